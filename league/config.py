@@ -1,0 +1,242 @@
+"""A league, whole, in one YAML file: environment, policies, sides, play, training and gate.
+
+Unknown keys are refused, everything is frozen, and an error names the file, the key and what was expected.
+"""
+
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args, get_origin
+
+import yaml
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from league.errors import ConfigError, InvalidReference
+from league.interface import digest
+from league.refs import check_slug
+
+JSON = dict[str, Any]
+ALGORITHMS = ("ppo",)
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class WrapperConfig(_Part):
+    """One SuperSuit wrapper by name, `{name: {argument: value}}` in YAML, applied in the order of the list."""
+
+    name: str
+    kwargs: JSON = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"name": value}
+        if isinstance(value, dict) and len(value) == 1 and "name" not in value:
+            name, kwargs = next(iter(value.items()))
+            return {"name": name, "kwargs": kwargs or {}}
+        return value
+
+
+class EnvironmentConfig(_Part):
+    """Which environment is played, and with which wrappers."""
+
+    entry_point: str
+    """A PettingZoo module (`pettingzoo.classic.connect_four_v3`) or a function (`package.module:function`)."""
+    api: Literal["aec"] = "aec"
+    """The environment's API. This release steps PettingZoo AEC environments."""
+    kwargs: JSON = {}
+    """Arguments of the environment's constructor."""
+    wrappers: tuple[WrapperConfig, ...] = ()
+
+    def digest(self) -> str:
+        """SHA-256 of the environment: results of environments with other digests are never mixed."""
+        return digest(self.model_dump(mode="json"))
+
+
+class PlayConfig(_Part):
+    """How matches are played."""
+
+    opening_plies: int = Field(default=0, ge=0)
+    """Random legal moves at the start of each game. A deterministic game between greedy policies needs some:
+    without them it repeats one game for ever."""
+    copies: int = Field(default=32, ge=1)
+    """Games stepped together in one worker. Has no influence on any result."""
+    max_moves: int = Field(default=10_000, ge=1)
+    """Actions after which a game counts as hung and the match fails."""
+
+
+class PPOConfig(_Part):
+    """Proximal policy optimisation by self-play (Schulman et al., 2017, arXiv 1707.06347)."""
+
+    algorithm: Literal["ppo"] = "ppo"
+    seed: int = Field(default=0, ge=0)
+    steps: int = Field(default=1_000_000, ge=1)
+    """Actions of all agents after which training ends."""
+    minutes: float | None = Field(default=None, gt=0)
+    """Wall-clock limit of training; it ends at whichever of the two limits comes first."""
+    checkpoint_every: int = Field(default=200_000, ge=1)
+    """Actions between two published versions. The end of training publishes one too."""
+    runners: int = Field(default=1, ge=0)
+    """Sampling processes; 0 samples in the learner's process."""
+    copies: int = Field(default=32, ge=1)
+    """Environment copies stepped together in each runner."""
+    train_batch_size: int = Field(default=2048, ge=1)
+    """Actions per update."""
+    minibatch_size: int = Field(default=256, ge=1)
+    epochs: int = Field(default=4, ge=1)
+    lr: float = Field(default=3e-4, gt=0)
+    gamma: float = Field(default=0.99, ge=0, le=1)
+    lambda_: float = Field(default=0.95, ge=0, le=1, alias="lambda")
+    clip: float = Field(default=0.2, gt=0)
+    entropy: float = Field(default=0.05, ge=0)
+    value_loss: float = Field(default=0.5, ge=0)
+    grad_clip: float = Field(default=0.5, gt=0)
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers."""
+
+    @model_validator(mode="after")
+    def _minibatch_fits(self) -> Self:
+        if self.minibatch_size > self.train_batch_size:
+            raise ValueError(f"minibatch_size must be at most train_batch_size ({self.train_batch_size})")
+        return self
+
+
+def _algorithm(settings: Any) -> str:
+    if isinstance(settings, Mapping):
+        return str(settings.get("algorithm", "ppo"))
+    return str(getattr(settings, "algorithm", "ppo"))
+
+
+TrainingConfig = Annotated[Annotated[PPOConfig, Tag("ppo")], Discriminator(_algorithm)]
+"""The settings of one algorithm, told apart by `algorithm`."""
+
+
+class GateConfig(_Part):
+    """The sequential test that a challenger must pass against the champion. See docs/statistics.md."""
+
+    model: Literal["logistic", "normalized"] = "normalized"
+    elo0: float = 0.0
+    """H0: the challenger is this much stronger, in Elo of `model`."""
+    elo1: float = 30.0
+    """H1: the challenger is this much stronger."""
+    alpha: float = Field(default=0.05, gt=0, lt=0.5)
+    """Probability of promoting under H0."""
+    beta: float = Field(default=0.05, gt=0, lt=0.5)
+    """Probability of rejecting under H1."""
+    max_blocks: int = Field(default=2000, ge=1)
+    """Blocks after which the verdict is `inconclusive` and the champion stays."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.elo0 < self.elo1:
+            raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
+        return self
+
+
+class LeagueConfig(_Part):
+    """One league. Only `league` and `environment` are required."""
+
+    league: str
+    environment: EnvironmentConfig
+    policies: dict[str, tuple[str, ...]] = {"shared": ("*",)}
+    """policy id → agents, by name or pattern (`player_*`); the first policy whose pattern fits takes the agent."""
+    sides: dict[str, tuple[str, ...]] | None = None
+    """side → agents, by name or pattern; by default each agent is a side of its own."""
+    play: PlayConfig = PlayConfig()
+    training: TrainingConfig = PPOConfig()
+    gate: GateConfig = GateConfig()
+
+    @field_validator("league")
+    @classmethod
+    def _league_is_slug(cls, value: str) -> str:
+        return _slug("league", value)
+
+    @field_validator("policies", "sides")
+    @classmethod
+    def _keys_are_slugs(cls, value: dict[str, Any] | None) -> dict[str, Any] | None:
+        if value is not None and not value:
+            raise ValueError("must name at least one")
+        for key in value or ():
+            _slug("name", key)
+        return value
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a league's file. Raises ConfigError."""
+        try:
+            document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror or error}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+        return cls.from_mapping(document, source=str(path))
+
+    @classmethod
+    def from_mapping(cls, document: Any, source: str = "configuration") -> Self:
+        """Check a league's settings. `source` names them in errors. Raises ConfigError."""
+        if not isinstance(document, Mapping):
+            raise ConfigError(f"{source}: expected keys such as 'league' and 'environment' at the top")
+        try:
+            return cls.model_validate(document)
+        except ValidationError as error:
+            raise ConfigError(f"{source}: {_sentence(cls, error)}") from error
+
+    def with_training(self, **settings: Any) -> Self:
+        """The same league with some training settings replaced, checked anew."""
+        training = self.training.model_dump(by_alias=True) | settings
+        return self.from_mapping(self.model_dump(by_alias=True) | {"training": training}, source=self.league)
+
+
+def _slug(kind: str, value: str) -> str:
+    try:
+        return check_slug(kind, value)
+    except InvalidReference as error:
+        raise ValueError(str(error)) from error
+
+
+def _sentence(model: type[BaseModel], error: ValidationError) -> str:
+    """The first faults of a ValidationError in a person's words."""
+    return "; ".join(_fault(model, detail) for detail in error.errors()[:3])
+
+
+def _fault(model: type[BaseModel], detail: Any) -> str:
+    path = [str(part) for part in detail["loc"] if part not in ALGORITHMS]
+    key = ".".join(path) or "file"
+    match detail["type"]:
+        case "missing":
+            return f"{key}: missing, it is required"
+        case "extra_forbidden":
+            known = _known_keys(model, path[:-1])
+            guess = difflib.get_close_matches(path[-1], known, n=1)
+            hint = f"did you mean {guess[0]!r}?" if guess else f"expected one of {', '.join(sorted(known))}"
+            return f"{key}: unknown key, {hint}"
+        case "union_tag_invalid":
+            return f"{key}.algorithm: expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
+        case "value_error":
+            return f"{key}: {detail['ctx']['error']}"
+    expected = detail["msg"][0].lower() + detail["msg"][1:]
+    return f"{key}: {expected}, got {detail['input']!r}"
+
+
+def _known_keys(model: type[BaseModel], path: list[str]) -> list[str]:
+    for part in path:
+        fields = {field.alias or name: field for name, field in model.model_fields.items()}
+        annotation = fields[part].annotation if part in fields else None
+        while get_origin(annotation) is not None and get_args(annotation):
+            annotation = get_args(annotation)[0]
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            return []
+        model = annotation
+    return [field.alias or name for name, field in model.model_fields.items()]

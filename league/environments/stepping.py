@@ -1,0 +1,99 @@
+"""The batched stepping protocol: n copies of an environment are reset and stepped by one call.
+
+A call yields, per group, one batch of the observations of all agents that must act, in all copies. What a group is,
+is the caller's: a policy id in training, a contestant's policy in a match. In a turn-based game an agent's rows are its
+own turns: the reward of a row is summed over all moves since the agent's previous row.
+"""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from numpy.typing import NDArray
+
+Group = Hashable
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """What a copy plays next: the seed of its reset, and the group of each agent in the order of `agents`."""
+
+    seed: int
+    groups: Sequence[Group]
+
+
+NextEpisode = Callable[[int], Episode | None]
+"""copy → its next episode, or None: the copy stays idle."""
+
+
+@dataclass(slots=True)
+class Batch:
+    """The k agents of one group that must act now. Row i is agent agents[i] (an index) of copy copies[i].
+
+    observations: ONNX input name → (k, …) in the environment's dtype.
+    rewards: summed since the agent's previous row; 0.0 at its first.
+    """
+
+    copies: list[int]
+    agents: list[int]
+    observations: dict[str, NDArray]
+    rewards: list[float]
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """The last report of an agent that has left its episode. Exactly one of the two flags may be the reason;
+    an environment that sets both at once is reported as it is.
+
+    observation: ONNX input name → array without a batch axis: the state after the last move.
+    """
+
+    copy: int
+    agent: int
+    observation: dict[str, NDArray]
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+@dataclass(slots=True)
+class Turn:
+    """What a call brought: agents that left, copies whose episode is over, and who must act next.
+
+    Endings belong to the episodes before; batches may already hold the first rows of a copy's next episode.
+    """
+
+    batches: dict[Group, Batch] = field(default_factory=dict)
+    endings: list[Ending] = field(default_factory=list)
+    finished: list[int] = field(default_factory=list)
+
+
+class BatchedEnvironment(Protocol):
+    """n copies in lockstep. A copy whose episode is over restarts with its next one in the same call."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Agent names; rows and groups refer to them by index."""
+        ...
+
+    @property
+    def copies(self) -> int:
+        """n"""
+        ...
+
+    def start(self, next_episode: NextEpisode) -> Turn:
+        """Reset every copy. `next_episode` is called here and at each restart."""
+        ...
+
+    def step(self, actions: Mapping[Group, NDArray]) -> Turn:
+        """Act: actions[group][i] is row i of the last Turn's batch of that group. A Turn without batches means that
+        all copies are idle. Raises IllegalAction, naming agent and action, before any copy has moved."""
+        ...
+
+    def assign(self, copy: int, groups: Sequence[Group]) -> None:
+        """Change the groups of a copy's agents from the next Turn on."""
+        ...
+
+    def close(self) -> None:
+        """Release the copies."""
+        ...

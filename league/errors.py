@@ -1,0 +1,173 @@
+"""The error hierarchy. Errors are raised low and translated once, at the edge (the CLI's exit code, the HTTP status).
+
+LeagueError
+├── InvalidInput              the caller's mistake
+│   ├── ConfigError             a league's YAML file, or a setting
+│   ├── InvalidReference        text that is no reference
+│   ├── ObservationError        an array that does not fit its space
+│   ├── IllegalMask             an action mask that is not one, or allows nothing
+│   ├── IllegalAction           an action outside the mask or the space
+│   └── EnvironmentMismatch     an environment, script or version that does not belong together
+├── NotFound
+│   ├── UnknownLeague
+│   ├── UnknownVersion
+│   ├── UnknownAlias
+│   └── UnknownPolicy
+├── Conflict                  the world has moved on
+│   ├── AliasMoved              a compare-and-set lost
+│   ├── InterfaceChanged        other spaces or policy ids than the league's versions have
+│   ├── LedgerRefusal           a result that breaks its schedule
+│   ├── NothingToRollBack
+│   └── AlreadyRunning          a second one of what may run once
+├── ArtifactCorrupt           a file whose digest is not the manifest's
+├── ParityError               an exported graph that acts otherwise than the trained module
+├── NotReady                  a policy that nothing serves yet
+├── RemoteError               a policy server that cannot be reached or failed
+└── StorageError              disk full, read-only, database gone
+"""
+
+from typing import ClassVar
+
+
+class LeagueError(Exception):
+    """A fault that a person is told in one sentence. `code` is stable: clients may rely on it."""
+
+    code: ClassVar[str] = "league_error"
+
+
+class InvalidInput(LeagueError):
+    """What the caller gave cannot be used."""
+
+    code = "invalid_input"
+
+
+class ConfigError(InvalidInput):
+    """A configuration that is refused; the message names the file, the key and what was expected."""
+
+    code = "invalid_config"
+
+
+class InvalidReference(InvalidInput):
+    """Text that is no reference such as `connect_four@3`, `connect_four@champion` or `script:random`."""
+
+    code = "invalid_reference"
+
+
+class ObservationError(InvalidInput):
+    """An observation whose shape, dtype or values do not fit its space."""
+
+    code = "invalid_observation"
+
+
+class IllegalMask(InvalidInput):
+    """An action mask that holds something other than 0 and 1, or allows no action."""
+
+    code = "illegal_mask"
+
+
+class IllegalAction(InvalidInput):
+    """An action outside its space or its mask."""
+
+    code = "illegal_action"
+
+
+class EnvironmentMismatch(InvalidInput):
+    """An environment, script or version that does not fit the league."""
+
+    code = "environment_mismatch"
+
+
+class NotFound(LeagueError):
+    """A thing that was named does not exist."""
+
+    code = "not_found"
+
+
+class UnknownLeague(NotFound):
+    """No league of that name is registered."""
+
+    code = "unknown_league"
+
+
+class UnknownVersion(NotFound):
+    """The league has no ready version of that number."""
+
+    code = "unknown_version"
+
+
+class UnknownAlias(NotFound):
+    """The league has no alias of that name."""
+
+    code = "unknown_alias"
+
+
+class UnknownPolicy(NotFound):
+    """The version has no policy of that id."""
+
+    code = "unknown_policy"
+
+
+class Conflict(LeagueError):
+    """The state is not the one that the caller acted on."""
+
+    code = "conflict"
+
+
+class AliasMoved(Conflict):
+    """A compare-and-set of an alias lost against another."""
+
+    code = "alias_moved"
+
+
+class InterfaceChanged(Conflict):
+    """Spaces or policy ids differ from those of the league's versions."""
+
+    code = "interface_changed"
+
+
+class LedgerRefusal(Conflict):
+    """A match that its schedule did not ask for, or that is not whole."""
+
+    code = "ledger_refusal"
+
+
+class NothingToRollBack(Conflict):
+    """The alias has no earlier version to return to."""
+
+    code = "nothing_to_roll_back"
+
+
+class AlreadyRunning(Conflict):
+    """Another process does what only one may do."""
+
+    code = "already_running"
+
+
+class ArtifactCorrupt(LeagueError):
+    """A file of a version is missing or has another digest than its manifest says."""
+
+    code = "artifact_corrupt"
+
+
+class ParityError(LeagueError):
+    """An exported graph does not act as the trained module does."""
+
+    code = "parity_failed"
+
+
+class NotReady(LeagueError):
+    """A policy that exists but is not served (yet)."""
+
+    code = "not_ready"
+
+
+class RemoteError(LeagueError):
+    """A policy server that cannot be reached, or that failed."""
+
+    code = "remote_error"
+
+
+class StorageError(LeagueError):
+    """The database or the artefact store cannot be read or written."""
+
+    code = "storage_error"

@@ -1,0 +1,99 @@
+"""References: the one way to name a version, a policy or a script.
+
+| text                    | record                                        |
+|-------------------------|-----------------------------------------------|
+| `connect_four@7`        | `CheckpointRef("connect_four", 7)`            |
+| `connect_four@champion` | `CheckpointRef("connect_four", "champion")`   |
+| `script:random`         | `ScriptRef("random")`                         |
+| `connect_four.shared`   | `PolicyRef("connect_four", "shared")`         |
+"""
+
+import re
+from dataclasses import dataclass
+
+from league.errors import InvalidReference
+
+SLUG = re.compile(r"[a-z0-9_-]+")
+CHAMPION = "champion"
+MAX_VERSION = 2**31 - 1
+"""Version numbers are a signed 32-bit column of the registry."""
+
+
+def check_slug(kind: str, text: str) -> str:
+    """Return `text` if it may name a league, a policy, a side or an alias; raise InvalidReference otherwise."""
+    if not SLUG.fullmatch(text):
+        raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'")
+    return text
+
+
+def parse_version(text: str) -> int | str:
+    """A version number or an alias: `"7"` → 7, `"champion"` → `"champion"`."""
+    if text.isascii() and text.isdigit():
+        number = int(text) if len(text) <= 10 else MAX_VERSION + 1
+        if not 1 <= number <= MAX_VERSION:
+            raise InvalidReference(f"version {text[:32]!r} must be between 1 and {MAX_VERSION}")
+        return number
+    return check_slug("alias", text)
+
+
+def check_alias(text: str) -> str:
+    """Return `text` if it may name an alias: a slug that is never all digits."""
+    if text.isdigit():
+        raise InvalidReference(f"alias {text!r} must not be all digits: that is a version number")
+    return check_slug("alias", text)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointRef:
+    """A version of a league, by number or by alias."""
+
+    league: str
+    version: int | str
+
+    @classmethod
+    def parse(cls, text: str) -> "CheckpointRef":
+        league, at, version = text.partition("@")
+        if not at:
+            raise InvalidReference(f"{text!r} names no version: expected LEAGUE@NUMBER or LEAGUE@ALIAS")
+        return cls(check_slug("league", league), parse_version(version))
+
+    def __str__(self) -> str:
+        return f"{self.league}@{self.version}"
+
+
+@dataclass(frozen=True, slots=True)
+class ScriptRef:
+    """A scripted baseline."""
+
+    name: str
+
+    @classmethod
+    def parse(cls, text: str) -> "ScriptRef":
+        scheme, _, name = text.partition(":")
+        if scheme != "script":
+            raise InvalidReference(f"{text!r} names no script: expected script:NAME")
+        return cls(check_slug("script", name))
+
+    def __str__(self) -> str:
+        return f"script:{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyRef:
+    """A served model: a league, and one of its policies where a version has several."""
+
+    league: str
+    policy: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> "PolicyRef":
+        league, dot, policy = text.partition(".")
+        return cls(check_slug("league", league), check_slug("policy", policy) if dot else None)
+
+    def __str__(self) -> str:
+        return self.league if self.policy is None else f"{self.league}.{self.policy}"
+
+
+def parse_ref(text: str) -> CheckpointRef | ScriptRef:
+    """Read any contestant: `connect_four@7`, `connect_four@champion` or `script:random`."""
+    return ScriptRef.parse(text) if text.startswith("script:") else CheckpointRef.parse(text)

@@ -1,0 +1,1 @@
+"""What was played: plain records and the append-only ledger."""

@@ -1,0 +1,42 @@
+"""Where a user's leagues live: three environment variables, each with a default."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Storage:
+    """The home directory, the database and the artefact store. All paths are absolute."""
+
+    home: Path
+    database_url: str
+    artifacts: Path
+
+    @classmethod
+    def at(cls, home: Path | str) -> "Storage":
+        """SQLite and a directory of artefacts inside `home`."""
+        home = Path(home).expanduser().absolute()
+        return cls(home, f"sqlite:///{home / 'league.db'}", home / "artifacts")
+
+    @classmethod
+    def from_environment(cls) -> "Storage":
+        """Read LEAGUE_HOME (default `./league-home`), LEAGUE_DATABASE_URL and LEAGUE_ARTIFACTS."""
+        default = cls.at(os.environ.get("LEAGUE_HOME") or "league-home")
+        artifacts = os.environ.get("LEAGUE_ARTIFACTS")
+        return cls(
+            home=default.home,
+            database_url=os.environ.get("LEAGUE_DATABASE_URL") or default.database_url,
+            artifacts=Path(artifacts).expanduser().absolute() if artifacts else default.artifacts,
+        )
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether other machines can reach it: a database server, and artefacts on a mount of their own."""
+        return not self.database_url.startswith("sqlite") and not self.artifacts.is_relative_to(self.home)
+
+    def export(self) -> None:
+        """Pin the three variables in this process, so that Ray's workers, started elsewhere, read the same."""
+        os.environ["LEAGUE_HOME"] = str(self.home)
+        os.environ["LEAGUE_DATABASE_URL"] = self.database_url
+        os.environ["LEAGUE_ARTIFACTS"] = str(self.artifacts)

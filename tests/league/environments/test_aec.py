@@ -1,0 +1,126 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.utils.wrappers import TerminateIllegalWrapper
+
+from league.config import EnvironmentConfig
+from league.environments.aec import AECStepping
+from league.environments.building import build
+from league.environments.stepping import Episode, Turn
+from league.errors import IllegalAction
+from tests.conformance.stepping import assert_stepping_conforms
+
+COUNTING = "tests.league.environments.counting:counting"
+
+
+def counting(**kwargs: Any) -> EnvironmentConfig:
+    return EnvironmentConfig(entry_point=COUNTING, kwargs=kwargs)
+
+
+ENVIRONMENTS = {
+    "connect_four": EnvironmentConfig(entry_point="pettingzoo.classic.connect_four_v3"),
+    "tictactoe": EnvironmentConfig(entry_point="pettingzoo.classic.tictactoe_v3"),
+    "all terminate": counting(lives=[3, 3]),
+    "all truncated": counting(lives=[3, 3], truncated=[0, 1]),
+    "mixed, with early deaths": counting(lives=[1, 4, 2, 4], truncated=[1, 2]),
+}
+
+
+@pytest.mark.parametrize("copies", [1, 3, 8])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_lockstep_reports_what_the_plain_loop_reports(name: str, copies: int) -> None:
+    config = ENVIRONMENTS[name]
+    assert_stepping_conforms(
+        lambda n: AECStepping(config, n), build(config), seeds=list(range(100, 112)), copies=copies
+    )
+
+
+def play_out(env: AECStepping, turn: Turn) -> list[Turn]:
+    turns = [turn]
+    while turn.batches:
+        turn = env.step({group: np.zeros(len(batch.copies), int) for group, batch in turn.batches.items()})
+        turns.append(turn)
+    return turns
+
+
+def test_a_truncated_agent_is_never_a_terminated_one_and_keeps_its_last_observation() -> None:
+    env = AECStepping(counting(lives=[2, 3], truncated=[1]), copies=1)
+    episodes = iter([Episode(5, "ab")])
+    endings = [ending for turn in play_out(env, env.start(lambda _: next(episodes, None))) for ending in turn.endings]
+    flags = {ending.agent: (ending.terminated, ending.truncated) for ending in endings}
+    assert flags == {0: (True, False), 1: (False, True)}
+    last = {ending.agent: ending.observation["observation"].tolist() for ending in endings}
+    assert last == {0: [0, 2, 5], 1: [1, 3, 5]}
+
+
+def test_rewards_between_two_turns_of_an_agent_are_summed() -> None:
+    env = AECStepping(counting(lives=[3, 3]), copies=1)
+    episodes = iter([Episode(0, "ab")])
+    turns = play_out(env, env.start(lambda _: next(episodes, None)))
+    rewards = [(group, batch.rewards[0]) for turn in turns for group, batch in turn.batches.items()]
+    assert rewards == [("a", 0.0), ("b", 10.0), ("a", 2.0), ("b", 20.0), ("a", 2.0), ("b", 20.0)]
+    assert [(ending.agent, ending.reward) for turn in turns for ending in turn.endings] == [(0, 1.0), (1, 10.0)]
+
+
+def test_each_reset_has_the_seed_of_its_episode() -> None:
+    env = AECStepping(counting(lives=[1, 1]), copies=2)
+    seeds = iter(range(10, 16))
+    seen: dict[int, list[int]] = {0: [], 1: []}
+
+    def next_episode(copy: int) -> Episode | None:
+        seed = next(seeds, None)
+        if seed is None:
+            return None
+        seen[copy].append(seed)
+        return Episode(seed, "ab")
+
+    turns = play_out(env, env.start(next_episode))
+    for copy in (0, 1):
+        told = [
+            int(ending.observation["observation"][2])
+            for turn in turns
+            for ending in turn.endings
+            if ending.copy == copy and ending.agent == 0
+        ]
+        assert told == seen[copy]
+
+
+def test_groups_can_change_within_an_episode() -> None:
+    env = AECStepping(counting(lives=[2, 2]), copies=1)
+    episodes = iter([Episode(0, ("opening", "opening"))])
+    turn = env.start(lambda _: next(episodes, None))
+    assert list(turn.batches) == ["opening"]
+    env.assign(0, ("first", "second"))
+    turn = env.step({"opening": np.array([0])})
+    assert list(turn.batches) == ["second"]
+
+
+def test_agents_of_one_group_in_all_copies_share_a_batch() -> None:
+    env = AECStepping(ENVIRONMENTS["connect_four"], copies=5)
+    turn = env.start(lambda copy: Episode(copy, ("shared", "shared")))
+    batch = turn.batches["shared"]
+    assert batch.copies == [0, 1, 2, 3, 4]
+    assert batch.observations["observation"].shape == (5, 6, 7, 2)
+    assert batch.observations["action_mask"].dtype == np.int8
+
+
+@pytest.mark.parametrize("action", [9, -1])
+def test_an_illegal_action_is_refused_before_any_copy_moves(action: int) -> None:
+    env = AECStepping(ENVIRONMENTS["tictactoe"], copies=2)
+    turn = env.start(lambda _: Episode(0, ("x", "o")))
+    with pytest.raises(IllegalAction, match=rf"action {action} of player_1 is illegal"):
+        env.step({"x": np.array([0, action])})
+    turn = env.step({"x": np.array([4, 4])})
+    assert (turn.batches["o"].observations["observation"].sum(axis=(1, 2, 3)) == 1).all()
+    with pytest.raises(IllegalAction, match="action_mask is"):
+        env.step({"o": np.array([4, 0])})
+
+
+def test_the_checking_wrappers_are_left_out_and_others_stay() -> None:
+    assert not isinstance(build(ENVIRONMENTS["connect_four"]), TerminateIllegalWrapper)
+    wrapped = EnvironmentConfig.model_validate(
+        {"entry_point": COUNTING, "wrappers": [{"frame_stack_v1": {"stack_size": 2}}]}
+    )
+    env = AECStepping(wrapped, copies=1)
+    assert env.start(lambda _: Episode(0, "ab")).batches["a"].observations["observation"].shape == (1, 6)

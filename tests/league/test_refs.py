@@ -1,0 +1,43 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from league.errors import InvalidReference
+from league.refs import CheckpointRef, PolicyRef, ScriptRef, check_alias, parse_ref
+
+slugs = st.from_regex(r"[a-z0-9_-]+", fullmatch=True)
+aliases = slugs.filter(lambda slug: not slug.isdigit())
+versions = st.integers(1, 2**31 - 1) | aliases
+
+
+@given(st.builds(CheckpointRef, slugs, versions) | st.builds(ScriptRef, slugs))
+def test_a_contestant_reads_back_from_its_text(ref: CheckpointRef | ScriptRef) -> None:
+    assert parse_ref(str(ref)) == ref
+
+
+@given(st.builds(PolicyRef, slugs, st.none() | slugs))
+def test_a_model_name_reads_back_from_its_text(ref: PolicyRef) -> None:
+    assert PolicyRef.parse(str(ref)) == ref
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "connect_four", "@3", "a@", "a@0", "a@-1x!", "A@3", "a@3@4", "a@99999999999999", "script:", "script:A", "a/b@1"],
+)
+def test_what_is_no_reference_is_refused(text: str) -> None:
+    with pytest.raises(InvalidReference):
+        parse_ref(text)
+
+
+@given(st.text())
+def test_any_text_parses_or_is_refused(text: str) -> None:
+    try:
+        assert str(parse_ref(text)) or True
+    except InvalidReference as error:
+        assert "must" in str(error) or "expected" in str(error)
+
+
+def test_an_alias_is_never_a_number() -> None:
+    assert check_alias("candidate") == "candidate"
+    with pytest.raises(InvalidReference, match="version number"):
+        check_alias("12")

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+from gymnasium import spaces as gym
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from league.errors import EnvironmentMismatch, IllegalMask, ObservationError
+from league.spaces import Box, Space, check, check_mask, from_gymnasium, inputs, tensors, to_gymnasium
+
+MASKED = gym.Dict({"action_mask": gym.Box(0, 1, (7,), np.int8), "observation": gym.Box(0, 1, (6, 7, 2), np.int8)})
+EXAMPLES = [
+    MASKED,
+    gym.Box(-np.inf, np.inf, (18,), np.float32),
+    gym.Box(np.array([0.0, -1.0], np.float32), np.array([np.inf, 1.0], np.float32)),
+    gym.Box(0, 255, (84, 84, 4), np.uint8),
+    gym.Discrete(4),
+    gym.Discrete(5, start=-2),
+    gym.MultiDiscrete([3, 4, 5]),
+    gym.MultiDiscrete([[2, 3], [4, 5]]),
+    gym.MultiBinary(6),
+    gym.Dict({"lidar": gym.Box(0, 1, (3,)), "pose": gym.Dict({"x": gym.Box(0, 1, ()), "gear": gym.Discrete(5)})}),
+]
+
+
+@pytest.mark.parametrize("space", EXAMPLES, ids=str)
+def test_a_space_survives_the_round_trip_through_json(space: gym.Space) -> None:
+    adapter: TypeAdapter[Space] = TypeAdapter(Space)
+    described = from_gymnasium(space)
+    assert adapter.validate_json(adapter.dump_json(described)) == described
+    assert to_gymnasium(described) == space
+
+
+@pytest.mark.parametrize("space", EXAMPLES, ids=str)
+def test_each_sample_of_a_space_passes_its_own_check(space: gym.Space) -> None:
+    space.seed(7)
+    described = from_gymnasium(space)
+    leaves = inputs(described)
+    arrays = tensors(described, space.sample())
+    assert list(arrays) == list(leaves)
+    for name, array in arrays.items():
+        assert check(name, array[None], leaves[name]).dtype == leaves[name].dtype
+
+
+def test_inputs_are_named_as_the_graph_names_them() -> None:
+    assert list(inputs(from_gymnasium(MASKED))) == ["observation", "action_mask"]
+    assert list(inputs(from_gymnasium(gym.Discrete(3)))) == ["observation"]
+    assert list(inputs(from_gymnasium(EXAMPLES[-1]))) == [
+        "observation.lidar",
+        "observation.pose.gear",
+        "observation.pose.x",
+    ]
+
+
+def test_a_space_that_no_policy_can_take_is_refused() -> None:
+    with pytest.raises(EnvironmentMismatch, match="Text"):
+        from_gymnasium(gym.Text(5))
+
+
+BOARD = inputs(from_gymnasium(MASKED))["observation"]
+POSE = inputs(from_gymnasium(gym.Box(-1, 1, (2,))))["observation"]
+
+
+@pytest.mark.parametrize(
+    ("array", "leaf", "message"),
+    [
+        (np.zeros((1, 6, 7)), BOARD, r"shape \[6, 7\], expected \[6, 7, 2\]"),
+        (np.full((1, 6, 7, 2), 0.5), BOARD, "fractions"),
+        (np.full((1, 6, 7, 2), np.nan), BOARD, "NaN"),
+        (np.full((1, 6, 7, 2), 300), BOARD, "between -128 and 127"),
+        (np.full((1, 6, 7, 2), "x"), BOARD, "other than numbers"),
+        (np.array([[np.nan, 0.0]]), POSE, "NaN or infinity"),
+        (np.array([[1e39, 0.0]]), POSE, "NaN or infinity"),
+        (np.array([4]), from_gymnasium(gym.Discrete(4)), "between 0 and 3"),
+        (np.array([[0, 3]]), from_gymnasium(gym.MultiDiscrete([2, 3])), "between"),
+        (np.array([[2]]), from_gymnasium(gym.MultiBinary(1)), "between 0 and 1"),
+    ],
+)
+def test_an_array_that_does_not_fit_is_refused(array: np.ndarray, leaf: Box, message: str) -> None:
+    with pytest.raises(ObservationError, match=message):
+        check("observation", array, leaf)
+
+
+@given(st.integers(-128, 127))
+def test_whole_numbers_pass_in_any_dtype(value: int) -> None:
+    for dtype in (np.int64, np.float64, np.int16):
+        checked = check("observation", np.full((3, 6, 7, 2), value, dtype), BOARD)
+        assert checked.dtype == np.int8
+        assert (checked == value).all()
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"), [([[1, 2]], "other than 0 and 1"), ([[1, -1]], "other than"), ([[1, 0], [0, 0]], "no action")]
+)
+def test_an_illegal_mask_is_refused(mask: list[list[int]], message: str) -> None:
+    with pytest.raises(IllegalMask, match=message):
+        check_mask(np.array(mask, np.int8))
