@@ -77,6 +77,13 @@ class PlayConfig(_Part):
     """Actions after which a game counts as hung and the match fails."""
 
 
+class ConvolutionConfig(_Part):
+    """One convolution over the planes of an observation, without padding."""
+
+    filters: int = Field(ge=1)
+    kernel: int = Field(default=3, ge=1)
+
+
 class PPOConfig(_Part):
     """Proximal policy optimisation by self-play (Schulman et al., 2017, arXiv 1707.06347)."""
 
@@ -88,6 +95,8 @@ class PPOConfig(_Part):
     """Wall-clock limit of training; it ends at whichever of the two limits comes first."""
     checkpoint_every: int = Field(default=200_000, ge=1)
     """Actions between two published versions. The end of training publishes one too."""
+    checkpoint_minutes: float | None = Field(default=None, gt=0)
+    """Wall-clock minutes of training between two published versions; the sooner of the two counts."""
     runners: int = Field(default=1, ge=0)
     """Sampling processes; 0 samples in the learner's process."""
     copies: int = Field(default=32, ge=1)
@@ -103,8 +112,13 @@ class PPOConfig(_Part):
     entropy: float = Field(default=0.05, ge=0)
     value_loss: float = Field(default=0.5, ge=0)
     grad_clip: float = Field(default=0.5, gt=0)
-    hidden: tuple[int, ...] = (256, 256)
+    convolutions: tuple[ConvolutionConfig, ...] = ()
+    """Layers over those parts of the observation that are planes, (height, width, channels). Others are flattened."""
+    hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
     """Widths of the hidden layers."""
+    opening_plies: int = Field(default=0, ge=0)
+    """Up to this many random legal moves begin each episode. They are not learned from, but lead to positions that
+    self-play alone would not visit."""
 
     @model_validator(mode="after")
     def _minibatch_fits(self) -> Self:
@@ -121,6 +135,10 @@ def _algorithm(settings: Any) -> str:
 
 TrainingConfig = Annotated[Annotated[PPOConfig, Tag("ppo")], Discriminator(_algorithm)]
 """The settings of one algorithm, told apart by `algorithm`."""
+
+
+LARGEST_NORMALIZED_ELO = 190
+"""Farther hypotheses have no usable test: see evaluation/sequential.py."""
 
 
 class GateConfig(_Part):
@@ -142,6 +160,10 @@ class GateConfig(_Part):
     def _ordered(self) -> Self:
         if not self.elo0 < self.elo1:
             raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
+        if self.model == "normalized" and max(-self.elo0, self.elo1) > LARGEST_NORMALIZED_ELO:
+            raise ValueError(
+                f"elo0 and elo1 must lie within ±{LARGEST_NORMALIZED_ELO} (normalized Elo), got {self.elo0:g} and {self.elo1:g}"
+            )
         return self
 
 

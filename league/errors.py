@@ -20,6 +20,8 @@ LeagueError
 │   ├── NothingToRollBack
 │   └── AlreadyRunning          a second one of what may run once
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
+├── GameHung                  a game that does not end
+├── WorkerLost                worker processes that die again and again
 ├── ParityError               an exported graph that acts otherwise than the trained module
 ├── NotReady                  a policy that nothing serves yet
 ├── RemoteError               a policy server that cannot be reached or failed
@@ -147,6 +149,18 @@ class ArtifactCorrupt(LeagueError):
     """A file of a version is missing or has another digest than its manifest says."""
 
     code = "artifact_corrupt"
+
+
+class GameHung(LeagueError):
+    """A game of a match that has not ended after `play.max_moves` actions."""
+
+    code = "game_hung"
+
+
+class WorkerLost(LeagueError):
+    """The processes that were to do a piece of work died, one after another."""
+
+    code = "worker_lost"
 
 
 class ParityError(LeagueError):

@@ -137,6 +137,13 @@ def inputs(space: Space) -> dict[str, Leaf]:
     return dict(_leaves(space))
 
 
+def paths(space: Space) -> dict[str, tuple[str, ...]]:
+    """ONNX input name → the keys that lead to its leaf in a value of `space`, in the order of `inputs`."""
+    if not isinstance(space, DictSpace):
+        return {OBSERVATION: ()}
+    return {name: path for name, path, _ in _paths(space)}
+
+
 def tensors(space: Space, value: Any) -> dict[str, NDArray]:
     """Split one value of `space`, as an environment gives it, into its arrays, without a copy where none is needed."""
     if not isinstance(space, DictSpace):
@@ -238,9 +245,10 @@ def _bound(bound: NDArray) -> Any:
 
 
 def _unbound(bound: Any, infinity: float, space: Box) -> NDArray:
-    filled = np.array(bound, dtype=object)
-    filled[filled == None] = infinity
-    return np.broadcast_to(filled, space.shape).astype(space.dtype)
+    # None, which stands for an infinite bound, becomes NaN in an array of floats; there is no other NaN among bounds.
+    finite = np.array(bound, dtype=np.float64)
+    exact = np.array(bound, dtype=space.dtype) if not np.isnan(finite).any() else np.nan_to_num(finite, nan=infinity)
+    return np.broadcast_to(exact, space.shape).astype(space.dtype)
 
 
 def _nested(values: Any) -> Any:

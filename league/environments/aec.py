@@ -42,7 +42,7 @@ class AECStepping:
         self._actions = [from_gymnasium(env.action_space(agent)) for agent in self.agents]
         self._groups: list[Sequence[Group]] = [()] * copies
         self._pending: dict[Group, Batch] = {}
-        self._next_episode: NextEpisode = lambda copy: None
+        self._next_episode: NextEpisode = lambda _: None
 
     @property
     def copies(self) -> int:
@@ -110,9 +110,7 @@ class AECStepping:
     def _yield(self, turn: Turn, rows: Rows) -> Turn:
         for group, (copies, agents, observations, rewards) in rows.items():
             dtypes = self._dtypes[agents[0]]
-            stacked = {
-                name: np.array([row[name] for row in observations], dtype=dtypes[name]) for name in dtypes
-            }
+            stacked = {name: np.array([row[name] for row in observations], dtype=dtypes[name]) for name in dtypes}
             turn.batches[group] = Batch(copies, agents, stacked, rewards)
         self._pending = turn.batches
         return turn

@@ -17,7 +17,7 @@ from league.interface import AgentInterface, Interface
 from league.spaces import from_gymnasium
 
 CHECKING_WRAPPERS = (OrderEnforcingWrapper, AssertOutOfBoundsWrapper, TerminateIllegalWrapper)
-"""They guard a careless caller, and cost half of a small game's speed. Stepping keeps the order and checks the masks itself."""
+"""They guard a careless caller at half of a small game's speed. Stepping keeps the order and checks masks itself."""
 
 
 def build(config: EnvironmentConfig, render_mode: str | None = None) -> AECEnv:
@@ -83,11 +83,7 @@ def _constructor(entry_point: str) -> Any:
         raise ConfigError(f"environment.entry_point: {entry_point!r} names no module") from error
     name = function if colon else "env"
     if not callable(getattr(module, name, None)):
-        expected = (
-            "a function of that name"
-            if colon
-            else "a PettingZoo module with `env`, or package.module:function"
-        )
+        expected = "a function of that name" if colon else "a PettingZoo module with `env`, or package.module:function"
         raise ConfigError(f"environment.entry_point: {module_name!r} has no {name!r}: expected {expected}")
     return getattr(module, name)
 

@@ -5,13 +5,14 @@ is the caller's: a policy id in training, a contestant's policy in a match. In a
 own turns: the reward of a row is summed over all moves since the agent's previous row.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-Group = Hashable
+Group = Any
+"""Anything hashable."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,3 +1,5 @@
+import contextlib
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,7 +24,20 @@ def test_a_model_name_reads_back_from_its_text(ref: PolicyRef) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "connect_four", "@3", "a@", "a@0", "a@-1x!", "A@3", "a@3@4", "a@99999999999999", "script:", "script:A", "a/b@1"],
+    [
+        "",
+        "connect_four",
+        "@3",
+        "a@",
+        "a@0",
+        "a@-1x!",
+        "A@3",
+        "a@3@4",
+        "a@99999999999999",
+        "script:",
+        "script:A",
+        "a/b@1",
+    ],
 )
 def test_what_is_no_reference_is_refused(text: str) -> None:
     with pytest.raises(InvalidReference):
@@ -31,10 +46,9 @@ def test_what_is_no_reference_is_refused(text: str) -> None:
 
 @given(st.text())
 def test_any_text_parses_or_is_refused(text: str) -> None:
-    try:
-        assert str(parse_ref(text)) or True
-    except InvalidReference as error:
-        assert "must" in str(error) or "expected" in str(error)
+    with contextlib.suppress(InvalidReference):
+        ref = parse_ref(text)
+        assert parse_ref(str(ref)) == ref
 
 
 def test_an_alias_is_never_a_number() -> None:

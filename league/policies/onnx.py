@@ -1,0 +1,148 @@
+"""A policy that is an ONNX graph, run by ONNX Runtime on one thread."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError
+from league.policies.draws import sample
+from league.policies.policy import Actions, Arrays
+from league.registry.manifest import PolicyManifest
+from league.spaces import Discrete
+
+ACTION = "action"
+DIST_INPUTS = "action_dist_inputs"
+STATE_IN = "state_in_"
+STATE_OUT = "state_out_"
+
+DTYPES = {"float": "float32", "double": "float64"}
+"""ONNX Runtime's names of element types where they are not NumPy's."""
+
+
+class OnnxPolicy:
+    """The graph of one policy. Keeps no state between calls, and may be called by several threads.
+
+    graph: the file or its bytes. The graph must hold its weights itself.
+    manifest: what the graph must look like; without one, it is taken as it is.
+    Raises ArtifactCorrupt if it is no graph, or not the one of the manifest.
+    """
+
+    def __init__(self, graph: Path | str | bytes, manifest: PolicyManifest | None = None) -> None:
+        self._session = _session(graph if isinstance(graph, bytes) else Path(graph).read_bytes())
+        self._inputs = {node.name: node for node in self._session.get_inputs()}
+        self._outputs = {node.name: node for node in self._session.get_outputs()}
+        _check_graph(self._inputs, self._outputs, manifest)
+        self._first_action = manifest.action.start if manifest and isinstance(manifest.action, Discrete) else 0
+        self._is_categorical = isinstance(manifest.action, Discrete) if manifest else _is_discrete(self._outputs)
+        self._observed = tuple(name for name in self._inputs if not name.startswith(STATE_IN))
+        self._recurrent = tuple(name for name in self._inputs if name.startswith(STATE_IN))
+        state_out = [STATE_OUT + name.removeprefix(STATE_IN) for name in self._recurrent]
+        self._greedy = [ACTION, *state_out]
+        self._exploring = [ACTION, DIST_INPUTS, *state_out]
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,
+        explore: bool = False,
+        rng: Sequence[np.random.Generator] | None = None,
+    ) -> Actions:
+        """Act on a batch; see `Policy.act`. The distribution's inputs are answered when exploring.
+
+        state: arrays (k, …) under the names `state_in_<i>`; None at the start of episodes.
+        Raises ObservationError if an array is missing or has another shape or dtype than the graph takes, and
+        EnvironmentMismatch if it cannot explore: only categorical policies of a Discrete action space can.
+        """
+        if explore and not self._is_categorical:
+            raise EnvironmentMismatch("this policy cannot explore: its action space is not Discrete")
+        try:
+            feed = {name: observations[name] for name in self._observed}
+            if self._recurrent:
+                feed |= self.initial_state(len(feed[self._observed[0]])) if state is None else state
+            rows = {name: len(array) for name, array in feed.items()}
+            if len(set(rows.values())) != 1:
+                raise ValueError(f"rows differ: {rows}")
+            outputs = self._session.run(self._exploring if explore else self._greedy, feed)
+        except Exception as error:
+            self._explain(observations, state)
+            raise ObservationError(f"the graph refuses its input: {_one_line(error)}") from error
+        if not explore:
+            return Actions(outputs[0], self._state(outputs[1:]))
+        actions = sample(outputs[1], rng) + self._first_action
+        return Actions(actions, self._state(outputs[2:]), outputs[1])
+
+    def initial_state(self, batch: int) -> dict[str, NDArray]:
+        """The recurrent state of `batch` episodes that start; empty for a graph without."""
+        return {
+            name: np.zeros((batch, *self._inputs[name].shape[1:]), _dtype(self._inputs[name]))
+            for name in self._recurrent
+        }
+
+    def _state(self, outputs: list[NDArray]) -> dict[str, NDArray] | None:
+        return dict(zip(self._recurrent, outputs, strict=True)) if outputs else None
+
+    def _explain(self, observations: Arrays, state: Arrays | None) -> None:
+        """Raise ObservationError for the first array that does not fit, if any."""
+        given = dict(observations) | dict(state or {})
+        for name in (*self._observed, *(self._recurrent if state is not None else ())):
+            node = self._inputs[name]
+            expected = f"expected a batch of {_dtype(node)} {list(node.shape[1:])}"
+            if name not in given:
+                raise ObservationError(f"{name} is missing: {expected}")
+            array = given[name]
+            if not isinstance(array, np.ndarray):
+                raise ObservationError(f"{name} is no NumPy array: {expected}")
+            if array.dtype != _dtype(node) or list(array.shape[1:]) != list(node.shape[1:]):
+                raise ObservationError(f"{name} is {array.dtype} {list(array.shape[1:])}: {expected}")
+
+
+def _session(graph: bytes) -> Any:
+    options = onnxruntime.SessionOptions()
+    # Replicas and workers are processes: threads of one would fight the others for cores.
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise ArtifactCorrupt(f"ONNX Runtime cannot load the graph: {_one_line(error)}") from error
+
+
+def _check_graph(inputs: dict[str, Any], outputs: dict[str, Any], manifest: PolicyManifest | None) -> None:
+    required = {ACTION, DIST_INPUTS}
+    required |= {STATE_OUT + name.removeprefix(STATE_IN) for name in inputs if name.startswith(STATE_IN)}
+    if missing := sorted(required - set(outputs)):
+        raise ArtifactCorrupt(f"the graph has no output {missing[0]}")
+    if manifest is None:
+        return
+    for kind, nodes, tensors in (
+        ("input", inputs, manifest.inputs),
+        ("output", outputs, manifest.outputs),
+    ):
+        found = {name: _dtype(node) for name, node in nodes.items()}
+        expected = {tensor.name: tensor.dtype for tensor in tensors}
+        for name in sorted(found.keys() | expected.keys()):
+            if found.get(name) != expected.get(name):
+                raise ArtifactCorrupt(
+                    f"{kind} {name} of the graph is {found.get(name, 'missing')}, "
+                    f"but {expected.get(name, 'missing')} in the manifest"
+                )
+
+
+def _dtype(node: Any) -> str:
+    name = str(node.type).removeprefix("tensor(").removesuffix(")")
+    return DTYPES.get(name, name)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _is_discrete(outputs: dict[str, Any]) -> bool:
+    action = outputs[ACTION]
+    return len(action.shape) == 1 and _dtype(action) in ("int32", "int64")

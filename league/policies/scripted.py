@@ -1,0 +1,183 @@
+"""Scripted baselines: contestants whose strength is known and that need no training.
+
+`random` picks uniformly among the legal actions. `one_ply` wins at once if it can, else keeps the opponent
+from doing so, else is `random`; it plays connect four and tic-tac-toe.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.errors import EnvironmentMismatch, IllegalMask, UnknownPolicy
+from league.policies.draws import Generators, choose, draw
+from league.policies.policy import Actions, Arrays, Policy
+from league.spaces import (
+    ACTION_MASK,
+    OBSERVATION,
+    Box,
+    DictSpace,
+    Discrete,
+    Leaf,
+    MultiBinary,
+    MultiDiscrete,
+    Space,
+    inputs,
+)
+
+
+def script(name: str, observation: Space, action: Space) -> Policy:
+    """The script `name` for an agent with these spaces.
+
+    Raises UnknownPolicy if there is none of that name, EnvironmentMismatch if it cannot play with them.
+    """
+    if name not in SCRIPTS:
+        raise UnknownPolicy(f"there is no script {name!r}; known: {', '.join(SCRIPTS)}")
+    return SCRIPTS[name](observation, action)
+
+
+class Random:
+    """Uniform over the legal actions; over the whole action space where there is no mask."""
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        self._masked = ACTION_MASK in inputs(observation)
+        if isinstance(action, DictSpace) or (self._masked and not isinstance(action, Discrete)):
+            raise EnvironmentMismatch(f"script:random cannot play with {action.type} actions here")
+        if isinstance(action, Box) and not all(np.isfinite(bound).all() for bound in _bounds(action)):
+            raise EnvironmentMismatch("script:random cannot play with actions that have no bounds")
+        self._action: Leaf = action
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,  # noqa: ARG002
+        explore: bool = False,  # noqa: ARG002
+        rng: Generators | None = None,
+    ) -> Actions:
+        """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
+        if self._masked and isinstance(self._action, Discrete):
+            return Actions(_choose(observations[ACTION_MASK], rng) + self._action.start)
+        rows = len(next(iter(observations.values())))
+        return Actions(_spread(draw(rng, rows, self._action.shape), self._action))
+
+
+@dataclass(frozen=True, slots=True)
+class LineGame:
+    """A game that is won by `length` squares in a line. Observed are two planes: own squares, the opponent's.
+
+    With `gravity` an action is a column, whose lowest empty square it takes (row 0 is the top); else it is a
+    square, numbered row by row.
+    """
+
+    rows: int
+    columns: int
+    length: int
+    gravity: bool
+
+    @property
+    def actions(self) -> int:
+        return self.columns if self.gravity else self.rows * self.columns
+
+    def lines(self) -> NDArray:
+        """Which squares each line covers: (lines, rows · columns) of 0 and 1, float32."""
+        covered = []
+        for row, column in product(range(self.rows), range(self.columns)):
+            for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+                last_row, last_column = row + down * (self.length - 1), column + right * (self.length - 1)
+                if last_row < self.rows and 0 <= last_column < self.columns:
+                    line = np.zeros((self.rows, self.columns), np.float32)
+                    for step in range(self.length):
+                        line[row + down * step, column + right * step] = 1
+                    covered.append(line.ravel())
+        return np.array(covered)
+
+    def actions_on(self, squares: NDArray, empty: NDArray) -> NDArray:
+        """Which actions take one of `squares`; both (k, rows · columns) bool → (k, actions) bool."""
+        if not self.gravity:
+            return squares & empty
+        empty = empty.reshape(-1, self.rows, self.columns)
+        lowest = empty.copy()
+        lowest[:, :-1] &= ~empty[:, 1:]
+        return (squares.reshape(empty.shape) & lowest).any(axis=1)
+
+
+CONNECT_FOUR = LineGame(rows=6, columns=7, length=4, gravity=True)
+TIC_TAC_TOE = LineGame(rows=3, columns=3, length=3, gravity=False)
+
+
+class OnePly:
+    """Looks one move ahead in connect four and tic-tac-toe."""
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        self._game = _line_game(observation, action)
+        self._lines = self._game.lines()
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,  # noqa: ARG002
+        explore: bool = False,  # noqa: ARG002
+        rng: Generators | None = None,
+    ) -> Actions:
+        """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
+        boards = observations[OBSERVATION]
+        legal = observations[ACTION_MASK] != 0
+        planes = boards.reshape(len(boards), -1, 2).astype(np.float32)
+        empty = planes.sum(axis=2) == 0
+        best = legal
+        for player in (1, 0):
+            completing = legal & self._game.actions_on(self._completing(planes[:, :, player]), empty)
+            best = np.where(completing.any(axis=1, keepdims=True), completing, best)
+        return Actions(_choose(best, rng))
+
+    def _completing(self, own: NDArray) -> NDArray:
+        """The squares of lines of which `own` (k, squares) lacks one: an empty one completes its line."""
+        almost = own @ self._lines.T == self._game.length - 1
+        return almost.astype(np.float32) @ self._lines > 0
+
+
+SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {"random": Random, "one_ply": OnePly}
+
+
+def _line_game(observation: Space, action: Space) -> LineGame:
+    leaves = inputs(observation)
+    for game in (CONNECT_FOUR, TIC_TAC_TOE):
+        fits = OBSERVATION in leaves and leaves[OBSERVATION].shape == (game.rows, game.columns, 2)
+        if fits and ACTION_MASK in leaves and action == Discrete(n=game.actions):
+            return game
+    raise EnvironmentMismatch("script:one_ply plays connect four and tic-tac-toe only, and has other spaces here")
+
+
+def _choose(allowed: NDArray, rng: Generators | None) -> NDArray:
+    if not allowed.any(axis=1).all():
+        raise IllegalMask("action_mask allows no action: expected at least one 1")
+    return choose(allowed, rng)
+
+
+def _spread(uniform: NDArray, space: Leaf) -> NDArray:
+    """Uniform numbers in [0, 1) over a space: (k, *shape) in its dtype."""
+    match space:
+        case Discrete():
+            values = space.start + np.floor(uniform * space.n)
+        case MultiDiscrete():
+            values = np.asarray(space.start) + np.floor(uniform * np.asarray(space.nvec))
+        case MultiBinary():
+            values = np.floor(uniform * 2)
+        case Box():
+            low, high = _bounds(space)
+            values = low + uniform * (high - low)
+            if np.dtype(space.dtype).kind != "f":
+                values = np.floor(low + uniform * (high - low + 1))
+        case _:
+            assert_never(space)
+    return values.astype(space.dtype)
+
+
+def _bounds(space: Box) -> tuple[NDArray, NDArray]:
+    """Lowest and highest values, (*shape) float64; an absent bound is NaN."""
+    return np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)

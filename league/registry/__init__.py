@@ -1,0 +1,1 @@
+"""What is kept: leagues, checkpoint versions, aliases, promotions and what replicas serve."""

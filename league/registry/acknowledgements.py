@@ -1,0 +1,39 @@
+"""What serving replicas say that they serve."""
+
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from league.registry import leagues, rows
+from league.registry.database import upsert
+from league.registry.tables import Acknowledgement
+
+KEPT = timedelta(days=1)
+"""Replicas that died without a word are forgotten after this."""
+
+
+def write(
+    session: Session, replica: str, league: str, version: int | None, sha256: str | None, fault: str | None
+) -> None:
+    """Replace what `replica` said of `league`. Raises UnknownLeague."""
+    leagues.require(session, league)
+    now = datetime.now(UTC)
+    values = {"version": version, "sha256": sha256, "fault": fault, "seen_at": now}
+    upsert(session, Acknowledgement, {"replica": replica, "league": league}, values)
+    session.execute(delete(Acknowledgement).where(Acknowledgement.seen_at < now - KEPT))
+
+
+def fresh(session: Session, league: str, since: timedelta) -> list[rows.Acknowledgement]:
+    """What was said of `league` in the last `since`, by replica. Raises UnknownLeague."""
+    leagues.require(session, league)
+    query = select(Acknowledgement).filter_by(league=league).order_by(Acknowledgement.replica)
+    found = session.scalars(query.where(Acknowledgement.seen_at >= datetime.now(UTC) - since))
+    return [
+        rows.Acknowledgement(row.replica, row.league, row.version, row.sha256, row.fault, row.seen_at) for row in found
+    ]
+
+
+def forget(session: Session, replica: str) -> None:
+    """Remove all that a replica said: it stops."""
+    session.execute(delete(Acknowledgement).filter_by(replica=replica))

@@ -1,0 +1,222 @@
+"""The face of the registry: each method is one transaction, or a version's whole way to being published."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, Self
+
+from league.config import LeagueConfig
+from league.errors import StorageError
+from league.interface import Interface
+from league.refs import CHAMPION, CheckpointRef
+from league.registry import acknowledgements, aliases, leagues, publishing, verdicts, versions
+from league.registry.aliases import AnyVersion
+from league.registry.artifacts import ArtifactStore
+from league.registry.database import Database
+from league.registry.faults import DISK_FULL_OR_SHUT, disk_faults
+from league.registry.manifest import Manifest
+from league.registry.rows import Acknowledgement, AliasEvent, LeagueRow, VerdictRow, VersionRow
+from league.settings import Storage
+
+Build = Callable[[Path, int], Manifest]
+"""Writes the files of version `number` into a directory and returns its manifest, without digests."""
+
+
+class Registry:
+    """Leagues, versions, aliases, verdicts and acknowledgements. May be used by several threads.
+
+    Every method raises StorageError, in one sentence, when the database or the artefact store fails.
+    """
+
+    def __init__(self, storage: Storage, database: Database) -> None:
+        self.storage = storage
+        self.database = database
+        self.artifacts = ArtifactStore(storage.artifacts)
+
+    @classmethod
+    def open(cls, storage: Storage | None = None) -> Self:
+        """The registry at `storage`, by default that of the environment; made or migrated if need be."""
+        storage = storage or Storage.from_environment()
+        return cls(storage, Database(storage.database_url))
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self.database.close()
+
+    # Leagues
+
+    def register(self, config: LeagueConfig, interface: Interface) -> None:
+        """Make a league known or renew its configuration. Raises InterfaceChanged if versions differ."""
+        with self.database.write() as session:
+            leagues.register(session, config, interface)
+
+    def leagues(self) -> list[LeagueRow]:
+        """All leagues by name."""
+        with self.database.read() as session:
+            return leagues.every(session)
+
+    def league(self, slug: str) -> LeagueRow:
+        """One league. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return leagues.get(session, slug)
+
+    # Versions
+
+    def publish(self, league: str, build: Build, *, source: str, parent: int | None = None) -> VersionRow:
+        """Publish what `build` writes as the next version, whole or not at all.
+
+        source: names the checkpoint; publishing it again returns the version that it became.
+        Raises UnknownLeague, UnknownVersion (of the parent), InterfaceChanged, and whatever `build` raises.
+        """
+        self.sweep(league)
+        with self.database.write() as session:
+            leagues.lock(session, league)
+            if (ready := versions.of_source(session, league, source)) is None:
+                number = publishing.reserve(session, league, source, parent, above=self.artifacts.last(league))
+        if ready is None:
+            ready = self._build(league, number, build, source, parent)
+        return self.version(league, ready)
+
+    def sweep(self, league: str) -> None:
+        """Clear away what publishers that died have left."""
+        with self.database.write() as session:
+            numbers = publishing.stale(session, league)
+        for number in numbers:
+            self._clear(league, number)
+
+    def versions(self, league: str) -> list[VersionRow]:
+        """All versions of a league, ascending. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return versions.every(session, league)
+
+    def version(self, league: str, number: int) -> VersionRow:
+        """One version. Raises UnknownLeague or UnknownVersion."""
+        with self.database.read() as session:
+            return versions.get(session, league, number)
+
+    def resolve(self, ref: CheckpointRef | str) -> VersionRow:
+        """The version that a reference names now.
+
+        Raises InvalidReference, UnknownLeague, UnknownVersion or UnknownAlias.
+        """
+        ref = CheckpointRef.parse(ref) if isinstance(ref, str) else ref
+        with self.database.read() as session:
+            return versions.resolve(session, ref)
+
+    def fetch(self, league: str, number: int) -> Path:
+        """A local directory with the files of a version, each verified. Raises ArtifactCorrupt."""
+        return self.artifacts.verify(league, number, self.version(league, number).sha256)
+
+    def _build(self, league: str, number: int, build: Build, source: str, parent: int | None) -> int:
+        """Write a reserved version; returns the number of the one that is ready in the end."""
+        try:
+            staging = self.artifacts.stage(league, number)
+            with disk_faults(staging, only=DISK_FULL_OR_SHUT):
+                manifest = build(staging, number)
+            publishing.check(manifest, league, number, parent)
+            text = self.artifacts.commit(manifest)
+            with self.database.write() as session:
+                return publishing.finish(session, manifest, text, source)
+        finally:
+            self._withdraw_unfinished(league, number)
+
+    def _withdraw_unfinished(self, league: str, number: int) -> None:
+        """Leave nothing of a version that is not ready. What cannot be cleared away now is swept later."""
+        with suppress(StorageError):
+            with self.database.write() as session:
+                abandoned = publishing.abandon(session, league, number)
+            if abandoned:
+                self._clear(league, number)
+
+    def _clear(self, league: str, number: int) -> None:
+        self.artifacts.discard(league, number)
+        with self.database.write() as session:
+            publishing.forget(session, league, number)
+
+    # Aliases
+
+    def aliases(self, league: str) -> dict[str, int]:
+        """alias → version. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return aliases.current(session, league)
+
+    def all_aliases(self) -> dict[tuple[str, str], int]:
+        """(league, alias) → version of all leagues, by one cheap query."""
+        with self.database.read() as session:
+            return aliases.every(session)
+
+    def set_alias(
+        self,
+        league: str,
+        alias: str,
+        version: int,
+        *,
+        expected: int | AnyVersion | None,
+        actor: str,
+        reason: str,
+        verdict: str | None = None,
+    ) -> AliasEvent:
+        """Point `alias` at `version` if it points at `expected` (None: if it does not exist; ANY: always).
+
+        Returns the event in force. Raises UnknownLeague, UnknownVersion, or AliasMoved, saying where it is.
+        """
+        with self.database.write() as session:
+            return aliases.move(
+                session,
+                league,
+                alias,
+                version,
+                expected=expected,
+                actor=actor,
+                reason=reason,
+                verdict=verdict,
+            )
+
+    def rollback(self, league: str, *, actor: str, reason: str) -> AliasEvent:
+        """Return the champion to the one before it. Raises UnknownLeague or NothingToRollBack."""
+        with self.database.write() as session:
+            return aliases.roll_back(session, league, CHAMPION, actor=actor, reason=reason)
+
+    def history(self, league: str, alias: str = CHAMPION, at: datetime | None = None) -> list[AliasEvent]:
+        """The events of an alias, newest first; with `at`, only the one that was in force then."""
+        with self.database.read() as session:
+            return aliases.history(session, league, alias, at)
+
+    # Acknowledgements
+
+    def acknowledge(
+        self, replica: str, league: str, version: int | None, sha256: str | None, fault: str | None = None
+    ) -> None:
+        """Say what a replica serves of a league, and why not what it should. Raises UnknownLeague."""
+        with self.database.write() as session:
+            acknowledgements.write(session, replica, league, version, sha256, fault)
+
+    def acknowledgements(self, league: str, since: timedelta = timedelta(seconds=15)) -> list[Acknowledgement]:
+        """What replicas said of a league in the last `since`. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return acknowledgements.fresh(session, league, since)
+
+    def forget(self, replica: str) -> None:
+        """Remove what a replica said: it stops."""
+        with self.database.write() as session:
+            acknowledgements.forget(session, replica)
+
+    # Verdicts
+
+    def open_verdict(
+        self, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]
+    ) -> VerdictRow:
+        """Open the verdict that counts the matches of `schedule`, or find it. Its id is the schedule's."""
+        with self.database.write() as session:
+            return verdicts.start(session, league, candidate, champion, schedule, settings)
+
+    def close_verdict(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
+        """Record how a verdict came out; twice is once. Raises NotFound, or Conflict if it is another."""
+        with self.database.write() as session:
+            verdicts.close(session, verdict, outcome, evidence)
+
+    def verdicts(self, league: str) -> list[VerdictRow]:
+        """All verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return verdicts.every(session, league)

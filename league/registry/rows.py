@@ -1,0 +1,102 @@
+"""What the registry answers: plain frozen records, none tied to a database session."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+from league.config import LeagueConfig
+from league.interface import Interface
+from league.registry.manifest import Manifest
+
+
+@dataclass(frozen=True, slots=True)
+class LeagueRow:
+    """A registered league."""
+
+    slug: str
+    config: LeagueConfig
+    interface: Interface
+    interface_digest: str
+    environment_digest: str
+    registered_at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class VersionRow:
+    """A whole, published checkpoint version."""
+
+    league: str
+    number: int
+    source: str
+    """The checkpoint that it was made from."""
+    sha256: str
+    """The digest of manifest.json, and so of the version."""
+    manifest: Manifest
+    aliases: tuple[str, ...]
+
+    @property
+    def ref(self) -> str:
+        return f"{self.league}@{self.number}"
+
+    @property
+    def parent(self) -> int | None:
+        return self.manifest.parent
+
+    @property
+    def steps(self) -> int:
+        return self.manifest.steps
+
+    @property
+    def created_at(self) -> datetime:
+        return self.manifest.created_at
+
+
+@dataclass(frozen=True, slots=True)
+class AliasEvent:
+    """One movement of an alias."""
+
+    id: int
+    league: str
+    alias: str
+    kind: Literal["set", "rollback"]
+    version: int
+    previous: int | None
+    """The version that it pointed to before."""
+    actor: str
+    reason: str
+    verdict: str | None
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledgement:
+    """What a serving replica serves of a league. `version` is None while it serves nothing of it."""
+
+    replica: str
+    league: str
+    version: int | None
+    sha256: str | None
+    fault: str | None
+    """Why it does not serve what it should."""
+    seen_at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictRow:
+    """A gate's decision on `candidate` against `champion`; outcome and evidence are None until it is made."""
+
+    id: str
+    """The id of the schedule whose matches it counts."""
+    league: str
+    candidate: int
+    champion: str
+    """A reference: `connect_four@3`, or `script:random` where there was no champion."""
+    settings: dict[str, Any]
+    outcome: str | None
+    evidence: dict[str, Any] | None
+    opened_at: datetime
+    closed_at: datetime | None
+
+    @property
+    def schedule(self) -> str:
+        return self.id

@@ -1,0 +1,194 @@
+"""The registry's tables. A change here needs a migration beside it: `migrations/versions/`."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    MetaData,
+    String,
+    Text,
+    TypeDecorator,
+    text,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+PUBLISHING, READY, ABANDONED = "publishing", "ready", "abandoned"
+"""The states of a version: only `ready` ones exist for anybody but their publisher."""
+
+
+class Utc(TypeDecorator[datetime]):
+    """An instant. SQLite has no time zones: there it is stored as naive UTC."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError(f"{value} has no time zone")
+        value = value.astimezone(UTC)
+        return value.replace(tzinfo=None) if dialect.name == "sqlite" else value
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Table(DeclarativeBase):
+    """Names every constraint, so that a migration can drop it on any database."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class League(Table):
+    """A registered league. Its row is the lock of every change below it."""
+
+    __tablename__ = "leagues"
+
+    slug: Mapped[str] = mapped_column(String(255), primary_key=True)
+    config: Mapped[dict[str, Any]] = mapped_column(JSON)
+    interface: Mapped[dict[str, Any]] = mapped_column(JSON)
+    interface_digest: Mapped[str] = mapped_column(String(64))
+    environment_digest: Mapped[str] = mapped_column(String(64))
+    last_version: Mapped[int]
+    """The highest number ever reserved. Numbers are not used again, whatever became of them."""
+    registered_at: Mapped[datetime] = mapped_column(Utc)
+
+
+class Version(Table):
+    """A checkpoint version: reserved (`publishing`), whole (`ready`), or to be cleared away (`abandoned`)."""
+
+    __tablename__ = "versions"
+    __table_args__ = (
+        Index(
+            "uq_versions_ready_source",
+            "league",
+            "source",
+            unique=True,
+            sqlite_where=text("state = 'ready'"),
+            postgresql_where=text("state = 'ready'"),
+        ),
+        ForeignKeyConstraint(["league", "parent"], ["versions.league", "versions.number"]),
+    )
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    state: Mapped[str] = mapped_column(String(16))
+    source: Mapped[str] = mapped_column(Text)
+    parent: Mapped[int | None]
+    publisher: Mapped[str] = mapped_column(Text)
+    """The process that writes it, see publisher.py."""
+    reserved_at: Mapped[datetime] = mapped_column(Utc)
+    manifest: Mapped[str | None] = mapped_column(Text)
+    """manifest.json, byte for byte; null until ready."""
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    """The digest of manifest.json, which holds the digests of all other files."""
+
+
+class AliasEvent(Table):
+    """One movement of an alias: who, when, why, on which verdict. Never changed."""
+
+    __tablename__ = "alias_events"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
+        Index("ix_alias_events_league_alias_id", "league", "alias", "id"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    league: Mapped[str] = mapped_column(String(255))
+    alias: Mapped[str] = mapped_column(String(255))
+    kind: Mapped[str] = mapped_column(String(16))
+    version: Mapped[int]
+    previous: Mapped[int | None]
+    beneath: Mapped[int | None] = mapped_column(ForeignKey("alias_events.id"))
+    """The event that a rollback of this one returns to."""
+    actor: Mapped[str] = mapped_column(Text)
+    reason: Mapped[str] = mapped_column(Text)
+    verdict: Mapped[str | None] = mapped_column(ForeignKey("verdicts.id"))
+    at: Mapped[datetime] = mapped_column(Utc)
+
+
+class Alias(Table):
+    """Where an alias points now, and the event that put it there."""
+
+    __tablename__ = "aliases"
+    __table_args__ = (ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),)
+
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    name: Mapped[str] = mapped_column(String(255), primary_key=True)
+    version: Mapped[int]
+    event: Mapped[int] = mapped_column(ForeignKey("alias_events.id"))
+
+
+class Acknowledgement(Table):
+    """What a serving replica says that it serves."""
+
+    __tablename__ = "acknowledgements"
+
+    replica: Mapped[str] = mapped_column(String(255), primary_key=True)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    version: Mapped[int | None]
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    fault: Mapped[str | None] = mapped_column(Text)
+    seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
+
+
+class Schedule(Table):
+    """What is to be played. `sequence` is the order in which schedules were opened."""
+
+    __tablename__ = "schedules"
+
+    sequence: Mapped[int] = mapped_column(primary_key=True)
+    id: Mapped[str] = mapped_column(String(255), unique=True)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), index=True)
+    document: Mapped[str] = mapped_column(Text)
+    opened_at: Mapped[datetime] = mapped_column(Utc)
+
+
+class Match(Table):
+    """The ledger: one block of games. Who played, and from which seed, follows from the schedule."""
+
+    __tablename__ = "matches"
+
+    schedule: Mapped[str] = mapped_column(ForeignKey("schedules.id"), primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    games: Mapped[int]
+    scores: Mapped[str] = mapped_column(Text)
+    returns: Mapped[str] = mapped_column(Text)
+    """Sums over the games for each contestant, a JSON list: all that ratings read."""
+    moves: Mapped[str] = mapped_column(Text)
+    """The games whole: what `results/documents.py` writes."""
+    played_at: Mapped[datetime] = mapped_column(Utc)
+
+
+class Verdict(Table):
+    """What a gate is deciding (`outcome` is null) or has decided, with its evidence."""
+
+    __tablename__ = "verdicts"
+    __table_args__ = (ForeignKeyConstraint(["league", "candidate"], ["versions.league", "versions.number"]),)
+
+    id: Mapped[str] = mapped_column(String(255), primary_key=True)
+    """That of the schedule whose matches it counts."""
+    league: Mapped[str] = mapped_column(String(255), index=True)
+    candidate: Mapped[int]
+    champion: Mapped[str] = mapped_column(Text)
+    settings: Mapped[dict[str, Any]] = mapped_column(JSON)
+    outcome: Mapped[str | None] = mapped_column(String(16))
+    evidence: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    opened_at: Mapped[datetime] = mapped_column(Utc)
+    closed_at: Mapped[datetime | None] = mapped_column(Utc)

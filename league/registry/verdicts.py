@@ -1,0 +1,59 @@
+"""Verdicts: opened before the first match that they count, closed once, never changed after."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from league.errors import Conflict, NotFound
+from league.registry import leagues, rows, versions
+from league.registry.database import insert
+from league.registry.tables import Verdict
+
+
+def start(
+    session: Session, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]
+) -> rows.VerdictRow:
+    """Open the verdict of a schedule, or find it. Raises UnknownVersion, or Conflict if it differs."""
+    versions.require(session, league, candidate)
+    asked = {"league": league, "candidate": candidate, "champion": champion, "settings": settings}
+    insert(session, Verdict, [asked | {"id": schedule, "opened_at": datetime.now(UTC)}])
+    verdict = session.get_one(Verdict, schedule)
+    for name, value in asked.items():
+        if getattr(verdict, name) != value:
+            raise Conflict(f"verdict {schedule} was opened with {name} {getattr(verdict, name)!r}, not {value!r}")
+    return _row(verdict)
+
+
+def close(session: Session, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
+    """Record how it came out; twice is once. Raises NotFound, or Conflict if it came out otherwise before."""
+    row = session.get(Verdict, verdict, with_for_update=True)
+    if row is None:
+        raise NotFound(f"there is no verdict {verdict!r}")
+    if row.outcome is not None:
+        if row.outcome != outcome:
+            raise Conflict(f"verdict {verdict} is {row.outcome!r} already, it cannot become {outcome!r}")
+        return
+    row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
+
+
+def every(session: Session, league: str) -> list[rows.VerdictRow]:
+    """All verdicts of a league, in the order in which they were opened. Raises UnknownLeague."""
+    leagues.require(session, league)
+    query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at, Verdict.id)
+    return [_row(verdict) for verdict in session.scalars(query)]
+
+
+def _row(verdict: Verdict) -> rows.VerdictRow:
+    return rows.VerdictRow(
+        id=verdict.id,
+        league=verdict.league,
+        candidate=verdict.candidate,
+        champion=verdict.champion,
+        settings=verdict.settings,
+        outcome=verdict.outcome,
+        evidence=verdict.evidence,
+        opened_at=verdict.opened_at,
+        closed_at=verdict.closed_at,
+    )

@@ -1,0 +1,146 @@
+"""The append-only store of what was played. It takes what its schedules ask for, and each match once."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any, TypeVarTuple
+
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session
+
+from league.errors import NotFound
+from league.registry import leagues, tables
+from league.registry.database import insert
+from league.registry.registry import Registry
+from league.results.admission import admit
+from league.results.documents import (
+    dump_games,
+    dump_numbers,
+    dump_schedule,
+    load_games,
+    load_numbers,
+    load_schedule,
+)
+from league.results.records import BlockResult, Match, Schedule
+
+Columns = TypeVarTuple("Columns")
+
+
+class Ledger:
+    """Schedules and their matches, in the registry's database. Raises StorageError when that fails."""
+
+    def __init__(self, registry: Registry) -> None:
+        self._database = registry.database
+
+    def open(self, schedule: Schedule) -> Schedule:
+        """Store a schedule unless its id is there already; returns the stored one. Raises UnknownLeague."""
+        row = {"id": schedule.id, "league": schedule.league, "document": dump_schedule(schedule)}
+        with self._database.write() as session:
+            leagues.require(session, schedule.league)
+            insert(session, tables.Schedule, [row | {"opened_at": datetime.now(UTC)}])
+            return _schedule(session, schedule.id)
+
+    def schedules(self, league: str) -> list[Schedule]:
+        """All schedules of a league, in the order in which they were opened. Raises UnknownLeague."""
+        with self._database.read() as session:
+            return _schedules(session, league)
+
+    def append(self, match: Match) -> bool:
+        """Store a match; False if it is there already. Raises LedgerRefusal if it breaks its schedule."""
+        return self.extend([match]) == 1
+
+    def extend(self, matches: Sequence[Match]) -> int:
+        """Store matches, all or none; returns how many were new. Raises LedgerRefusal if one does not fit."""
+        with self._database.write() as session:
+            schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
+            for match in matches:
+                admit(match, schedules[match.schedule])
+            return insert(session, tables.Match, [_row(match) for match in matches])
+
+    def matches(self, *, league: str, schedule: str | None = None, after: int | None = None) -> list[Match]:
+        """The matches of a league, or of one of its schedules, in schedule order.
+
+        after: only those at later positions than this.
+        """
+        with self._database.read() as session:
+            schedules = {known.id: known for known in _schedules(session, league)}
+            query = _in_order(select(tables.Match.schedule, tables.Match.position, tables.Match.moves), league)
+            if schedule is not None:
+                query = query.where(tables.Match.schedule == schedule)
+            if after is not None:
+                query = query.where(tables.Match.position > after)
+            found = session.execute(query)
+            return [_match(schedules[of], position, moves) for of, position, moves in found]
+
+    def positions(self, schedule: str) -> set[int]:
+        """Which positions of a schedule were played."""
+        with self._database.read() as session:
+            return set(session.scalars(select(tables.Match.position).filter_by(schedule=schedule)))
+
+    def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
+        """The matches of a league without their moves, in schedule order; of one environment if given."""
+        match = tables.Match
+        columns = match.schedule, match.position, match.games, match.scores, match.returns
+        with self._database.read() as session:
+            schedules = {
+                known.id: known
+                for known in _schedules(session, league)
+                if environment_digest in (None, known.environment_digest)
+            }
+            found = session.execute(_in_order(select(*columns), league))
+            return [
+                BlockResult(
+                    schedule=of,
+                    position=position,
+                    contestants=schedules[of].contestants_at(position),
+                    games=games,
+                    scores=load_numbers(scores),
+                    returns=load_numbers(returns),
+                )
+                for of, position, games, scores, returns in found
+                if of in schedules
+            ]
+
+
+def _schedules(session: Session, league: str) -> list[Schedule]:
+    leagues.require(session, league)
+    query = select(tables.Schedule.document).filter_by(league=league).order_by(tables.Schedule.sequence)
+    return [load_schedule(document) for document in session.scalars(query)]
+
+
+def _schedule(session: Session, name: str) -> Schedule:
+    document = session.scalar(select(tables.Schedule.document).filter_by(id=name))
+    if document is None:
+        raise NotFound(f"no schedule {name!r} was opened")
+    return load_schedule(document)
+
+
+def _in_order(query: Select[*Columns], league: str) -> Select[*Columns]:
+    query = query.join(tables.Schedule, tables.Schedule.id == tables.Match.schedule)
+    query = query.where(tables.Schedule.league == league)
+    return query.order_by(tables.Schedule.sequence, tables.Match.position)
+
+
+def _row(match: Match) -> dict[str, Any]:
+    contestants = range(len(match.contestants))
+    return {
+        "schedule": match.schedule,
+        "position": match.position,
+        "games": len(match.games),
+        "scores": dump_numbers([sum(game.scores[c] for game in match.games) for c in contestants]),
+        "returns": dump_numbers([sum(game.returns[c] for game in match.games) for c in contestants]),
+        "moves": dump_games(match.games),
+        "played_at": datetime.now(UTC),
+    }
+
+
+def _match(schedule: Schedule, position: int, moves: str) -> Match:
+    return Match(
+        id=schedule.match_id(position),
+        league=schedule.league,
+        schedule=schedule.id,
+        position=position,
+        contestants=schedule.contestants_at(position),
+        seed=schedule.seed_at(position),
+        environment_digest=schedule.environment_digest,
+        games=load_games(moves),
+    )

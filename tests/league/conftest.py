@@ -1,0 +1,28 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from league.settings import Storage
+from tests.league.registry import postgresql
+
+
+@pytest.fixture(scope="session")
+def postgresql_socket() -> Iterator[Path]:
+    programs = postgresql.programs()
+    if programs is None:
+        pytest.skip("PostgreSQL is not installed")
+    with postgresql.server(programs) as socket:
+        yield socket
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
+    """An empty home, on each database."""
+    storage = Storage.at(tmp_path / "home")
+    if request.param == "sqlite":
+        return storage
+    socket = request.getfixturevalue("postgresql_socket")
+    return replace(storage, database_url=postgresql.create(socket, f"league_{uuid4().hex}"))

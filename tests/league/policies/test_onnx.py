@@ -1,0 +1,186 @@
+"""A graph acts greedily or by its distribution, row by row, and says what is wrong with what it is given."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from league.errors import ArtifactCorrupt, EnvironmentMismatch, InvalidInput, ObservationError
+from league.policies.onnx import OnnxPolicy
+from league.registry.manifest import Parity, PolicyManifest, Tensor
+from league.spaces import Box, DictSpace, Discrete
+from tests.league.policies.graphs import continuous, counting, masked_mlp
+
+GRAPH = masked_mlp()
+POLICY = OnnxPolicy(GRAPH)
+
+
+def manifest(**changes: Any) -> PolicyManifest:
+    """What `masked_mlp` must look like."""
+    board = Box(dtype="int8", shape=(6, 7, 2), low=0, high=1)
+    mask = Box(dtype="int8", shape=(7,), low=0, high=1)
+    fields: dict[str, Any] = {
+        "file": "shared.onnx",
+        "observation": DictSpace(spaces={"observation": board, "action_mask": mask}),
+        "action": Discrete(n=7),
+        "inputs": (
+            Tensor(name="observation", dtype="int8", shape=(None, 6, 7, 2)),
+            Tensor(name="action_mask", dtype="int8", shape=(None, 7)),
+        ),
+        "outputs": (
+            Tensor(name="action", dtype="int64", shape=(None,)),
+            Tensor(name="action_dist_inputs", dtype="float32", shape=(None, 7)),
+        ),
+        "parity": Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
+    }
+    return PolicyManifest.model_validate(fields | changes)
+
+
+def observations(rows: int, seed: int = 0) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(seed)
+    mask = random.integers(0, 2, (rows, 7), dtype=np.int8)
+    mask[np.arange(rows), random.integers(0, 7, rows)] = 1
+    return {"observation": random.integers(0, 2, (rows, 6, 7, 2), dtype=np.int8), "action_mask": mask}
+
+
+def generators(rows: int, seed: int = 0) -> list[np.random.Generator]:
+    return [np.random.default_rng((seed, row)) for row in range(rows)]
+
+
+def test_greedy_actions_are_the_legal_mode() -> None:
+    batch = observations(50)
+    answer = POLICY.act(batch)
+    logits = POLICY.act(batch, explore=True, rng=generators(50)).dist_inputs
+    assert logits is not None
+    assert answer.actions.tolist() == np.where(batch["action_mask"] == 1, logits, -np.inf).argmax(1).tolist()
+    assert (answer.state, answer.dist_inputs) == (None, None)
+    assert len(set(answer.actions.tolist())) > 3
+
+
+def test_a_file_is_its_bytes(tmp_path: Path) -> None:
+    (tmp_path / "shared.onnx").write_bytes(GRAPH)
+    batch = observations(9)
+    for graph in (tmp_path / "shared.onnx", str(tmp_path / "shared.onnx")):
+        assert OnnxPolicy(graph, manifest()).act(batch).actions.tolist() == POLICY.act(batch).actions.tolist()
+
+
+def test_a_row_is_answered_whatever_its_batch() -> None:
+    batch = observations(20)
+    together = POLICY.act(batch, explore=True, rng=generators(20)).actions
+    for row in range(20):
+        alone = {name: array[row : row + 1] for name, array in batch.items()}
+        assert POLICY.act(alone, explore=True, rng=generators(20)[row : row + 1]).actions == together[row]
+
+
+def test_exploring_follows_the_distribution() -> None:
+    rows = 20_000
+    batch = {name: np.repeat(array, rows, axis=0) for name, array in observations(1, seed=3).items()}
+    answer = POLICY.act(batch, explore=True, rng=generators(rows))
+    assert answer.dist_inputs is not None
+    weights = np.exp(answer.dist_inputs[0].astype(np.float64))
+    probability = weights / weights.sum()
+    share = np.bincount(answer.actions, minlength=7) / rows
+    assert (probability > 0.05).sum() > 2, "there is something to choose from"
+    assert (np.abs(share - probability) <= 5 * np.sqrt(probability * (1 - probability) / rows)).all()
+
+
+@given(arrays(np.int8, (4, 7), elements=st.integers(0, 1)), st.integers(0, 2**32))
+def test_what_is_illegal_is_never_chosen(mask: np.ndarray, seed: int) -> None:
+    mask[:, seed % 7] = 1
+    batch = observations(4, seed) | {"action_mask": mask}
+    for answer in (POLICY.act(batch), POLICY.act(batch, explore=True, rng=generators(4, seed))):
+        assert mask[np.arange(4), answer.actions].all()
+
+
+def test_actions_start_where_their_space_does() -> None:
+    policy = OnnxPolicy(masked_mlp(start=3), manifest(action=Discrete(n=7, start=3)))
+    batch = observations(30)
+    assert (policy.act(batch).actions == POLICY.act(batch).actions + 3).all()
+    explored = policy.act(batch, explore=True, rng=generators(30)).actions
+    assert (explored == POLICY.act(batch, explore=True, rng=generators(30)).actions + 3).all()
+
+
+def test_recurrent_state_goes_in_and_comes_out() -> None:
+    policy = OnnxPolicy(counting())
+    state = None
+    for step, (expected, actions) in enumerate([([1, 2], [0, 0]), ([2, 4], [0, 1]), ([3, 6], [1, 1])]):
+        answer = policy.act({"observation": np.array([[1], [2]], np.float32)}, state=state)
+        state = answer.state
+        assert state is not None, step
+        assert state["state_in_0"].ravel().tolist() == expected
+        assert answer.actions.tolist() == actions
+    explored = policy.act({"observation": np.zeros((1, 1), np.float32)}, explore=True, rng=generators(1))
+    assert list(explored.state or ()) == ["state_in_0"]
+    assert explored.dist_inputs is not None
+
+
+def test_a_vector_of_actions_is_played_but_not_explored() -> None:
+    policy = OnnxPolicy(continuous())
+    value = np.array([[0.25, -1.5]], np.float32)
+    assert (policy.act({"observation": value}).actions == value).all()
+    with pytest.raises(EnvironmentMismatch, match="cannot explore"):
+        policy.act({"observation": value}, explore=True, rng=generators(1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"action_mask": None}, r"action_mask is missing: expected a batch of int8 \[7\]"),
+        ({"observation": np.zeros((1, 6, 7, 2))}, r"observation is float64 \[6, 7, 2\]: expected .* int8"),
+        ({"observation": np.zeros((1, 6, 7), np.int8)}, r"observation is int8 \[6, 7\]: expected .*\[6, 7, 2\]"),
+        ({"observation": np.zeros((2, 6, 7, 2), np.int8)}, r"rows differ: .*'observation': 2"),
+        ({"observation": [[0]]}, r"observation is no NumPy array"),
+    ],
+)
+def test_what_does_not_fit_is_named(change: dict[str, Any], message: str) -> None:
+    batch = {name: array for name, array in (observations(1) | change).items() if array is not None}
+    with pytest.raises(ObservationError, match=message):
+        POLICY.act(batch)
+
+
+def test_a_state_that_does_not_fit_is_named() -> None:
+    policy = OnnxPolicy(counting())
+    batch = {"observation": np.zeros((1, 1), np.float32)}
+    with pytest.raises(ObservationError, match=r"state_in_0 is float32 \[2\]"):
+        policy.act(batch, state={"state_in_0": np.zeros((1, 2), np.float32)})
+    with pytest.raises(ObservationError, match=r"state_in_0 is missing"):
+        policy.act(batch, state={})
+
+
+@pytest.mark.parametrize("rng", [None, generators(1)])
+def test_exploring_needs_a_generator_for_each_row(rng: list[np.random.Generator] | None) -> None:
+    with pytest.raises(InvalidInput, match="2 rows needs rng"):
+        POLICY.act(observations(2), explore=True, rng=rng)
+
+
+@pytest.mark.parametrize(
+    ("graph", "changes", "message"),
+    [
+        (b"no graph", {}, "ONNX Runtime cannot load the graph"),
+        (GRAPH[:-100], {}, "ONNX Runtime cannot load the graph"),
+        (GRAPH, {"inputs": manifest().inputs[:1]}, "input action_mask of the graph is int8, but missing in"),
+        (counting(), {}, "input action_mask of the graph is missing, but int8 in the manifest"),
+        (
+            GRAPH,
+            {"outputs": (Tensor(name="action", dtype="int32", shape=(None,)), manifest().outputs[1])},
+            "output action of the graph is int64, but int32 in the manifest",
+        ),
+    ],
+)
+def test_a_graph_that_is_not_the_manifest_s_is_refused(graph: bytes, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ArtifactCorrupt, match=message) as caught:
+        OnnxPolicy(graph, manifest(**changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_graph_must_have_the_outputs_of_a_policy() -> None:
+    import onnx
+
+    model = onnx.load_from_string(GRAPH)
+    del model.graph.output[1]
+    with pytest.raises(ArtifactCorrupt, match="has no output action_dist_inputs"):
+        OnnxPolicy(model.SerializeToString())

@@ -1,0 +1,173 @@
+"""The client: what it sends, what it makes of the answers, and what it tries again."""
+
+import json
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from league.errors import InvalidInput, InvalidReference, NotReady, ObservationError, RemoteError, UnknownLeague
+from league.policies import remote
+from league.policies.remote import ATTEMPTS, RemotePolicy
+
+BOARD = {"observation": np.zeros((2, 6, 7, 2), np.int8), "action_mask": np.ones((2, 7), np.int8)}
+DROP = (0, b"")
+"""An answer that is none: the connection ends."""
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Gives the next of the prepared answers, the last one for ever, and keeps what it was asked."""
+
+    protocol_version = "HTTP/1.1"
+    answers: ClassVar[list[tuple[int, bytes]]] = []
+    asked: ClassVar[list[tuple[str, Any]]] = []
+    connections: ClassVar[set[tuple[str, int]]] = set()
+
+    def do_POST(self) -> None:
+        self.connections.add(self.client_address)
+        self.asked.append((self.path, json.loads(self.rfile.read(int(self.headers["content-length"])))))
+        status, body = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        if not status:
+            self.close_connection = True
+            return
+        self.send_response(status)
+        self.send_header("content-length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def url(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setattr(remote, "BACK_OFF", 0.001)
+    for collection in (Handler.answers, Handler.asked, Handler.connections):
+        collection.clear()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+
+
+def answers(*prepared: tuple[int, bytes]) -> None:
+    Handler.answers[:] = prepared
+
+
+def actions(*given: Any) -> tuple[int, bytes]:
+    return 200, json.dumps({"actions": given, "model": "board", "version": 1, "sha256": "0" * 64}).encode()
+
+
+def error(status: int, code: str, message: str = "a sentence") -> tuple[int, bytes]:
+    return status, json.dumps({"code": code, "message": message}).encode()
+
+
+def test_a_batch_is_sent_row_by_row(url: str) -> None:
+    answers(actions(3, 4))
+    with RemotePolicy(url, "board.left", version=7) as policy:
+        answer = policy.act(BOARD)
+    assert (answer.actions.tolist(), answer.actions.dtype, answer.state) == ([3, 4], np.int64, None)
+    board = {"observation": np.zeros((6, 7, 2), int).tolist(), "action_mask": [1] * 7}
+    assert Handler.asked == [("/v1/policies/board.left/action?version=7", {"observations": [board, board]})]
+
+
+def test_leaves_go_back_to_where_their_names_say(url: str) -> None:
+    answers(actions(0))
+    policy = RemotePolicy(url, "board")
+    policy.act({"observation.a.b": np.ones((1, 2), np.float32), "observation.c": np.array([3])})
+    policy.act({"observation.grid": np.array([[1]]), "action_mask": np.array([[1, 0]])})
+    policy.act({"observation": np.array([5])})
+    sent = [body["observations"] for _, body in Handler.asked]
+    assert sent == [[{"a": {"b": [1.0, 1.0]}, "c": 3}], [{"observation": {"grid": [1]}, "action_mask": [1, 0]}], [5]]
+
+
+def test_vectors_and_state_come_back_as_float32(url: str) -> None:
+    reply = {"actions": [[0.5, -1.0]], "state": {"state_in_0": [[1.5]]}}
+    answers((200, json.dumps(reply).encode()))
+    answer = RemotePolicy(url, "vector").act(
+        {"observation": np.zeros((1, 2), np.float32)}, state={"state_in_0": np.ones((1, 1), np.float32)}
+    )
+    assert answer.actions.dtype == np.float32
+    assert answer.state is not None
+    np.testing.assert_array_equal(answer.state["state_in_0"], np.array([[1.5]], np.float32))
+    assert Handler.asked[0][1]["state"] == {"state_in_0": [[1.0]]}
+
+
+def test_a_row_explores_by_its_own_generator(url: str) -> None:
+    answers(actions(0, 0))
+    generators = [np.random.default_rng(seed) for seed in (1, 2)]
+    RemotePolicy(url, "board").act(BOARD, explore=True, rng=generators)
+    expected = [int(np.random.default_rng(seed).integers(2**63)) for seed in (1, 2)]
+    assert Handler.asked[0][1]["seed"] == expected
+    with pytest.raises(InvalidInput, match="rng"):
+        RemotePolicy(url, "board").act(BOARD, explore=True)
+
+
+def test_connections_are_kept(url: str) -> None:
+    answers(actions(1, 1))
+    with RemotePolicy(url, "board") as policy:
+        for _ in range(5):
+            policy.act(BOARD)
+    assert len(Handler.connections) == 1
+
+
+@pytest.mark.parametrize(
+    "trouble",
+    [DROP, error(503, "not_ready"), (500, b"Internal Server Error"), (429, b"dropped due to backpressure")],
+    ids=["dropped", "not ready", "HAProxy", "overloaded"],
+)
+def test_what_may_pass_is_tried_again(url: str, trouble: tuple[int, bytes]) -> None:
+    answers(*[trouble] * (ATTEMPTS - 1), actions(1, 1))
+    assert RemotePolicy(url, "board").act(BOARD).actions.tolist() == [1, 1]
+    assert len(Handler.asked) == ATTEMPTS
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected", "attempts"),
+    [
+        (error(404, "unknown_league", "there is no league 'board'"), UnknownLeague, 1),
+        (error(400, "invalid_observation"), ObservationError, 1),
+        (error(413, "body_too_large"), InvalidInput, 1),
+        (error(503, "not_ready"), NotReady, ATTEMPTS),
+        (error(500, "internal_error"), RemoteError, 1),
+        ((200, b"<html>"), RemoteError, 1),
+        ((404, b"nothing here"), RemoteError, 1),
+        ((500, b"Internal Server Error"), RemoteError, ATTEMPTS),
+        (DROP, RemoteError, ATTEMPTS),
+    ],
+)
+def test_what_stays_is_raised(url: str, answer: tuple[int, bytes], expected: type[Exception], attempts: int) -> None:
+    answers(answer)
+    with pytest.raises(expected) as raised:
+        RemotePolicy(url, "board").act(BOARD)
+    assert type(raised.value) is expected
+    assert len(Handler.asked) == attempts
+
+
+def test_the_server_s_sentence_is_kept(url: str) -> None:
+    answers(error(404, "unknown_league", "there is no league 'board'; known: none yet"))
+    with pytest.raises(UnknownLeague, match="known: none yet"):
+        RemotePolicy(url, "board").act(BOARD)
+
+
+def test_nobody_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "BACK_OFF", 0.001)
+    with pytest.raises(RemoteError, match=r"127\.0\.0\.1:9/v1/policies/board/action cannot be reached"):
+        RemotePolicy("http://127.0.0.1:9", "board").act(BOARD)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:8000", "ftp://host", "", "http://", "http://a:b"])
+def test_what_is_no_address(address: str) -> None:
+    with pytest.raises(InvalidInput, match="address of a server"):
+        RemotePolicy(address, "board")
+
+
+@pytest.mark.parametrize(("model", "version"), [("Board", None), ("a.b.c", None), ("board", "no such")])
+def test_what_is_no_reference(model: str, version: str | None) -> None:
+    with pytest.raises(InvalidReference):
+        RemotePolicy("http://127.0.0.1:9", model, version)

@@ -1,0 +1,182 @@
+"""The baselines, against brute force on the real games."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pettingzoo.classic.connect_four.connect_four import raw_env as connect_four
+from pettingzoo.classic.tictactoe.tictactoe import raw_env as tictactoe
+
+from league.errors import EnvironmentMismatch, IllegalMask, InvalidInput, UnknownPolicy
+from league.policies.policy import Policy
+from league.policies.scripted import script
+from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space, from_gymnasium, tensors
+
+GAMES = {"connect_four": connect_four, "tictactoe": tictactoe}
+DRAWS = 150
+"""Enough that each of nine equally likely actions is drawn: the chance that one is not is below 1e-6."""
+
+
+def generators(rows: int, seed: int = 0) -> list[np.random.Generator]:
+    return [np.random.default_rng((seed, row)) for row in range(rows)]
+
+
+def after(game: str, moves: Sequence[int]) -> Any:
+    """A real environment after these moves."""
+    env = GAMES[game]()
+    env.reset(seed=0)
+    for move in moves:
+        env.step(move)
+    return env
+
+
+def position(game: str, seed: int, plies: int) -> list[int]:
+    """So many random legal moves, or fewer if the game would end."""
+    random, moves = np.random.default_rng(seed), list[int]()
+    env = after(game, moves)
+    for _ in range(plies):
+        move = int(random.choice(legal(env)))
+        env.step(move)
+        if any(env.terminations.values()):
+            break
+        moves.append(move)
+    return moves
+
+
+def legal(env: Any) -> list[int]:
+    return np.flatnonzero(env.observe(env.agent_selection)["action_mask"]).tolist()
+
+
+def winning(game: str, moves: Sequence[int], own: bool) -> list[int]:
+    """The actions by which the player to move wins at once, or the other one would if it were to move."""
+    found = []
+    for action in legal(after(game, moves)):
+        env = after(game, moves)
+        if not own:
+            env.agent_selection = env._agent_selector.next()
+        player = env.agent_selection
+        env.step(action)
+        if env.rewards[player] == 1:
+            found.append(action)
+    return found
+
+
+def spaces(env: Any) -> tuple[Space, Space]:
+    agent = env.possible_agents[0]
+    return from_gymnasium(env.observation_space(agent)), from_gymnasium(env.action_space(agent))
+
+
+def chosen(policy: Policy, env: Any) -> set[int]:
+    """All actions that a script takes in a position."""
+    value = tensors(spaces(env)[0], env.observe(env.agent_selection))
+    batch = {name: np.repeat(array[None], DRAWS, axis=0) for name, array in value.items()}
+    return set(policy.act(batch, rng=generators(DRAWS)).actions.tolist())
+
+
+@settings(max_examples=120, deadline=None)
+@given(st.sampled_from(sorted(GAMES)), st.integers(0, 10_000), st.integers(0, 41))
+def test_one_ply_wins_else_blocks_else_plays_any_legal_move(game: str, seed: int, plies: int) -> None:
+    moves = position(game, seed, plies)
+    env = after(game, moves)
+    expected = winning(game, moves, own=True) or winning(game, moves, own=False) or legal(env)
+    assert chosen(script("one_ply", *spaces(env)), env) == set(expected)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(sorted(GAMES)), st.integers(0, 10_000), st.integers(0, 41))
+def test_random_plays_every_legal_move_and_no_other(game: str, seed: int, plies: int) -> None:
+    env = after(game, position(game, seed, plies))
+    assert chosen(script("random", *spaces(env)), env) == set(legal(env))
+
+
+@pytest.mark.parametrize("name", ["random", "one_ply"])
+def test_a_row_is_answered_whatever_its_batch(name: str) -> None:
+    envs = [after("connect_four", position("connect_four", seed, 3 * seed)) for seed in range(8)]
+    policy = script(name, *spaces(envs[0]))
+    values = [tensors(spaces(env)[0], env.observe(env.agent_selection)) for env in envs]
+    batch = {key: np.stack([value[key] for value in values]) for key in values[0]}
+    together = policy.act(batch, rng=generators(8)).actions
+    for row in range(8):
+        alone = {key: array[row : row + 1] for key, array in batch.items()}
+        assert policy.act(alone, rng=generators(8)[row : row + 1]).actions == together[row]
+
+
+def masked(actions: int, start: int = 0) -> tuple[Space, Space]:
+    board = Box(dtype="int8", shape=(2,), low=0, high=1)
+    mask = Box(dtype="int8", shape=(actions,), low=0, high=1)
+    return DictSpace(spaces={"observation": board, "action_mask": mask}), Discrete(n=actions, start=start)
+
+
+def test_random_is_uniform_over_what_is_legal() -> None:
+    rows = 20_000
+    policy = script("random", *masked(5, start=10))
+    mask = np.tile(np.array([0, 1, 1, 0, 1], np.int8), (rows, 1))
+    batch = {"observation": np.zeros((rows, 2), np.int8), "action_mask": mask}
+    counts = np.bincount(policy.act(batch, rng=generators(rows)).actions, minlength=15)
+    assert counts[[11, 12, 14]].sum() == rows
+    assert (np.abs(counts[[11, 12, 14]] - rows / 3) < 5 * np.sqrt(rows * 2 / 9)).all()
+
+
+@pytest.mark.parametrize(
+    ("action", "low", "high"),
+    [
+        (Discrete(n=4, start=-1), -1, 2),
+        (MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,)), [0, 5], [1, 7]),
+        (MultiBinary(shape=(3,)), 0, 1),
+        (Box(dtype="uint8", shape=(2,), low=3, high=5), 3, 5),
+    ],
+)
+def test_random_without_a_mask_takes_every_value_of_the_space(action: Space, low: Any, high: Any) -> None:
+    policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
+    actions = policy.act({"observation": np.zeros((2000, 1), np.float32)}, rng=generators(2000)).actions
+    assert not isinstance(action, DictSpace)
+    assert (actions.shape, actions.dtype) == ((2000, *action.shape), np.dtype(action.dtype))
+    assert (actions.min(axis=0) == low).all()
+    assert (actions.max(axis=0) == high).all()
+
+
+def test_random_fills_a_continuous_space() -> None:
+    action = Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0])
+    policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
+    actions = policy.act({"observation": np.zeros((5000, 1), np.float32)}, rng=generators(5000)).actions
+    assert actions.dtype == np.float32
+    assert (actions >= [-1, 0]).all()
+    assert (actions <= [1, 10]).all()
+    assert np.allclose(actions.mean(axis=0), [0, 5], atol=0.25)
+
+
+def test_unknown_scripts_are_named_with_the_known_ones() -> None:
+    with pytest.raises(UnknownPolicy, match="no script 'minimax'; known: random, one_ply"):
+        script("minimax", *masked(3))
+
+
+@pytest.mark.parametrize(
+    ("name", "observation", "action"),
+    [
+        ("one_ply", *masked(7)),
+        ("one_ply", Box(dtype="int8", shape=(6, 7, 2), low=0, high=1), Discrete(n=7)),
+        ("one_ply", spaces(tictactoe())[0], Discrete(n=8)),
+        ("random", masked(4)[0], MultiDiscrete(nvec=[2, 2], start=[0, 0], shape=(2,))),
+        ("random", Discrete(n=3), Box(dtype="float32", shape=(1,), low=None, high=1)),
+        ("random", Discrete(n=3), DictSpace(spaces={"move": Discrete(n=2)})),
+    ],
+)
+def test_spaces_that_a_script_cannot_play_with_are_refused(name: str, observation: Space, action: Space) -> None:
+    with pytest.raises(EnvironmentMismatch, match=f"script:{name}"):
+        script(name, observation, action)
+
+
+@pytest.mark.parametrize("name", ["random", "one_ply"])
+def test_faults_are_named(name: str) -> None:
+    policy = script(name, *spaces(tictactoe()))
+    batch = {"observation": np.zeros((2, 3, 3, 2), np.int8), "action_mask": np.ones((2, 9), np.int8)}
+    with pytest.raises(InvalidInput, match="2 rows needs rng, one generator per row: got none"):
+        policy.act(batch)
+    with pytest.raises(InvalidInput, match="2 rows needs rng, one generator per row: got 1"):
+        policy.act(batch, rng=generators(1))
+    nothing: Mapping[str, np.ndarray] = batch | {"action_mask": np.zeros((2, 9), np.int8)}
+    with pytest.raises(IllegalMask, match="allows no action"):
+        policy.act(nothing, rng=generators(2))

@@ -1,0 +1,30 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.league.registry.examples import registered
+
+
+@pytest.fixture
+def empty(storage: Storage) -> Iterator[Registry]:
+    """A registry without a league."""
+    registry = Registry.open(storage)
+    yield registry
+    registry.close()
+
+
+@pytest.fixture
+def registry(empty: Registry) -> Registry:
+    """A registry with one league and no versions."""
+    return registered(empty)
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Iterator[Registry]:
+    """A registry on SQLite with one league, for what has nothing to do with the database."""
+    registry = Registry.open(Storage.at(tmp_path / "home"))
+    yield registered(registry)
+    registry.close()

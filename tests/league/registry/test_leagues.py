@@ -1,0 +1,47 @@
+import pytest
+
+from league.errors import InterfaceChanged, UnknownLeague
+from league.registry.registry import Registry
+from tests.league.registry.examples import LEAGUE, config, interface, publish, registered
+
+
+def test_a_league_comes_back_as_it_was_registered(registry: Registry) -> None:
+    row = registry.league(LEAGUE)
+    assert row.config == config()
+    assert row.interface == interface()
+    assert row.interface_digest == interface().digest()
+    assert row.environment_digest == config().environment.digest()
+
+
+def test_leagues_are_listed_by_name(registry: Registry) -> None:
+    registered(registry, "another")
+    assert [row.slug for row in registry.leagues()] == ["another", LEAGUE]
+
+
+def test_registering_again_renews_the_configuration_and_keeps_the_versions(registry: Registry) -> None:
+    before = registry.league(LEAGUE)
+    version = publish(registry, "run/1")
+    registry.register(config(kwargs={"screen_height": 500}), interface())
+    after = registry.league(LEAGUE)
+    assert after.config.environment.kwargs == {"screen_height": 500}
+    assert after.environment_digest != before.environment_digest
+    assert after.registered_at == before.registered_at
+    assert registry.versions(LEAGUE) == [version]
+    assert publish(registry, "run/2").number == 2
+
+
+def test_an_interface_may_change_only_while_there_are_no_versions(registry: Registry) -> None:
+    registry.register(config(), interface(squares=4))
+    registry.register(config(), interface())
+    publish(registry, "run/1")
+    with pytest.raises(InterfaceChanged, match=LEAGUE):
+        registry.register(config(), interface(squares=4))
+    assert registry.league(LEAGUE).interface == interface()
+
+
+def test_an_unknown_league_is_named_with_the_known_ones(empty: Registry) -> None:
+    with pytest.raises(UnknownLeague, match="no league 'chess'; known: none yet"):
+        empty.league("chess")
+    registered(empty)
+    with pytest.raises(UnknownLeague, match=f"no league 'chess'; known: {LEAGUE}"):
+        empty.versions("chess")

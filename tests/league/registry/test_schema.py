@@ -1,0 +1,104 @@
+"""Migrations: equal to the tables, applied once, by whoever comes first."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import inspect, text
+
+from league.errors import ConfigError, StorageError
+from league.registry import migrations
+from league.registry.database import Database
+from league.registry.registry import Registry
+from league.registry.tables import Table
+from league.settings import Storage
+
+
+def test_migrations_build_the_tables(empty: Registry) -> None:
+    with empty.database.engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, Table.metadata) == []
+        # compare_metadata does not look at the condition of a partial index.
+        indexes = {index["name"]: index for index in inspect(connection).get_indexes("versions")}
+        where = indexes["uq_versions_ready_source"]["dialect_options"]
+    assert any("state" in str(condition) and "ready" in str(condition) for condition in where.values())
+
+
+def test_known_revisions_are_those_of_the_directory() -> None:
+    assert migrations.__file__ is not None
+    script = ScriptDirectory(str(Path(migrations.__file__).parent))
+    assert [revision.revision for revision in script.walk_revisions()][::-1] == list(migrations.KNOWN)
+
+
+def test_opening_together_migrates_once(storage: Storage) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        registries = list(pool.map(lambda _: Registry.open(storage), range(8)))
+    with registries[0].database.engine.connect() as connection:
+        assert connection.execute(text("SELECT version_num FROM alembic_version")).all() == [(migrations.HEAD,)]
+    for registry in registries:
+        assert registry.leagues() == []
+        registry.close()
+
+
+def test_opening_again_finds_what_is_there(registry: Registry, storage: Storage) -> None:
+    again = Registry.open(storage)
+    assert again.leagues() == registry.leagues()
+    again.close()
+
+
+def test_a_newer_schema_is_refused(empty: Registry, storage: Storage) -> None:
+    with empty.database.engine.connect() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+        connection.commit()
+    with pytest.raises(StorageError, match="9999 of a newer release"):
+        Registry.open(storage)
+
+
+def test_a_failed_migration_leaves_nothing(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    from alembic import op
+
+    create = op.create_table
+
+    def break_at_aliases(name: str, *columns: object) -> object:
+        if name == "aliases":
+            raise RuntimeError("power cut")
+        return create(name, *columns)
+
+    monkeypatch.setattr(op, "create_table", break_at_aliases)
+    with pytest.raises(RuntimeError, match="power cut"):
+        Registry.open(storage)
+    monkeypatch.undo()
+    registry = Registry.open(storage)
+    assert registry.leagues() == []
+    registry.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("mysql://host/league", "names 'mysql': expected sqlite or postgresql"),
+        ("no url at all", "is no database URL"),
+        ("sqlite://", "names no file"),
+        ("sqlite:///:memory:", "names no file"),
+    ],
+)
+def test_a_url_that_cannot_be_used_is_named(url: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Database(url)
+
+
+def test_a_server_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(StorageError) as caught:
+        Database(f"postgresql://somebody:secret@/league?host={tmp_path}")
+    assert "\n" not in str(caught.value)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_file_that_is_no_database_is_one_line(tmp_path: Path) -> None:
+    storage = Storage.at(tmp_path)
+    (tmp_path / "league.db").write_text("these are not the bytes of a database, however long they go on " * 100)
+    with pytest.raises(StorageError, match=r"league\.db cannot be used: file is not a database"):
+        Registry.open(storage)

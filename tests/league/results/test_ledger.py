@@ -1,0 +1,221 @@
+"""The ledger takes what its schedules ask for, each match once, and gives it back exactly."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from league.errors import LedgerRefusal, NotFound, UnknownLeague
+from league.registry.registry import Registry
+from league.results.documents import dump_games, dump_schedule, load_games, load_schedule
+from league.results.ledger import Ledger
+from league.results.records import BlockResult, Game, Match, Schedule, rotation
+from league.settings import Storage
+from tests.league.registry.examples import LEAGUE, config, registered
+
+SCHEDULE = Schedule(
+    id="tictactoe-round_robin-1",
+    league=LEAGUE,
+    kind="round_robin",
+    seed=2**63 - 1,
+    environment_digest=config().environment.digest(),
+    sides=("player_1", "player_2"),
+    contestants=("tictactoe@1", "tictactoe@2", "script:random"),
+    pairings=((0, 1), (0, 2), (1, 2)),
+    length=9,
+    opening_plies=2,
+)
+
+
+def game(schedule: Schedule, position: int, index: int) -> Game:
+    """A game that contestant 0 wins as first and draws as second, its moves different in each game."""
+    won = index == 0
+    return Game(
+        sides=rotation(2, index),
+        seed=schedule.seed_at(position),
+        opening=(position, 1),
+        actions=(3, index, position),
+        returns=(1.0, -1.0) if won else (0.25, 0.25),
+        scores=(1.0, 0.0) if won else (0.5, 0.5),
+    )
+
+
+def played(schedule: Schedule, position: int) -> Match:
+    return Match(
+        id=schedule.match_id(position),
+        league=schedule.league,
+        schedule=schedule.id,
+        position=position,
+        contestants=schedule.contestants_at(position),
+        seed=schedule.seed_at(position),
+        environment_digest=schedule.environment_digest,
+        games=(game(schedule, position, 0), game(schedule, position, 1)),
+    )
+
+
+@pytest.fixture
+def ledger(storage: Storage) -> Iterator[Ledger]:
+    registry = registered(Registry.open(storage))
+    yield Ledger(registry)
+    registry.close()
+
+
+def test_a_schedule_is_stored_once(ledger: Ledger) -> None:
+    assert ledger.open(SCHEDULE) == SCHEDULE
+    assert ledger.open(replace(SCHEDULE, length=5)) == SCHEDULE
+    second = replace(SCHEDULE, id="a-later-one")
+    ledger.open(second)
+    assert ledger.schedules(LEAGUE) == [SCHEDULE, second]
+
+
+def test_a_schedule_of_an_unknown_league_is_refused(ledger: Ledger) -> None:
+    with pytest.raises(UnknownLeague):
+        ledger.open(replace(SCHEDULE, league="chess"))
+
+
+def test_matches_come_back_exactly_in_schedule_order(ledger: Ledger) -> None:
+    ledger.open(SCHEDULE)
+    for position in (4, 0, 2):
+        assert ledger.append(played(SCHEDULE, position)) is True
+    expected = [played(SCHEDULE, position) for position in (0, 2, 4)]
+    assert ledger.matches(league=LEAGUE) == expected
+    assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id) == expected
+    assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id, after=0) == expected[1:]
+    assert ledger.matches(league=LEAGUE, schedule="another") == []
+    assert ledger.positions(SCHEDULE.id) == {0, 2, 4}
+    assert ledger.positions("another") == set()
+
+
+def test_twice_is_once(ledger: Ledger) -> None:
+    ledger.open(SCHEDULE)
+    match = played(SCHEDULE, 3)
+    assert ledger.append(match) is True
+    other_moves = replace(match, games=tuple(replace(game, actions=(8,)) for game in match.games))
+    assert ledger.append(match) is False
+    assert ledger.append(other_moves) is False
+    assert ledger.matches(league=LEAGUE) == [match]
+
+
+def test_many_are_stored_together_or_not_at_all(ledger: Ledger) -> None:
+    ledger.open(SCHEDULE)
+    ledger.append(played(SCHEDULE, 1))
+    assert ledger.extend([]) == 0
+    assert ledger.extend([played(SCHEDULE, position) for position in range(3)]) == 2
+    broken = replace(played(SCHEDULE, 4), seed=1)
+    with pytest.raises(LedgerRefusal):
+        ledger.extend([played(SCHEDULE, 3), broken])
+    assert ledger.positions(SCHEDULE.id) == {0, 1, 2}
+
+
+def test_results_are_the_sums_of_the_blocks(ledger: Ledger) -> None:
+    other = replace(SCHEDULE, id="of another environment", environment_digest="0" * 64)
+    for schedule in (other, SCHEDULE):
+        ledger.open(schedule)
+        ledger.extend([played(schedule, position) for position in (2, 1)])
+    mine = [
+        BlockResult(SCHEDULE.id, 1, ("tictactoe@1", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
+        BlockResult(SCHEDULE.id, 2, ("tictactoe@2", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
+    ]
+    assert ledger.results(LEAGUE, SCHEDULE.environment_digest) == mine
+    assert [result.schedule for result in ledger.results(LEAGUE)] == [other.id] * 2 + [SCHEDULE.id] * 2
+    assert ledger.results(LEAGUE, "1" * 64) == []
+    with pytest.raises(UnknownLeague):
+        ledger.results("chess")
+
+
+def _of_game(change: Callable[[Game], Game]) -> Callable[[Match], Match]:
+    return lambda match: replace(match, games=(match.games[0], change(match.games[1])))
+
+
+REFUSED: dict[str, tuple[Callable[[Match], Match], str]] = {
+    "beyond the schedule": (lambda match: replace(match, position=9), "ends before position 9"),
+    "before the schedule": (lambda match: replace(match, position=-1), "ends before position 9"),
+    "another id": (lambda match: replace(match, id="x/1"), "its id is 'x/1'"),
+    "another league": (lambda match: replace(match, league="chess"), "its league is 'chess'"),
+    "unknown contestants": (
+        lambda match: replace(match, contestants=("tictactoe@1", "tictactoe@9")),
+        "its contestants is .*tictactoe@9",
+    ),
+    "other contestants of the schedule": (
+        lambda match: replace(match, contestants=("tictactoe@1", "tictactoe@2")),
+        "its contestants is",
+    ),
+    "another block's seed": (lambda match: replace(match, seed=SCHEDULE.seed_at(2)), "its seed is"),
+    "another environment": (
+        lambda match: replace(match, environment_digest="0" * 64),
+        "its environment_digest is",
+    ),
+    "no games": (lambda match: replace(match, games=()), "has 0 games, expected one for each of 2 sides"),
+    "odd games": (lambda match: replace(match, games=match.games[:1]), "has 1 games"),
+    "too many games": (lambda match: replace(match, games=match.games * 2), "has 4 games"),
+    "sides not rotated": (_of_game(lambda game: replace(game, sides=(0, 1))), "game 1 .* not in rotation"),
+    "a game of another seed": (_of_game(lambda game: replace(game, seed=5)), "game 1 has the seed 5"),
+    "another opening": (_of_game(lambda game: replace(game, opening=(0, 1))), "game 1 has another opening"),
+    "a short opening": (_of_game(lambda game: replace(game, opening=(1,))), "game 1 has another opening"),
+    "an infinite return": (
+        _of_game(lambda game: replace(game, returns=(math.inf, 0.0))),
+        "game 1 needs a finite return",
+    ),
+    "a return too few": (_of_game(lambda game: replace(game, returns=(1.0,))), "game 1 needs a finite"),
+    "both win": (_of_game(lambda game: replace(game, scores=(1.0, 1.0))), "game 1 needs scores"),
+    "a score out of range": (_of_game(lambda game: replace(game, scores=(2.0, -1.0))), "game 1 needs scores"),
+    "no number": (_of_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 needs scores"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_match_that_breaks_its_schedule_is_refused(name: str, tmp_path: Path) -> None:
+    change, message = REFUSED[name]
+    registry = registered(Registry.open(Storage.at(tmp_path)))
+    ledger = Ledger(registry)
+    ledger.open(SCHEDULE)
+    with pytest.raises(LedgerRefusal, match=message):
+        ledger.append(change(played(SCHEDULE, 1)))
+    assert ledger.matches(league=LEAGUE) == []
+    registry.close()
+
+
+def test_a_match_of_no_schedule_is_refused(ledger: Ledger) -> None:
+    with pytest.raises(NotFound, match="no schedule 'tictactoe-round_robin-1' was opened"):
+        ledger.append(played(SCHEDULE, 0))
+
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+actions = st.one_of(
+    st.integers(-(2**63), 2**63 - 1),
+    st.lists(st.integers(-(2**63), 2**63 - 1), max_size=3),
+    st.lists(numbers, max_size=3),
+    st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=3),
+)
+
+
+@st.composite
+def blocks(draw: Any) -> tuple[Game, ...]:
+    seed, opening = draw(st.integers(0, 2**63 - 1)), tuple(draw(st.lists(actions, max_size=3)))
+    return tuple(
+        Game(
+            sides=rotation(2, index),
+            seed=seed,
+            opening=opening,
+            actions=tuple(draw(st.lists(actions, max_size=5))),
+            returns=tuple(draw(st.lists(numbers, min_size=2, max_size=2))),
+            scores=(0.5, 0.5),
+        )
+        for index in range(2)
+    )
+
+
+@given(blocks())
+def test_games_are_kept_exactly(games: tuple[Game, ...]) -> None:
+    assert load_games(dump_games(games)) == games
+
+
+@given(st.integers(0, 2**63 - 1))
+def test_schedules_are_kept_exactly(seed: int) -> None:
+    schedule = replace(SCHEDULE, seed=seed)
+    assert load_schedule(dump_schedule(schedule)) == schedule
