@@ -1,0 +1,70 @@
+"""How strong is a version? Greedy, with random openings, both seats alike, against `random` and `one_ply`.
+
+Plays the champion of LEAGUE_HOME's connect_four, or the version that is named. A draw is no win. The bound is the lower
+end of Wilson's two-sided 95 % interval of the share won. Nothing is written to the ledger.
+"""
+
+import argparse
+import sys
+
+from scipy.stats import binomtest
+
+from evaluation.contestants import baselines, pinned
+from evaluation.player import Player
+from evaluation.schedule import round_robin
+from league.errors import LeagueError
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+
+TARGETS = {"script:random": {"demo": 0.95, "full": 0.98}, "script:one_ply": {"full": 0.55}}
+"""opponent → configuration → what the lower bound is held to"""
+
+
+def main() -> int:
+    """Print shares and bounds beside their targets; 1 if one that was asked for is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ref", nargs="?", default="connect_four@champion", help="default: %(default)s")
+    parser.add_argument("--games", type=int, default=2000, help="against each opponent; default: %(default)s")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the games, for a look")
+    parser.add_argument("--hold", choices=("demo", "full"), default="demo", help="which targets must be met")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    games = max(2, options.games // 10 if options.quick else options.games)
+    try:
+        return int(not _measure(options.ref, games, options.seed, options.hold))
+    except LeagueError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _measure(ref: str, games: int, seed: int, held: str) -> bool:
+    registry = Registry.open()
+    league = CheckpointRef.parse(ref).league
+    row = registry.league(league)
+    version = pinned(ref, league, registry)
+    player = Player(row.config, registry)
+    print(f"{version}, greedy, {games} games each, {row.config.play.opening_plies} random opening plies")
+    met = True
+    for opponent in baselines(row.interface):
+        schedule = round_robin(row.config, row.interface, [version, opponent], games // 2, seed)
+        points = [game.scores[0] for match in player.play(schedule, range(schedule.length)) for game in match.games]
+        met &= _report(opponent, points, held)
+    return met
+
+
+def _report(opponent: str, points: list[float], held: str) -> bool:
+    won, drawn = points.count(1.0), points.count(0.5)
+    low = binomtest(won, len(points)).proportion_ci(0.95, "wilson").low
+    print(
+        f"against {opponent}: won {won / len(points):.2%} ({won} won, {drawn} drawn, {points.count(0.0)} lost),"
+        f" lower 95 % bound {low:.2%}"
+    )
+    for configuration, target in TARGETS[opponent].items():
+        verdict = "met" if low >= target else "missed"
+        print(f"  bound / target of the {configuration} configuration ({target:.0%}): {low / target:.3f}, {verdict}")
+    target = TARGETS[opponent].get(held)
+    return target is None or low >= target
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Who is stronger, how sure are we, and may it be promoted."""

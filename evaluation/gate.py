@@ -1,0 +1,147 @@
+"""The gate: from the blocks of a verdict's schedule to `promote`, `reject` or `inconclusive`.
+
+A decision is a function of the settings and of the block scores in schedule order, and of nothing else: not of when a
+block was finished, nor of how many workers played, nor of blocks behind the one at which the test stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.sequential import EloEstimate, bounds, elo_estimate, gsprt_llr
+from league.config import GateConfig
+from league.results.records import Action, Match
+
+Outcome = Literal["promote", "reject", "inconclusive"]
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Where a sequential test stands.
+
+    outcome: None while the test is open.
+    blocks: how many blocks count; the test stopped at the last of them if it has an outcome.
+    counts: how many of those ended in each cell, worst for the challenger first.
+    curve: the LLR after each of those blocks; `llr` is its end, 0.0 without blocks.
+    estimate: the challenger's Elo over the champion, logistic as ratings are; None without blocks.
+    distinct_games: how many different games are among those that count; None where moves are not known.
+    """
+
+    outcome: Outcome | None
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    distinct_games: int | None
+    counts: tuple[int, ...]
+    curve: tuple[float, ...]
+    estimate: EloEstimate | None
+
+    @property
+    def score(self) -> float | None:
+        """The challenger's mean score over the blocks that count; None without blocks."""
+        top = len(self.counts) - 1
+        return sum(i * n for i, n in enumerate(self.counts)) / (top * self.blocks) if self.blocks else None
+
+
+def decide(settings: GateConfig, block_scores: Sequence[float], games_per_block: int = 2) -> Decision:
+    """Decide on the challenger's mean score in each block, in schedule order.
+
+    `promote` at the first block whose LLR reaches the upper bound, `reject` at the lower one, `inconclusive` at
+    `max_blocks` without either. Blocks behind the stopping block do not count. Raises ValueError for scores that blocks
+    of `games_per_block` games cannot have.
+    """
+    lower, upper = bounds(settings.alpha, settings.beta)
+    counts = _cumulated(block_scores[: settings.max_blocks], games_per_block)
+    curve = gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
+    crossed = _crossed(curve, (lower, upper))
+    blocks = int(crossed[0]) + 1 if crossed.size else len(counts)
+    outcome: Outcome | None = None
+    if crossed.size:
+        outcome = "promote" if curve[blocks - 1] >= upper else "reject"
+    elif blocks == settings.max_blocks:
+        outcome = "inconclusive"
+    return Decision(
+        outcome=outcome,
+        llr=float(curve[blocks - 1]) if blocks else 0.0,
+        bounds=(lower, upper),
+        blocks=blocks,
+        games=blocks * games_per_block,
+        distinct_games=None,
+        counts=tuple(int(n) for n in counts[blocks - 1]) if blocks else (0,) * (2 * games_per_block + 1),
+        curve=tuple(float(llr) for llr in curve[:blocks]),
+        estimate=elo_estimate(counts[blocks - 1], "logistic") if blocks else None,
+    )
+
+
+def judge(settings: GateConfig, matches: Sequence[Match], challenger: str) -> Decision:
+    """Decide on matches in schedule order, two contestants each, and count the distinct games among those
+    that count.
+    """
+    scores = [match.score(match.contestants.index(challenger)) for match in matches]
+    decision = decide(settings, scores, len(matches[0].games) if matches else 2)
+    return replace(decision, distinct_games=distinct_games(matches[: decision.blocks]))
+
+
+class Watch:
+    """Follows a verdict's matches as they come in, block by block, and knows when its test is over.
+
+    It looks at each block once where `judge` looks at all; the decision itself is `judge`'s.
+    """
+
+    def __init__(self, settings: GateConfig, challenger: str) -> None:
+        self._settings, self._challenger = settings, challenger
+        self.bounds = bounds(settings.alpha, settings.beta)
+        self.llr = 0.0
+        self._counts: NDArray[np.int64] | None = None
+        self._seen = 0
+
+    def is_over(self, matches: Sequence[Match]) -> bool:
+        """Whether the test is decided or exhausted by `matches`, all of the schedule so far in its order."""
+        new = matches[self._seen : self._settings.max_blocks]
+        if new:
+            scores = [match.score(match.contestants.index(self._challenger)) for match in new]
+            counts = _cumulated(scores, len(new[0].games))
+            counts = counts if self._counts is None else counts + self._counts
+            curve = gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
+            self._counts, self.llr = counts[-1], float(curve[-1])
+            self._seen += len(new)
+            if _crossed(curve, self.bounds).size:
+                return True
+        return self._seen >= self._settings.max_blocks
+
+
+def distinct_games(matches: Iterable[Match]) -> int:
+    """How many different games were played, by who met and by all moves from the opening on.
+
+    Greedy policies in a deterministic game repeat themselves; n copies of one game are not n pieces of evidence.
+    """
+    return len(
+        {
+            (frozenset(match.contestants), _frozen(game.opening), _frozen(game.actions))
+            for match in matches
+            for game in match.games
+        }
+    )
+
+
+def _frozen(actions: Sequence[Action]) -> tuple[Hashable, ...]:
+    return tuple(tuple(action) if isinstance(action, list) else action for action in actions)
+
+
+def _cumulated(block_scores: Sequence[float], games: int) -> NDArray[np.int64]:
+    """(blocks, 2 games + 1): how many of the blocks so far ended in each cell, after each block."""
+    halves = np.asarray(block_scores, dtype=np.float64) * 2 * games
+    cells = np.rint(halves)
+    if not (np.abs(halves - cells) < 1e-6).all() or ((cells < 0) | (cells > 2 * games)).any():
+        raise ValueError(f"scores of blocks of {games} game(s) are multiples of {1 / (2 * games):g} in [0, 1]")
+    return np.eye(2 * games + 1, dtype=np.int64)[cells.astype(np.intp)].cumsum(axis=0)
+
+
+def _crossed(curve: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.intp]:
+    return np.flatnonzero((curve <= limits[0]) | (curve >= limits[1]))

@@ -1,0 +1,133 @@
+"""What evaluations and nights bring, as plain data; `to_json()` gives a JSON document without NaN."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+class _Document:
+    """A dataclass that is a JSON document."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Nested dictionaries and lists; what is undefined is None."""
+        document: dict[str, Any] = _plain(asdict(self))  # type: ignore[call-overload]
+        return document
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True, slots=True)
+class Standing(_Document):
+    """One contestant's results. `score` is in [0, 1], `mean_return` in the environment's own unit.
+
+    rating: Elo above `script:random`, None if no chain of games leads there.
+    interval: the rating's two-sided 95 % interval.
+    distinct_games: how many different games (seed, opening and moves) are among them; None where moves were not read.
+    """
+
+    ref: str
+    mean_return: float
+    score: float
+    games: int
+    distinct_games: int | None
+    rating: float | None
+    interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Payoff(_Document):
+    """score[i][j] is contestant i's mean score against j over games[i][j] games; None if they did not meet.
+
+    by_side[side][i][j] is the same for the games in which i played that side.
+    """
+
+    contestants: tuple[str, ...]
+    score: tuple[tuple[float | None, ...], ...]
+    games: tuple[tuple[int, ...], ...]
+    by_side: dict[str, tuple[tuple[float | None, ...], ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationReport(_Document):
+    """A round robin: who stands where, best first, and who beats whom."""
+
+    league: str
+    schedule: str
+    environment_digest: str
+    games: int
+    distinct_games: int
+    standings: tuple[Standing, ...]
+    payoff: Payoff
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictReport(_Document):
+    """One challenger's test with its evidence.
+
+    outcome: `promote`, `reject`, `inconclusive`, or `void` where it could not be ended: `note` says why.
+    llr, bounds: the log likelihood ratio at the end, and the two values at which it decides.
+    blocks, games: those that counted. distinct_games: how many different games are among them.
+    score: the challenger's mean score. elo, interval: its strength over the opponent in logistic Elo, with its 95 %
+    interval; None where a side of it is infinite.
+    promoted: whether this verdict made the challenger champion; `note` says why not where `promote` was refused.
+    """
+
+    verdict: str
+    candidate: str
+    opponent: str
+    outcome: str
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    distinct_games: int
+    score: float | None
+    elo: float | None
+    interval: tuple[float | None, float | None] | None
+    promoted: bool
+    note: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NightReport(_Document):
+    """One night of a league: its verdicts in order, the champion before and after, and everybody's ratings.
+
+    faults: versions that could not be judged or rated, each with the reason; they are tried again the next night.
+    """
+
+    league: str
+    champion_before: str | None
+    champion: str | None
+    verdicts: tuple[VerdictReport, ...]
+    faults: tuple[str, ...]
+    standings: tuple[Standing, ...]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the games of one schedule are.
+
+    what: a person's words for it, such as `connect_four@3 against connect_four@2`.
+    played, of: matches (blocks) so far and at most.
+    llr, bounds: where the sequential test stands, for verdicts.
+    """
+
+    what: str
+    played: int
+    of: int
+    llr: float | None = None
+    bounds: tuple[float, float] | None = None
+
+
+Listener = Callable[[Progress | VerdictReport], None]
+"""Told how far games are, and each verdict as it falls; called in the process that asked for them."""

@@ -1,0 +1,92 @@
+"""Schedules: who meets whom, how often, in which order. Pure: the same arguments give the same schedule and id.
+
+The order goes round by round, every pairing once in each, so that any prefix of a schedule is balanced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+from league.config import LeagueConfig
+from league.errors import EnvironmentMismatch
+from league.interface import Interface, digest
+from league.results.records import Schedule
+from league.seeds import derive
+
+Pairing = tuple[int, ...]
+
+
+def round_robin(
+    config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int = 0
+) -> Schedule:
+    """Every pair of contestants meets in `blocks` matches."""
+    pairings = list(combinations(range(len(contestants)), 2))
+    return _schedule(config, interface, "round_robin", contestants, pairings, blocks * len(pairings), seed)
+
+
+def gauntlet(
+    config: LeagueConfig,
+    interface: Interface,
+    challengers: Sequence[str],
+    opponents: Sequence[str],
+    blocks: int,
+    seed: int = 0,
+) -> Schedule:
+    """Every challenger meets every opponent, but never itself, in `blocks` matches."""
+    contestants = list(dict.fromkeys([*challengers, *opponents]))
+    number = {ref: i for i, ref in enumerate(contestants)}
+    meetings = [(number[a], number[b]) for a in challengers for b in opponents if a != b]
+    pairings = list({frozenset(pair): pair for pair in meetings}.values())
+    return _schedule(config, interface, "gauntlet", contestants, pairings, blocks * len(pairings), seed)
+
+
+def verdict(config: LeagueConfig, interface: Interface, challenger: str, champion: str, seed: int = 0) -> Schedule:
+    """The challenger meets the champion in up to `gate.max_blocks` matches; its id depends on the gate's
+    settings too.
+    """
+    schedule = _schedule(config, interface, "verdict", [challenger, champion], [(0, 1)], config.gate.max_blocks, seed)
+    gate = config.gate.model_dump(mode="json")
+    return replace(schedule, id=f"{schedule.id}-{digest(gate)[:8]}")
+
+
+def _schedule(
+    config: LeagueConfig,
+    interface: Interface,
+    kind: str,
+    contestants: Sequence[str],
+    pairings: Sequence[Pairing],
+    length: int,
+    seed: int,
+) -> Schedule:
+    sides = tuple(interface.sides)
+    if len(sides) != 2:
+        raise EnvironmentMismatch(
+            f"league {config.league} has {len(sides)} side(s) ({', '.join(sides)}): matches are played between two"
+        )
+    if not pairings:
+        raise EnvironmentMismatch(f"a schedule of league {config.league} needs two contestants that can meet")
+    content: dict[str, Any] = {
+        "environment": config.environment.digest(),
+        "sides": {side: list(agents) for side, agents in interface.sides.items()},
+        "opening_plies": config.play.opening_plies,
+        "contestants": list(contestants),
+        "pairings": [list(pairing) for pairing in pairings],
+        "length": length,
+        "seed": seed,
+    }
+    name = digest(content)
+    return Schedule(
+        id=f"{config.league}-{kind}-{name[:16]}",
+        league=config.league,
+        kind=kind,
+        seed=derive(seed, name),
+        environment_digest=config.environment.digest(),
+        sides=sides,
+        contestants=tuple(contestants),
+        pairings=tuple(pairings),
+        length=length,
+        opening_plies=config.play.opening_plies,
+    )

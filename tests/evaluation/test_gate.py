@@ -1,0 +1,176 @@
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from evaluation.gate import Watch, decide, distinct_games, judge
+from evaluation.sequential import bounds, elo_estimate, expected_games, gsprt_llr
+from league.config import GateConfig
+from league.results.records import Game, Match, rotation
+
+GATE = GateConfig(elo0=0, elo1=60, max_blocks=400)
+block_scores = st.lists(st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]), max_size=120)
+few = settings(max_examples=60, deadline=None)
+
+CELLS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+
+EQUALS = {"fair": (0.25, 0.0, 0.5, 0.0, 0.25), "first mover wins": (0.08, 0.06, 0.72, 0.06, 0.08)}
+"""Shares of LL, LD, DD or WL, WD, WW between equals: without and with an advantage of the first move."""
+
+
+def match(position: int, points: Sequence[float], moves: Sequence[int] = (0,)) -> Match:
+    """A block of two games with the challenger's points in each."""
+    games = tuple(
+        Game(rotation(2, i), 1, (position,), tuple(moves), (p, 1 - p), (p, 1 - p)) for i, p in enumerate(points)
+    )
+    return Match(f"s/{position}", "league", "s", position, ("league@2", "league@1"), 1, "digest", games)
+
+
+def test_a_winning_streak_is_promoted_at_the_upper_bound() -> None:
+    decision = decide(GATE, [1.0] * 400)
+    lower, upper = bounds(0.05, 0.05)
+    assert decision.outcome == "promote"
+    assert decision.bounds == (lower, upper)
+    assert decision.curve[-1] == decision.llr >= upper > decision.curve[-2]
+    assert decision.blocks == len(decision.curve) == decision.games / 2 == decision.counts[4]
+    assert decision.score == 1.0
+    assert decision.estimate is not None
+    assert decision.estimate.elo > 400
+
+
+def test_a_losing_streak_is_rejected_at_the_lower_bound() -> None:
+    decision = decide(GATE, [0.0] * 400)
+    assert decision.outcome == "reject"
+    assert decision.llr <= decision.bounds[0]
+    assert decision.counts[0] == decision.blocks
+
+
+def test_an_even_match_is_inconclusive_at_max_blocks() -> None:
+    settings = GateConfig(elo0=-30, elo1=30, max_blocks=50)
+    scores = [0.0, 1.0] * 50
+    assert decide(settings, scores[:49]).outcome is None
+    decision = decide(settings, scores)
+    assert (decision.outcome, decision.blocks) == ("inconclusive", 50)
+
+
+def test_without_blocks_it_is_open() -> None:
+    decision = decide(GATE, [])
+    assert (decision.outcome, decision.llr, decision.blocks, decision.games) == (None, 0.0, 0, 0)
+    assert decision.estimate is decision.score is None
+
+
+def test_single_games_are_trinomial() -> None:
+    decision = decide(GATE, [1.0, 0.5, 0.0, 1.0], games_per_block=1)
+    assert decision.counts == (1, 1, 2)
+    assert decision.llr == pytest.approx(gsprt_llr((1, 1, 2), 0, 60, "normalized"), abs=1e-9)
+
+
+@pytest.mark.parametrize("score", [0.3, -0.25, 1.25])
+def test_scores_that_a_block_cannot_have_are_refused(score: float) -> None:
+    with pytest.raises(ValueError, match="multiples"):
+        decide(GATE, [0.5, score])
+
+
+@few
+@given(block_scores, block_scores)
+def test_blocks_behind_the_stopping_block_do_not_count(scores: list[float], later: list[float]) -> None:
+    decision = decide(GATE, scores)
+    if decision.outcome is not None:
+        assert decide(GATE, scores + later) == decision
+        assert decide(GATE, scores[: decision.blocks]) == decision
+
+
+@few
+@given(block_scores)
+def test_it_stops_at_the_first_block_that_decides(scores: list[float]) -> None:
+    decision = decide(GATE, scores)
+    lower, upper = decision.bounds
+    assert all(lower < llr < upper for llr in decision.curve[:-1])
+    assert decide(GATE, scores[: decision.blocks - 1]).outcome is None or decision.blocks == 0
+
+
+@few
+@given(block_scores, st.lists(st.integers(1, 40), min_size=1))
+def test_watching_chunks_is_judging_the_whole(scores: list[float], sizes: list[int]) -> None:
+    """Whatever the chunks in which matches come in, the watch ends at the chunk that holds the stopping block."""
+    matches = [match(i, (min(1.0, 2 * s), max(0.0, 2 * s - 1))) for i, s in enumerate(scores)]
+    whole = judge(GATE, matches, "league@2")
+    watch, seen = Watch(GATE, "league@2"), 0
+    over = watch.is_over([])
+    assert not over
+    while not over and seen < len(matches):
+        seen += sizes[seen % len(sizes)]
+        over = watch.is_over(matches[:seen])
+    assert over == (whole.outcome is not None)
+    assert judge(GATE, matches[:seen], "league@2") == whole
+
+
+def test_the_challenger_may_be_either_contestant() -> None:
+    matches = [match(i, (1.0, 1.0)) for i in range(60)]
+    assert judge(GATE, matches, "league@2").outcome == "promote"
+    assert judge(GATE, matches, "league@1").outcome == "reject"
+
+
+def test_repeated_games_are_counted_once() -> None:
+    repeated = [match(7, (1.0, 0.0), moves=(1, 2)), match(7, (1.0, 0.0), moves=(1, 2))]
+    assert distinct_games(repeated) == 1
+    assert distinct_games([*repeated, match(8, (1.0, 0.0), moves=(1, 2)), match(7, (1.0, 0.0), moves=(1, 3))]) == 3
+    assert judge(GATE, repeated, "league@2").distinct_games == 1
+
+
+@pytest.mark.parametrize("shares", EQUALS.values(), ids=EQUALS)
+def test_equals_are_rarely_promoted(shares: tuple[float, ...]) -> None:
+    """2,000 simulated gates each: at most 5 % false promotions, three binomial standard errors allowed."""
+    promoted, blocks = _simulate(np.array(shares), 2000, seed=1)
+    assert promoted <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 2000)
+    assert blocks * 2 == pytest.approx(expected_games(0, 60, 0, 0.05, 0.05), rel=0.15)
+
+
+@pytest.mark.parametrize("shares", EQUALS.values(), ids=EQUALS)
+def test_a_challenger_at_h1_is_mostly_promoted(shares: tuple[float, ...]) -> None:
+    """Shares between equals, tilted until the effect of a game is 60 normalised Elo."""
+    stronger = _tilted(np.array(shares), 60)
+    promoted, blocks = _simulate(stronger, 2000, seed=2)
+    assert promoted >= 0.95 - 3 * np.sqrt(0.05 * 0.95 / 2000)
+    assert blocks * 2 == pytest.approx(expected_games(0, 60, 60, 0.05, 0.05), rel=0.15)
+
+
+def _tilted(shares: np.ndarray, elo: float) -> np.ndarray:
+    def distance(theta: float) -> float:
+        return float(elo_estimate(_weighted(shares, theta) * 1e9, "normalized").elo - elo)
+
+    return _weighted(shares, brentq(distance, -3, 3))
+
+
+def _weighted(shares: np.ndarray, theta: float) -> np.ndarray:
+    weighted = shares * np.exp(theta * CELLS)
+    return np.asarray(weighted / weighted.sum())
+
+
+def _simulate(shares: np.ndarray, gates: int, seed: int) -> tuple[float, float]:
+    """Share of promotions, and mean number of blocks, of gates over random block scores.
+
+    All gates go block by block together; those that have ended are decided as `decide` does, and a sample is compared.
+    """
+    rng = np.random.default_rng(seed)
+    lower, upper = bounds(GATE.alpha, GATE.beta)
+    drawn = rng.choice(5, p=shares, size=(gates, GATE.max_blocks))
+    counts, ends, llrs = np.zeros((gates, 5)), np.full(gates, GATE.max_blocks), np.zeros(gates)
+    running = np.arange(gates)
+    for start in range(0, GATE.max_blocks, 40):
+        steps = np.eye(5)[drawn[running, start : start + 40]].cumsum(axis=1) + counts[running, None]
+        curves = gsprt_llr(steps, GATE.elo0, GATE.elo1, GATE.model)
+        outside = (curves <= lower) | (curves >= upper)
+        ended = outside.any(axis=1)
+        at = outside.argmax(axis=1)[ended]
+        ends[running[ended]], llrs[running[ended]] = start + at + 1, curves[ended, at]
+        counts[running] = steps[:, -1]
+        running = running[~ended]
+    for gate in range(0, gates, gates // 20):
+        decision = decide(GATE, list(CELLS[drawn[gate]]))
+        assert decision.blocks == ends[gate]
+        assert (decision.outcome == "promote") == (llrs[gate] >= upper)
+    return float((llrs >= upper).mean()), float(ends.mean())

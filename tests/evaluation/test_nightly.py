@@ -1,0 +1,311 @@
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from filelock import FileLock
+from sqlalchemy.orm import Session
+
+from evaluation import tournament, verdicts
+from evaluation.nightly import nightly
+from evaluation.report import NightReport, Progress, VerdictReport
+from league.config import LeagueConfig
+from league.errors import AlreadyRunning, ConfigError
+from league.registry.database import Database
+from league.registry.registry import Registry
+from league.results.ledger import Ledger
+from league.settings import Storage
+from tests.evaluation import examples
+
+CONFIG = examples.config(play={"opening_plies": 2, "copies": 2})
+WEAK = examples.graph()
+MIDDLING = examples.graph(wins=True)
+STRONG = examples.graph(wins=True, blocks=True)
+STRONGEST = examples.graph(wins=True, blocks=True, order=examples.CENTRE_FIRST)
+
+
+def league_of(home: Path, *graphs: bytes, config: LeagueConfig = CONFIG) -> Registry:
+    registry = examples.registry(home, play=config.play.model_dump(), gate=config.gate.model_dump())
+    for graph in graphs:
+        examples.publish(registry, graph)
+    return registry
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    opened = league_of(tmp_path / "home", WEAK, MIDDLING, STRONG, MIDDLING)
+    yield opened
+    opened.close()
+
+
+def state(registry: Registry) -> dict[str, Any]:
+    """All that a night leaves behind, its clock times apart."""
+    return {
+        "matches": Ledger(registry).matches(league=examples.LEAGUE),
+        "verdicts": [(v.id, v.outcome, v.evidence) for v in registry.verdicts(examples.LEAGUE)],
+        "champions": [(e.version, e.previous, e.verdict) for e in registry.history(examples.LEAGUE)],
+    }
+
+
+def outcomes(report: NightReport) -> list[tuple[str, str, str, bool]]:
+    return [(v.candidate, v.opponent, v.outcome, v.promoted) for v in report.verdicts]
+
+
+def test_a_night_finds_the_strongest_and_promotes_it(registry: Registry) -> None:
+    told: list[Progress | VerdictReport] = []
+    report = nightly(CONFIG, registry=registry, listener=told.append)
+    assert outcomes(report) == [
+        ("tictactoe@1", "script:random", "reject", False),
+        ("tictactoe@2", "script:random", "promote", True),
+        ("tictactoe@3", "tictactoe@2", "promote", True),
+        ("tictactoe@4", "tictactoe@3", "reject", False),
+    ]
+    assert (report.champion_before, report.champion, report.faults) == (None, "tictactoe@3", ())
+    assert registry.aliases(examples.LEAGUE) == {"champion": 3}
+    assert [standing.ref for standing in report.standings][:2] == ["script:one_ply", "tictactoe@3"]
+    assert all(standing.rating is not None for standing in report.standings)
+    assert [each for each in told if isinstance(each, VerdictReport)] == list(report.verdicts)
+    assert any(isinstance(each, Progress) and each.llr for each in told)
+    assert json.loads(json.dumps(report.to_json(), allow_nan=False))["champion"] == "tictactoe@3"
+
+
+def test_promotions_say_who_why_and_on_which_verdict(registry: Registry) -> None:
+    report = nightly(CONFIG, registry=registry)
+    event = registry.history(examples.LEAGUE)[0]
+    assert event.verdict == report.verdicts[2].verdict
+    assert event.actor == "league nightly"
+    assert "beat tictactoe@2" in event.reason
+
+
+def test_verdicts_hold_their_evidence(registry: Registry) -> None:
+    nightly(CONFIG, registry=registry)
+    for row in registry.verdicts(examples.LEAGUE):
+        assert row.evidence is not None
+        assert sum(row.evidence["counts"]) == row.evidence["blocks"] == row.evidence["games"] / 2
+        lower, upper = row.evidence["bounds"]
+        assert (row.evidence["llr"] >= upper) == (row.outcome == "promote")
+        assert (row.evidence["llr"] <= lower) == (row.outcome == "reject")
+        assert 0 < row.evidence["distinct_games"] <= row.evidence["games"]
+
+
+def test_the_next_night_has_nothing_to_do(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    nightly(CONFIG, registry=registry)
+    before = state(registry)
+    monkeypatch.setattr(tournament, "player", None)
+    report = nightly(CONFIG, registry=registry)
+    assert report.verdicts == ()
+    assert (report.champion_before, report.champion) == ("tictactoe@3", "tictactoe@3")
+    assert state(registry) == before
+
+
+def test_a_new_version_is_judged_against_the_champion_of_the_moment(registry: Registry) -> None:
+    nightly(CONFIG, registry=registry)
+    examples.publish(registry, STRONGEST)
+    registry.set_alias(examples.LEAGUE, "champion", 2, expected=3, actor="me", reason="by hand")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report) == [("tictactoe@5", "tictactoe@2", "promote", True)]
+
+
+def test_an_even_match_leaves_the_champion(tmp_path: Path) -> None:
+    config = examples.config(gate={"elo0": -20, "elo1": 20, "max_blocks": 30})
+    registry = league_of(tmp_path, STRONG, STRONG, config=config)
+    registry.set_alias(examples.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+    report = nightly(config, registry=registry)
+    assert outcomes(report) == [("tictactoe@2", "tictactoe@1", "inconclusive", False)]
+    assert report.champion == "tictactoe@1"
+
+
+def test_one_policy_under_two_numbers_is_not_promoted(tmp_path: Path) -> None:
+    """Both games of a block are then one game with the seats swapped: it scores a half exactly, and is rejected."""
+    registry = league_of(tmp_path, STRONG, STRONG)
+    registry.set_alias(examples.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report) == [("tictactoe@2", "tictactoe@1", "reject", False)]
+    assert report.verdicts[0].score == 0.5
+    assert report.verdicts[0].distinct_games <= report.verdicts[0].games / 2
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_the_number_of_workers_changes_nothing(tmp_path: Path) -> None:
+    alone, many = (league_of(tmp_path / name, WEAK, MIDDLING, STRONG) for name in ("alone", "many"))
+    nightly(CONFIG, registry=alone)
+    nightly(CONFIG, registry=many, workers=2)
+    assert state(alone) == state(many)
+
+
+class Crash(BaseException):
+    """The process is gone."""
+
+
+@contextmanager
+def crashing_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """The process dies right after its `writes`-th transaction; yields a counter of the transactions."""
+    original, count = Database.write, [0]
+
+    @contextmanager
+    def write(database: Database) -> Iterator[Session]:
+        with original(database) as session:
+            yield session
+        count[0] += 1
+        if count[0] == writes:
+            raise Crash
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "write", write)
+        yield count
+
+
+def test_a_night_that_died_after_any_of_its_writes_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After each single transaction in turn: what stands in the end is what an undisturbed night leaves."""
+    monkeypatch.setattr("evaluation.nightly.RATING_BLOCKS", 6)
+    config = examples.config(gate={"elo1": 150, "max_blocks": 100}, play={"opening_plies": 2, "copies": 4})
+    league_of(tmp_path / "fresh", MIDDLING, STRONG, config=config).close()
+    quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
+    with crashing_after(0, monkeypatch) as count:
+        nightly(config, registry=quiet)
+    expected, writes = state(quiet), count[0]
+    assert writes > 15
+    assert [version for version, _, _ in expected["champions"]] == [2, 1]
+    for crash_at in range(1, writes + 1):
+        registry = _copy(tmp_path / "fresh", tmp_path / str(crash_at))
+        with crashing_after(crash_at, monkeypatch), pytest.raises(Crash):
+            nightly(config, registry=registry)
+        report = nightly(config, registry=registry)
+        assert state(registry) == expected, f"after transaction {crash_at}"
+        assert report.champion == "tictactoe@2"
+        registry.close()
+
+
+def _copy(home: Path, to: Path) -> Registry:
+    shutil.copytree(home, to)
+    return Registry.open(Storage.at(to))
+
+
+KILLED = """
+import os, signal, sys
+from league.registry.registry import Registry
+from league.settings import Storage
+from evaluation.nightly import nightly
+from evaluation.report import VerdictReport
+from tests.evaluation.test_nightly import CONFIG
+
+verdicts = 0
+def listener(told):
+    global verdicts
+    verdicts += isinstance(told, VerdictReport)
+    if verdicts == 2 and not isinstance(told, VerdictReport) and told.played:
+        os.kill(os.getpid(), signal.SIGKILL)
+nightly(CONFIG, registry=Registry.open(Storage.at(sys.argv[1])), listener=listener)
+"""
+
+
+def test_a_night_that_was_killed_goes_on(registry: Registry, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", KILLED, str(registry.storage.home)]
+    killed = subprocess.run(command, cwd=Path(__file__).parents[2], timeout=120, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert [verdict.outcome for verdict in registry.verdicts(examples.LEAGUE)] == ["reject", "promote", None]
+    report = nightly(CONFIG, registry=registry)
+    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@3", "tictactoe@4"]
+    quiet = league_of(tmp_path / "quiet", WEAK, MIDDLING, STRONG, MIDDLING)
+    nightly(CONFIG, registry=quiet)
+    assert state(registry) == state(quiet)
+
+
+def test_a_second_night_is_told_so(registry: Registry) -> None:
+    home = registry.storage.home
+    (home / "locks").mkdir(exist_ok=True)
+    with FileLock(home / "locks" / "nightly-tictactoe.lock"), pytest.raises(AlreadyRunning, match="tictactoe"):
+        nightly(CONFIG, registry=registry)
+    assert nightly(CONFIG, registry=registry).champion == "tictactoe@3"
+
+
+def test_a_champion_moved_during_the_test_is_not_overruled(registry: Registry) -> None:
+    """The candidate has won against version 2, but a person has put version 1 in its place."""
+
+    def interfere(told: Progress | VerdictReport) -> None:
+        if isinstance(told, Progress) and told.what == "tictactoe@3 against tictactoe@2" and not told.played:
+            registry.set_alias(examples.LEAGUE, "champion", 1, expected=2, actor="me", reason="by hand")
+
+    report = nightly(CONFIG, registry=registry, listener=interfere)
+    refused = report.verdicts[2]
+    assert (refused.outcome, refused.promoted) == ("promote", False)
+    assert refused.note is not None
+    assert "tictactoe@1 now" in refused.note
+    assert registry.history(examples.LEAGUE)[0].version == 4, "version 4 beat version 1 later in that night"
+    again = nightly(CONFIG, registry=registry)
+    assert outcomes(again) == [("tictactoe@3", "tictactoe@4", "promote", True)]
+
+
+def test_an_open_verdict_against_a_champion_of_the_past_is_void(registry: Registry) -> None:
+    row = registry.league(examples.LEAGUE)
+    registry.set_alias(examples.LEAGUE, "champion", 2, expected=None, actor="me", reason="first")
+    verdict = verdicts.open_verdict(registry, row, 3, "tictactoe@2")
+    registry.set_alias(examples.LEAGUE, "champion", 4, expected=2, actor="me", reason="by hand")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report)[0] == ("tictactoe@3", "tictactoe@2", "void", False)
+    assert ("tictactoe@3", "tictactoe@4", "promote", True) in outcomes(report)
+    assert registry.verdicts(examples.LEAGUE)[0].id == verdict.id
+
+
+def test_a_void_verdict_is_followed_by_other_games(registry: Registry) -> None:
+    row = registry.league(examples.LEAGUE)
+    first = verdicts.open_verdict(registry, row, 3, "script:random")
+    registry.close_verdict(first.id, "void", {})
+    second = verdicts.open_verdict(registry, row, 3, "script:random")
+    assert second.id != first.id
+    assert second.id == verdicts.open_verdict(registry, row, 3, "script:random").id
+
+
+def test_a_promotion_that_was_rolled_back_is_not_repeated(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process dies between promotion and closing its verdict, and a person rolls back before the next night."""
+    with monkeypatch.context() as patch:
+        patch.setattr(Registry, "close_verdict", _crash_on_promotion(Registry.close_verdict))
+        with pytest.raises(Crash):
+            nightly(CONFIG, registry=registry)
+    assert registry.aliases(examples.LEAGUE) == {"champion": 3}
+    registry.rollback(examples.LEAGUE, actor="me", reason="no")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report)[0] == ("tictactoe@3", "tictactoe@2", "promote", True)
+    assert registry.aliases(examples.LEAGUE) == {"champion": 2}
+    assert [e.kind for e in registry.history(examples.LEAGUE)] == ["rollback", "set", "set"]
+
+
+def _crash_on_promotion(close: Any) -> Any:
+    def crash(registry: Registry, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
+        if outcome == "promote" and evidence["candidate"] == "tictactoe@3":
+            raise Crash
+        close(registry, verdict, outcome, evidence)
+
+    return crash
+
+
+def test_a_tampered_version_is_reported_and_the_others_judged(registry: Registry) -> None:
+    (registry.artifacts.root / "tictactoe" / "3" / "shared.onnx").write_bytes(STRONGEST)
+    report = nightly(CONFIG, registry=registry)
+    assert report.champion == "tictactoe@2"
+    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@1", "tictactoe@2", "tictactoe@4"]
+    assert any("tictactoe@3" in fault and "shared.onnx" in fault for fault in report.faults)
+
+
+def test_an_empty_league_has_a_quiet_night(tmp_path: Path) -> None:
+    report = nightly(CONFIG, registry=league_of(tmp_path))
+    assert (report.verdicts, report.standings, report.champion) == ((), (), None)
+
+
+def test_a_home_that_cannot_be_written_is_one_sentence(registry: Registry) -> None:
+    locks = registry.storage.home / "locks"
+    locks.write_text("in the way")
+    with pytest.raises(Exception, match="cannot be locked") as error:
+        nightly(CONFIG, registry=registry)
+    assert "\n" not in str(error.value)
+
+
+def test_hypotheses_out_of_reach_are_refused_by_name() -> None:
+    with pytest.raises(ConfigError, match="elo1"):
+        examples.config(gate={"elo1": 400})

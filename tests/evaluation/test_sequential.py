@@ -1,0 +1,183 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from evaluation.sequential import (
+    ELO_PER_EFFECT,
+    Model,
+    bounds,
+    elo_estimate,
+    elo_of,
+    expected_games,
+    gsprt_llr,
+    score_of,
+)
+
+MODELS: tuple[Model, ...] = ("logistic", "normalized")
+
+Counts = tuple[int, ...]
+trinomial = st.tuples(*[st.integers(0, 400)] * 3)
+pentanomial = st.tuples(*[st.integers(0, 400)] * 5)
+counts = st.one_of(trinomial, pentanomial)
+few = settings(max_examples=40, deadline=None)
+hypotheses = st.tuples(st.floats(-100, 100), st.floats(1, 60)).map(lambda pair: (pair[0], pair[0] + pair[1]))
+
+
+def six(ll: int, ld: int, wl: int, dd: int, wd: int, ww: int) -> Counts:
+    """The cells of fastchess, which keeps WL and DD apart."""
+    return ll, ld, wl + dd, wd, ww
+
+
+# Expected values: fastchess, app/tests/sprt_test.cpp, printed with two decimals.
+@pytest.mark.parametrize(
+    ("observed", "elo0", "elo1", "model", "llr"),
+    [
+        ((36027, 68692, 36433), 0, 2, "normalized", 0.92),
+        ((10650, 20431, 10871), -1.75, 0.25, "normalized", 2.30),
+        ((21184, 40708, 21404), 0.5, 2.5, "logistic", -1.57),
+        ((57030, 106593, 57433), 0, 2, "logistic", -2.59),
+        (six(365, 16618, 36029, 200, 16974, 390), 0, 2, "normalized", 2.25),
+        (six(127, 4883, 10311, 401, 5150, 104), -1.75, 0.25, "normalized", 3.01),
+        (six(223, 9863, 20279, 1000, 10037, 246), 0.5, 2.5, "logistic", -3.07),
+        (six(871, 26175, 55003, 980, 26678, 821), 0, 2, "logistic", -4.98),
+    ],
+)
+def test_llr_of_fastchess(observed: Counts, elo0: float, elo1: float, model: Model, llr: float) -> None:
+    assert gsprt_llr(observed, elo0, elo1, model) == pytest.approx(llr, abs=5e-3)
+
+
+def test_llr_to_five_decimals() -> None:
+    assert gsprt_llr((13, 37, 50, 25, 3), 0, 4, "normalized") == pytest.approx(-0.54912, abs=1e-5)
+
+
+def test_normalized_elo_of_pairs() -> None:
+    assert elo_estimate((13, 37, 50, 25, 3), "normalized").elo == pytest.approx(-63.97, abs=5e-3)
+
+
+# Expected values: fastchess, elo_test.cpp: the estimate and half the width of its 95 % interval.
+@pytest.mark.parametrize(
+    ("observed", "model", "elo", "half"),
+    [
+        ((96, 111, 136), "logistic", 40.70, 30.43),
+        ((96, 111, 136), "normalized", 49.77, 36.77),
+        ((89, 123, 76), "normalized", -20.76, 40.13),
+        (six(34, 54, 31, 32, 64, 75), "normalized", 57.94, 28.28),
+        (six(34, 54, 31, 32, 64, 75), "logistic", 55.58, 27.65),
+        (six(332, 433, 457, 41, 333, 334), "logistic", -8.64, 10.33),
+        (six(7895, 8757, 5485, 200, 568, 9999), "normalized", -19.01, 2.65),
+    ],
+)
+def test_elo_with_interval(observed: Counts, model: Model, elo: float, half: float) -> None:
+    estimate = elo_estimate(observed, model)
+    assert estimate.elo == pytest.approx(elo, abs=6e-3)
+    assert (estimate.high - estimate.low) / 2 == pytest.approx(half, abs=6e-3)
+
+
+def test_bounds() -> None:
+    lower, upper = bounds(0.05, 0.05)
+    assert (lower, upper) == (pytest.approx(-2.94444, abs=1e-5), pytest.approx(2.94444, abs=1e-5))
+    assert bounds(0.01, 0.2) == (pytest.approx(math.log(0.2 / 0.99)), pytest.approx(math.log(0.8 / 0.01)))
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(0, 0.05), (0.05, 0), (0.5, 0.5), (-0.1, 0.1)])
+def test_bounds_refuse_what_is_no_error_probability(alpha: float, beta: float) -> None:
+    with pytest.raises(ValueError, match="alpha and beta"):
+        bounds(alpha, beta)
+
+
+# Expected values: Wald's approximation at alpha = beta = 0.05.
+@pytest.mark.parametrize(("elo1", "ends", "middle"), [(35, 522, 854), (20, 1599, 2616)])
+def test_expected_games(elo1: float, ends: float, middle: float) -> None:
+    for elo in (0, elo1):
+        assert expected_games(0, elo1, elo, 0.05, 0.05) == pytest.approx(ends, abs=0.5)
+    assert expected_games(0, elo1, elo1 / 2, 0.05, 0.05) == pytest.approx(middle, abs=0.5)
+
+
+@few
+@given(st.floats(-400, 400))
+def test_elo_and_score_are_inverse(elo: float) -> None:
+    assert elo_of(score_of(elo)) == pytest.approx(elo, abs=1e-6)
+
+
+@few
+@given(counts, hypotheses, st.sampled_from(MODELS))
+def test_llr_is_antisymmetric(observed: Counts, elos: tuple[float, float], model: Model) -> None:
+    """Seen from the opponent's side, the same games speak as much against as they spoke for."""
+    mine = gsprt_llr(observed, elos[0], elos[1], model)
+    theirs = gsprt_llr(observed[::-1], -elos[1], -elos[0], model)
+    assert mine == pytest.approx(-theirs, abs=1e-5)
+
+
+@few
+@given(st.tuples(*[st.integers(1, 400)] * 5), st.integers(0, 3), hypotheses)
+def test_a_better_block_raises_the_logistic_llr(observed: Counts, cell: int, elos: tuple[float, float]) -> None:
+    one = np.eye(5, dtype=int)
+    worse, better = (gsprt_llr(observed + one[i], *elos, "logistic") for i in (cell, cell + 1))
+    assert better > worse
+
+
+@few
+@given(st.lists(st.integers(0, 4), min_size=1, max_size=25), hypotheses, st.sampled_from(MODELS))
+def test_prefixes_at_once_are_prefixes_one_by_one(cells: list[int], elos: tuple[float, float], model: Model) -> None:
+    prefixes = np.eye(5)[cells].cumsum(axis=0)
+    together = gsprt_llr(prefixes, *elos, model)
+    assert together == pytest.approx([float(gsprt_llr(row, *elos, model)) for row in prefixes], abs=1e-7)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("observed", [(13, 37, 50, 25, 3), (30, 2, 100, 4, 45), (1, 5, 9), (9, 1, 2)])
+def test_constrained_estimates_are_the_most_likely(observed: Counts, model: Model) -> None:
+    """Against a general optimiser that knows nothing of the closed form."""
+    elo0, elo1 = -40.0, 90.0
+    total = [_best_likelihood(observed, elo, model) for elo in (elo0, elo1)]
+    assert gsprt_llr(observed, elo0, elo1, model) == pytest.approx(total[1] - total[0], abs=1e-5)
+
+
+def _best_likelihood(observed: Counts, elo: float, model: Model) -> float:
+    n = np.array(observed, dtype=float)
+    grid = np.linspace(0, 1, len(n))
+    effect = elo / ELO_PER_EFFECT * math.sqrt((len(n) - 1) / 2)
+
+    def constraint(p: np.ndarray) -> float:
+        mean = p @ grid
+        if model == "logistic":
+            return float(mean - score_of(elo))
+        return float(mean - 0.5 - effect * math.sqrt(p @ (grid - mean) ** 2))
+
+    found = minimize(
+        lambda p: -(n @ np.log(p)),
+        np.full(len(n), 1 / len(n)),
+        jac=lambda p: -n / p,
+        bounds=[(1e-9, 1)] * len(n),
+        constraints=[{"type": "eq", "fun": constraint}, {"type": "eq", "fun": lambda p: p.sum() - 1}],
+        method="SLSQP",
+        options={"maxiter": 500, "ftol": 1e-13},
+    )
+    return -float(found.fun)
+
+
+@few
+@given(counts, st.sampled_from([-190.0, -100.0, 100.0, 190.0]))
+def test_extreme_counts_and_hypotheses_have_an_llr(observed: Counts, elo: float) -> None:
+    elo0, elo1 = sorted((0.0, elo))
+    assert math.isfinite(gsprt_llr(observed, elo0, elo1, "normalized"))
+
+
+def test_no_blocks_say_nothing() -> None:
+    assert gsprt_llr((0, 0, 0, 0, 0), 0, 30, "normalized") == 0.0
+
+
+@pytest.mark.parametrize("observed", [(1, 2), (1, 2, 3, 4), (1, -2, 3), (1, 2, math.nan), 3])
+def test_counts_that_are_none_are_refused(observed: object) -> None:
+    with pytest.raises(ValueError, match="counts"):
+        gsprt_llr(observed, 0, 30, "normalized")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("elo0", "elo1"), [(30, 0), (0, 0), (0, 200), (-200, 0)])
+def test_hypotheses_that_are_none_are_refused(elo0: float, elo1: float) -> None:
+    with pytest.raises(ValueError, match="elo0"):
+        gsprt_llr((1, 2, 3, 4, 5), elo0, elo1, "normalized")
