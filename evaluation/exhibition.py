@@ -35,7 +35,7 @@ def exhibit(config: LeagueConfig, players: Mapping[str, Policy], seed: int) -> I
     episodes = iter([Episode(seed, environment.agents)])
     draws = {agent: generator(seed, agent) for agent in environment.agents}
     try:
-        turn = environment.start(lambda copy: next(episodes, None))
+        turn = environment.start(lambda _: next(episodes, None))
         while turn.batches:
             actions = {}
             for agent, batch in turn.batches.items():

@@ -19,7 +19,6 @@ from evaluation.gate import Decision, Watch, judge
 from evaluation.report import Listener, Progress, VerdictReport
 from evaluation.schedule import verdict as verdict_schedule
 from league.config import GateConfig
-from league.errors import NotFound
 from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.registry.rows import LeagueRow, VerdictRow
@@ -90,10 +89,7 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
 
 
 def _schedule(registry: Registry, verdict: VerdictRow) -> Schedule:
-    for schedule in Ledger(registry).schedules(verdict.league):
-        if schedule.id == verdict.schedule:
-            return schedule
-    raise NotFound(f"verdict {verdict.id} has no schedule in the ledger")
+    return Ledger(registry).schedule(verdict.schedule)
 
 
 def _gate(verdict: VerdictRow) -> GateConfig:

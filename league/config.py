@@ -93,8 +93,8 @@ class PPOConfig(_Part):
     """Actions of all agents after which training ends."""
     minutes: float | None = Field(default=None, gt=0)
     """Wall-clock limit of training; it ends at whichever of the two limits comes first."""
-    checkpoint_every: int = Field(default=200_000, ge=1)
-    """Actions between two published versions. The end of training publishes one too."""
+    checkpoint_every: int | None = Field(default=200_000, ge=1)
+    """Actions between two published versions, null for no such cadence. The end of training publishes one too."""
     checkpoint_minutes: float | None = Field(default=None, gt=0)
     """Wall-clock minutes of training between two published versions; the sooner of the two counts."""
     runners: int = Field(default=1, ge=0)
@@ -162,7 +162,8 @@ class GateConfig(_Part):
             raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
         if self.model == "normalized" and max(-self.elo0, self.elo1) > LARGEST_NORMALIZED_ELO:
             raise ValueError(
-                f"elo0 and elo1 must lie within ±{LARGEST_NORMALIZED_ELO} (normalized Elo), got {self.elo0:g} and {self.elo1:g}"
+                f"elo0 and elo1 must lie within ±{LARGEST_NORMALIZED_ELO} (normalized Elo),"
+                f" got {self.elo0:g} and {self.elo1:g}"
             )
         return self
 

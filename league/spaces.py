@@ -89,9 +89,7 @@ def from_gymnasium(space: "gymnasium.Space[Any]") -> Space:
 
     match space:
         case gymnasium.spaces.Box():
-            return Box(
-                dtype=space.dtype.name, shape=space.shape, low=_bound(space.low), high=_bound(space.high)
-            )
+            return Box(dtype=space.dtype.name, shape=space.shape, low=_bound(space.low), high=_bound(space.high))
         case gymnasium.spaces.Discrete():
             return Discrete(n=int(space.n), start=int(space.start))
         case gymnasium.spaces.MultiDiscrete():

@@ -50,7 +50,8 @@ class AECStepping:
 
     def start(self, next_episode: NextEpisode) -> Turn:
         self._next_episode = next_episode
-        turn, rows = Turn(), {}
+        turn = Turn()
+        rows: Rows = {}
         for copy in range(self.copies):
             self._restart(copy, turn, rows)
         return self._yield(turn, rows)
@@ -60,7 +61,8 @@ class AECStepping:
         for group, batch in self._pending.items():
             self._check(batch, actions[group])
             moves += zip(batch.copies, _plain(actions[group]), strict=True)
-        turn, rows = Turn(), {}
+        turn = Turn()
+        rows: Rows = {}
         for copy, action in sorted(moves, key=_copy_of):
             self._envs[copy].step(action)
             self._advance(copy, turn, rows)

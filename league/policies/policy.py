@@ -16,7 +16,7 @@ class Actions:
     """What a policy answers to a batch of k observations.
 
     actions: (k, *action shape) in the agent's own action space.
-    state: recurrent state to hand in at the next call, `state_out_<i>` under the name `state_in_<i>`; None if there is none.
+    state: recurrent state to hand in at the next call, `state_out_<i>` under the name `state_in_<i>`; None without one.
     dist_inputs: (k, d) float32 inputs of the action distribution, masked; None for scripts or when not asked for.
     """
 

@@ -44,6 +44,11 @@ class Ledger:
         with self._database.read() as session:
             return _schedules(session, league)
 
+    def schedule(self, schedule: str) -> Schedule:
+        """One schedule by its id. Raises NotFound."""
+        with self._database.read() as session:
+            return _schedule(session, schedule)
+
     def append(self, match: Match) -> bool:
         """Store a match; False if it is there already. Raises LedgerRefusal if it breaks its schedule."""
         return self.extend([match]) == 1

@@ -133,9 +133,9 @@ class Stubborn:
         self,
         observations: Arrays,
         *,
-        state: Arrays | None = None,  # noqa: ARG002
-        explore: bool = False,  # noqa: ARG002
-        rng: Sequence[np.random.Generator] | None = None,  # noqa: ARG002
+        state: Arrays | None = None,
+        explore: bool = False,
+        rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
         return Actions(np.zeros(len(observations["action_mask"]), np.int64))
 

@@ -1,0 +1,30 @@
+"""`make bench`: run the benchmarks named in BENCH, or all; what follows their names is passed on (`--quick`)."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ORDER = ("sampling", "serving", "promotions", "fresh_machine", "strength")
+
+
+def main() -> int:
+    """Run each in a process of its own, so that none inherits another's Ray; 1 if any failed."""
+    names = [argument for argument in sys.argv[1:] if not argument.startswith("-")]
+    options = [argument for argument in sys.argv[1:] if argument.startswith("-")]
+    unknown = [name for name in names if name not in ORDER]
+    if unknown:
+        print(f"no benchmark {', '.join(unknown)}: expected some of {', '.join(ORDER)}", file=sys.stderr)
+        return 2
+    failed = []
+    for name in names or ORDER:
+        print(f"\n== {name} ==", flush=True)
+        if subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *options], cwd=HERE.parent).returncode:
+            failed.append(name)
+    if failed:
+        print(f"\nfailed: {', '.join(failed)}", file=sys.stderr)
+    return bool(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+"""The composition of the `league` command, and the edge where errors become sentences and exit codes."""
+
+import sys
+
+import typer
+
+from cli.demo import demo
+from cli.doctor import doctor
+from cli.evaluation import evaluate, nightly
+from cli.output import errors
+from cli.serving import act, serve
+from cli.training import train
+from cli.versions import history, promote, rollback, versions
+from league.errors import InvalidInput, LeagueError, NotFound
+
+app = typer.Typer(
+    name="league",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Train multi-agent policies, let a league decide which version is really better, and serve the champion.\n\n"
+    "A first look: `league demo`. The usual way: `train`, `nightly`, `serve`, `act`. What lives where is set by "
+    "LEAGUE_HOME (default ./league-home), LEAGUE_DATABASE_URL and LEAGUE_ARTIFACTS.",
+)
+for command in (demo, doctor, train, versions, evaluate, nightly, promote, rollback, history, serve, act):
+    app.command()(command)
+
+CALLERS_MISTAKE = 2
+FAULT = 1
+
+
+def run() -> None:
+    """Run the command. A fault is one line on stderr: exit 2 for the caller's mistake, 1 otherwise."""
+    try:
+        app()
+    except LeagueError as error:
+        errors.print(f"league: {' '.join(str(error).split())}", markup=False, soft_wrap=True)
+        sys.exit(CALLERS_MISTAKE if isinstance(error, InvalidInput | NotFound) else FAULT)

@@ -1,0 +1,48 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from league.registry.registry import Registry
+from tests.cli.conftest import League
+from tests.evaluation import examples
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> str:
+    path = tmp_path / "tictactoe.yaml"
+    path.write_text(yaml.safe_dump(examples.config().model_dump(mode="json", by_alias=True)))
+    return str(path)
+
+
+def test_evaluate_as_json(league: League, registry: Registry) -> None:
+    document = league("evaluate", "tictactoe", "--blocks", "20", "--workers", "0", "--json").json
+    standings = {standing["ref"]: standing for standing in document["standings"]}
+    assert set(standings) == {"tictactoe@1", "tictactoe@2", "tictactoe@3", "script:random", "script:one_ply"}
+    assert standings["script:random"]["rating"] == 0
+    for standing in standings.values():
+        assert {"mean_return", "score", "rating", "interval", "games"} <= set(standing)
+        low, high = standing["interval"]
+        assert low <= standing["rating"] <= high
+    assert standings["tictactoe@3"]["rating"] > standings["tictactoe@1"]["rating"]
+
+
+def test_evaluate_as_tables(league: League, registry: Registry) -> None:
+    out = league("evaluate", "tictactoe", "tictactoe@1", "tictactoe@3", "--blocks", "4", "--workers", "0").out
+    assert "tictactoe@3" in out
+    assert "script:one_ply" in out
+
+
+def test_a_night_judges_promotes_and_rates_and_the_next_has_nothing_to_do(
+    league: League, registry: Registry, config: str
+) -> None:
+    told = league("nightly", config, "--workers", "0")
+    assert told.code == 0, told.err
+    assert "tictactoe@1 against script:random" in told.out
+    champion = registry.aliases("tictactoe")["champion"]
+    assert f"the champion is now tictactoe@{champion}" in told.out
+    again = league("nightly", config, "--workers", "0", "--json").json["leagues"][0]
+    assert again["verdicts"] == []
+    assert again["champion"] == f"tictactoe@{champion}"
+    rated = league("versions", "tictactoe", "--json").json["versions"]
+    assert all(version["rating"] is not None for version in rated)

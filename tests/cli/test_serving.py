@@ -1,0 +1,26 @@
+import json
+
+from league.registry.registry import Registry
+from tests.cli.conftest import League
+
+EMPTY = {"observation": [[[0, 0]] * 3] * 3, "action_mask": [1] * 9}
+
+
+def test_act_locally_on_the_first_observation_of_an_episode(league: League, registry: Registry) -> None:
+    assert league("act", "tictactoe@3", "--local").out.strip() == "1"
+
+
+def test_act_locally_on_text_a_file_and_stdin(league: League, registry: Registry, tmp_path) -> None:
+    corner = EMPTY | {"action_mask": [1, 0, 0, 0, 0, 0, 0, 0, 0]}
+    path = tmp_path / "observation.json"
+    path.write_text(json.dumps(corner))
+    for source, stdin in ((json.dumps(corner), None), (str(path), None), ("-", json.dumps(corner))):
+        document = league("act", "tictactoe@3", "--local", "--json", "-o", source, stdin=stdin).json
+        assert document["action"] == 0
+        assert document["version"] == 3
+        assert document["sha256"] == registry.version("tictactoe", 3).sha256
+
+
+def test_exploration_is_reproducible_by_its_seed(league: League, registry: Registry) -> None:
+    first = league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out
+    assert first == league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out

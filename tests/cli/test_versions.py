@@ -1,0 +1,56 @@
+from concurrent.futures import ThreadPoolExecutor
+
+from league.registry.registry import Registry
+from tests.cli.conftest import League
+
+
+def test_versions_as_json(league: League, registry: Registry) -> None:
+    league("promote", "tictactoe@2")
+    document = league("versions", "tictactoe", "--json").json
+    assert document["league"] == "tictactoe"
+    assert [version["version"] for version in document["versions"]] == [1, 2, 3]
+    assert [version["aliases"] for version in document["versions"]] == [[], ["champion"], []]
+    assert {"rating", "interval", "games", "steps", "parent", "sha256", "created_at"} <= set(document["versions"][0])
+
+
+def test_versions_as_a_table(league: League, registry: Registry) -> None:
+    lines = league("versions", "tictactoe").out.splitlines()
+    assert lines[0].split()[:3] == ["version", "aliases", "rating"]
+    assert len(lines) == 4
+
+
+def test_promote_roll_back_and_the_history_of_both(league: League, registry: Registry) -> None:
+    assert "now version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
+    assert "now version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out
+    assert league("rollback", "tictactoe", "--json").json["version"] == 1
+    events = league("history", "tictactoe", "--json").json["events"]
+    assert [(event["version"], event["previous"], event["kind"]) for event in events] == [
+        (1, 3, "rollback"),
+        (3, 1, "set"),
+        (1, None, "set"),
+    ]
+    assert events[1]["actor"] == "ada"
+    assert events[2]["reason"] == "the first"
+    then = events[1]["at"]
+    assert [event["version"] for event in league("history", "tictactoe", "--at", then, "--json").json["events"]] == [3]
+    outcome = league("rollback", "tictactoe")
+    assert outcome.code == 1
+    assert outcome.err.startswith("league: ")
+
+
+def test_of_two_promotions_that_expect_the_same_one_wins_and_the_other_is_told(
+    league: League, registry: Registry
+) -> None:
+    league("promote", "tictactoe@1")
+    with ThreadPoolExecutor(2) as pool:
+        outcomes = list(pool.map(lambda ref: league("promote", ref, "--expected", "1"), ("tictactoe@2", "tictactoe@3")))
+    assert sorted(outcome.code for outcome in outcomes) == [0, 1]
+    loser = max(outcomes, key=lambda outcome: outcome.code)
+    winner = registry.aliases("tictactoe")["champion"]
+    assert loser.err.startswith("league: ")
+    assert str(winner) in loser.err
+
+
+def test_another_alias_can_be_moved(league: League, registry: Registry) -> None:
+    league("promote", "tictactoe@2", "--alias", "candidate", "--expected", "none")
+    assert registry.aliases("tictactoe") == {"candidate": 2}

@@ -1,0 +1,30 @@
+"""Leagues for tests of training, small or exactly predictable."""
+
+from typing import Any
+
+from league.config import LeagueConfig
+
+COUNTING = "tests.league.environments.counting:counting"
+
+
+def counting(lives: list[int], truncated: list[int], **training: Any) -> LeagueConfig:
+    """Each player its own policy, as their spaces differ."""
+    return LeagueConfig.from_mapping(
+        {
+            "league": "counting",
+            "environment": {"entry_point": COUNTING, "kwargs": {"lives": lives, "truncated": truncated}},
+            "policies": {f"policy_{i}": [f"player_{i}"] for i in range(len(lives))},
+            "training": {"runners": 0, "copies": 3, "hidden": [8], "seed": 5} | training,
+        }
+    )
+
+
+def tictactoe(**training: Any) -> LeagueConfig:
+    """One policy for both players, a network of a few units."""
+    return LeagueConfig.from_mapping(
+        {
+            "league": "tictactoe",
+            "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
+            "training": {"runners": 0, "copies": 4, "hidden": [16], "seed": 5} | training,
+        }
+    )

@@ -1,0 +1,27 @@
+import numpy as np
+from scipy.stats import chisquare
+
+from training.sampling import categorical
+
+
+def test_log_softmax_of_masked_logits() -> None:
+    found = categorical.log_softmax(np.array([[0.0, np.log(3), -1e9]], np.float32))
+    np.testing.assert_allclose(np.exp(found), [[0.25, 0.75, 0.0]], atol=1e-6)
+    assert found.dtype == np.float32
+
+
+def test_samples_follow_the_distribution() -> None:
+    p = np.array([0.5, 0.3, 0.2, 0.0])
+    with np.errstate(divide="ignore"):
+        log_p = np.maximum(np.log(p), -1e9).astype(np.float32)
+    drawn = categorical.sample(np.tile(log_p, (20_000, 1)), np.random.default_rng(1))
+    counts = np.bincount(drawn, minlength=4)
+    assert counts[3] == 0
+    assert chisquare(counts[:3], 20_000 * p[:3]).pvalue > 1e-3
+
+
+def test_entropy_in_nats() -> None:
+    uniform = categorical.log_softmax(np.zeros((1, 4), np.float32))
+    certain = categorical.log_softmax(np.array([[0.0, -1e9]], np.float32))
+    np.testing.assert_allclose(categorical.entropy(uniform), [np.log(4)], rtol=1e-6)
+    assert categorical.entropy(certain).tolist() == [0.0]

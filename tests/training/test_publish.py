@@ -1,0 +1,120 @@
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from league.environments.building import interface
+from league.errors import ParityError
+from league.policies.onnx import OnnxPolicy
+from league.registry.manifest import TRAINING
+from league.registry.registry import Registry
+from league.settings import Storage
+from league.stack import installed
+from tests.training.leagues import tictactoe
+from training import publish as publishing
+from training.publish import Checkpoint, git_commit, load_modules, publish
+from training.trial import build
+
+LEAGUE = tictactoe(train_batch_size=64, minibatch_size=32, epochs=1)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """RLlib's state after one update, in this process and without Tune."""
+    request.getfixturevalue("ray_session")
+    algorithm = build(LEAGUE, interface(LEAGUE))
+    try:
+        algorithm.train()
+        path = tmp_path_factory.mktemp("trained") / "64"
+        algorithm.save_to_path(str(path))
+    finally:
+        algorithm.stop()
+    return path
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    registry = Registry.open(Storage.at(tmp_path / "home"))
+    registry.register(LEAGUE, interface(LEAGUE))
+    yield registry
+    registry.close()
+
+
+def put(registry: Registry, trained: Path, source: str = "run/64", parent: int | None = None) -> int:
+    row = publish(
+        Checkpoint(trained, source=source, steps=64),
+        registry=registry,
+        config=LEAGUE,
+        interface=interface(LEAGUE),
+        parent=parent,
+        git_commit="abc",
+    )
+    return row.number
+
+
+def test_a_version_says_all_of_itself_and_acts_as_the_training_state(registry: Registry, trained: Path) -> None:
+    first = put(registry, trained)
+    number = put(registry, trained, source="run/65", parent=first)
+    manifest = registry.version("tictactoe", number).manifest
+    assert manifest.interface == interface(LEAGUE)
+    assert manifest.environment == LEAGUE.environment
+    assert (manifest.algorithm, manifest.seed, manifest.steps) == ("ppo", 5, 64)
+    assert (manifest.parent, manifest.git_commit) == (first, "abc")
+    assert manifest.settings["lambda"] == LEAGUE.training.lambda_
+    assert manifest.stack == installed()
+    assert manifest.policies["shared"].parity.observations >= 2000
+    artefact = registry.fetch("tictactoe", number)
+    assert (artefact / TRAINING / "algorithm_state.pkl").is_file()
+    module = load_modules(artefact / TRAINING, LEAGUE, interface(LEAGUE))["shared"]
+    policy = OnnxPolicy(artefact / "shared.onnx", manifest.policies["shared"])
+    rows = {"observation": np.zeros((1, 3, 3, 2), np.int8), "action_mask": np.ones((1, 9), np.int8)}
+    tensors = {name: torch.from_numpy(array) for name, array in rows.items()}
+    expected = module.forward_inference({"obs": tensors})["action_dist_inputs"].argmax(-1)
+    assert policy.act(rows).actions.tolist() == expected.tolist()
+
+
+def test_the_same_checkpoint_is_published_once(registry: Registry, trained: Path) -> None:
+    assert put(registry, trained) == put(registry, trained)
+    assert len(registry.versions("tictactoe")) == 1
+
+
+def test_a_failing_proof_leaves_no_version(registry: Registry, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The graph is exported from a module whose weights were changed on the way."""
+    export = publishing.export_policy
+
+    def tampered(module: torch.nn.Module, *rest: object) -> None:
+        before = module.policy_head.weight.detach().clone()
+        with torch.no_grad():
+            module.policy_head.weight[4] += 0.05
+        export(module, *rest)
+        with torch.no_grad():
+            module.policy_head.weight.copy_(before)
+
+    monkeypatch.setattr(publishing, "export_policy", tampered)
+    with pytest.raises(ParityError):
+        put(registry, trained)
+    assert registry.versions("tictactoe") == []
+    artifacts = registry.storage.artifacts
+    assert not [path for path in artifacts.rglob("*") if path.is_file()]
+
+
+def test_git_commit_of_a_tracked_file_only(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+        command = ["git", "-C", str(tmp_path), *identity, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    config = tmp_path / "league.yaml"
+    config.write_text(json.dumps({}))
+    assert git_commit(config) is None
+    git("init", "-q")
+    assert git_commit(config) is None
+    git("add", "league.yaml")
+    git("commit", "-qm", "first")
+    assert git_commit(config) == git("rev-parse", "HEAD")
+    assert git_commit(tmp_path / "other.yaml") is None
+    assert git_commit(None) is None

@@ -1,0 +1,1 @@
+"""League configuration → RLlib → published checkpoint versions."""

@@ -1,0 +1,1 @@
+"""One file per algorithm: a league's settings → RLlib's AlgorithmConfig."""

@@ -1,0 +1,46 @@
+"""The Ray that training runs on: a local one of its own, the caller's, or a cluster."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import ray
+
+from league.errors import ConfigError
+from league.settings import Storage
+
+
+@contextmanager
+def connected(address: str | None, storage: Storage) -> Iterator[None]:
+    """Have Ray while the block runs; end it afterwards if it was started or joined here.
+
+    address: a cluster to join. None: the Ray that this process is connected to, else a local one.
+    Raises ConfigError if the cluster cannot be reached, or has machines that do not reach `storage`.
+    """
+    ours = not ray.is_initialized()
+    if ours:
+        _connect(address)
+    try:
+        _check_storage(storage)
+        yield
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _connect(address: str | None) -> None:
+    if address is None:
+        ray.init(address="local", include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        return
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (ConnectionError, ValueError) as error:
+        raise ConfigError(f"no Ray cluster at {address!r}: {' '.join(str(error).split())}") from error
+
+
+def _check_storage(storage: Storage) -> None:
+    machines = {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
+    if len(machines) > 1 and not storage.is_shared:
+        raise ConfigError(
+            f"the cluster has {len(machines)} machines: set LEAGUE_DATABASE_URL to a database server and "
+            "LEAGUE_ARTIFACTS to a directory that all of them mount"
+        )

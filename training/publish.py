@@ -1,0 +1,120 @@
+"""A checkpoint of training → a version in the registry."""
+
+import shutil
+import subprocess
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
+from ray.rllib.core.rl_module.torch import TorchRLModule
+
+from league.config import LeagueConfig
+from league.interface import Interface
+from league.registry.manifest import TRAINING, Manifest, PolicyManifest
+from league.registry.registry import Registry
+from league.registry.rows import VersionRow
+from league.spaces import Discrete
+from league.stack import installed
+from training import parity
+from training.algorithms.ppo import module_spec
+from training.export import export_policy, graph_tensors
+
+MODULES = Path(COMPONENT_LEARNER_GROUP, COMPONENT_LEARNER, COMPONENT_RL_MODULE)
+"""Where RLlib keeps the modules inside an Algorithm's checkpoint."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """RLlib's state on disk.
+
+    source: names it for ever, "<run>/<steps>". steps: actions that training took, those of its parents included.
+    """
+
+    path: Path
+    source: str
+    steps: int
+
+
+def publish(
+    checkpoint: Checkpoint,
+    *,
+    registry: Registry,
+    config: LeagueConfig,
+    interface: Interface,
+    parent: int | None,
+    git_commit: str | None,
+) -> VersionRow:
+    """Export the policies of `checkpoint`, prove the graphs, and publish them with the training state.
+
+    Raises ParityError, and what Registry.publish raises; there is then no version.
+    """
+
+    def build(staging: Path, number: int) -> Manifest:
+        modules = load_modules(checkpoint.path, config, interface)
+        observations = parity.gather(config.environment, interface, modules, seed=config.training.seed)
+        policies = {
+            policy: _export(staging, policy, module, interface, observations[policy])
+            for policy, module in modules.items()
+        }
+        shutil.copytree(checkpoint.path, staging / TRAINING)
+        return Manifest(
+            league=config.league,
+            version=number,
+            created_at=datetime.now(UTC),
+            interface=interface,
+            policies=policies,
+            environment=config.environment,
+            environment_digest=config.environment.digest(),
+            algorithm=config.training.algorithm,
+            settings=config.training.model_dump(mode="json", by_alias=True),
+            seed=config.training.seed,
+            steps=checkpoint.steps,
+            parent=parent,
+            git_commit=git_commit,
+            stack=installed(),
+        )
+
+    return registry.publish(config.league, build, source=checkpoint.source, parent=parent)
+
+
+def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, TorchRLModule]:
+    """The policies' modules in the state of `checkpoint`. Reads pickles: only for what our own training wrote."""
+    modules = module_spec(config.training, interface).build()
+    modules.restore_from_path(checkpoint / MODULES)
+    return {policy: modules[policy] for policy in interface.policy_ids}
+
+
+def git_commit(config_path: Path | None) -> str | None:
+    """The commit of the repository that the league's file is tracked in; None if there is none."""
+    if config_path is None:
+        return None
+    directory, name = config_path.absolute().parent, config_path.name
+    try:
+        _git(directory, "ls-files", "--error-unmatch", name)
+        return _git(directory, "rev-parse", "HEAD")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(directory: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(directory), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def _export(
+    staging: Path, policy: str, module: TorchRLModule, interface: Interface, observations: parity.Batches
+) -> PolicyManifest:
+    spaces = interface.of_policy(policy)
+    assert isinstance(spaces.action, Discrete)
+    file = f"{policy}.onnx"
+    export_policy(module, spaces, staging / file)
+    inputs, outputs = graph_tensors(spaces)
+    return PolicyManifest(
+        file=file,
+        observation=spaces.observation,
+        action=spaces.action,
+        inputs=inputs,
+        outputs=outputs,
+        parity=parity.prove(staging / file, policy, module, observations, spaces.action.start),
+    )

@@ -1,0 +1,1 @@
+"""The EnvRunner on the kernel's lockstep stepping."""
