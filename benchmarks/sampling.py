@@ -9,6 +9,7 @@ import logging
 import statistics
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +46,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="shorter measurements, for a look")
     quick = parser.parse_args().quick
     logging.disable(logging.WARNING)
+    warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     runners = {("ours", copies): ours(copies) for copies in COPIES}
     runners |= {("RLlib", copies): rllib(copies) for copies in COPIES}

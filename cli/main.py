@@ -1,5 +1,6 @@
 """The composition of the `league` command, and the edge where errors become sentences and exit codes."""
 
+import os
 import sys
 
 import typer
@@ -33,8 +34,17 @@ FAULT = 1
 
 def run() -> None:
     """Run the command. A fault is one line on stderr: exit 2 for the caller's mistake, 1 otherwise."""
+    _let_modules_here_be_found()
     try:
         app()
     except LeagueError as error:
         errors.print(f"league: {' '.join(str(error).split())}", markup=False, soft_wrap=True)
         sys.exit(CALLERS_MISTAKE if isinstance(error, InvalidInput | NotFound) else FAULT)
+
+
+def _let_modules_here_be_found() -> None:
+    """A league's `entry_point` may lie in the directory where the command is run. Ray hands the path on to workers.
+
+    Behind everything else, so that a file there takes no installed package's place.
+    """
+    sys.path.append(os.getcwd())
