@@ -1,0 +1,173 @@
+"""A lean HTTP/1.1 load generator: raw sockets, keep-alive, one request in flight per connection.
+
+`python -m benchmarks.load URL --connections 32 --seconds 5 < body.json` prints one line of JSON (a `Load`). It is its
+own process so that it shares no interpreter with what it measures; each request costs it a few microseconds.
+"""
+
+import argparse
+import asyncio
+import json
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import cast
+from urllib.parse import urlsplit
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What one run saw. Times in milliseconds; `failed` counts dropped connections and statuses other than 200."""
+
+    requests: int
+    seconds: float
+    failed: int
+    statuses: dict[str, int]
+    p50: float
+    p99: float
+    max: float
+
+    @property
+    def rate(self) -> float:
+        """Answers with status 200 per second."""
+        return (self.requests - self.failed) / self.seconds
+
+
+OnReply = Callable[[int, bytes, float], bool]
+"""(status, body, time.perf_counter() at sending) → whether to send again. Status 0: the connection was dropped."""
+
+
+LENGTH = b"content-length: "
+LAST_CHUNK = b"0\r\n\r\n"
+
+
+class Connection(asyncio.Protocol):
+    """Sends `request` again as soon as its reply is whole, and reports each reply."""
+
+    def __init__(self, request: bytes, on_reply: OnReply) -> None:
+        self.request = request
+        self.on_reply = on_reply
+        self.closed = asyncio.get_running_loop().create_future()
+        self.received = b""
+        self.sent_at = 0.0
+        self.waiting = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        self.send()
+
+    def send(self) -> None:
+        self.waiting = True
+        self.sent_at = time.perf_counter()
+        self.transport.write(self.request)
+
+    def data_received(self, data: bytes) -> None:
+        self.received = self.received + data if self.received else data
+        end = self.received.find(b"\r\n\r\n")
+        if end < 0:
+            return
+        head = self.received[:end].lower()
+        if not self.is_whole(head, end + 4):
+            return
+        reply, self.received, self.waiting = self.received, b"", False
+        if self.on_reply(int(reply[9:12]), reply[end + 4 :], self.sent_at) and b"connection: close" not in head:
+            self.send()
+        else:
+            self.transport.close()
+
+    def is_whole(self, head: bytes, body: int) -> bool:
+        """Whether a reply, whose body starts at `body`, has arrived; its length is stated, or it is in chunks."""
+        at = head.find(LENGTH)
+        if at < 0:
+            return self.received.endswith(LAST_CHUNK)
+        stop = head.find(b"\r", at)
+        return len(self.received) >= body + int(head[at + len(LENGTH) : stop if stop > 0 else None])
+
+    def connection_lost(self, _: Exception | None) -> None:
+        if self.waiting:
+            self.on_reply(0, b"", self.sent_at)
+        self.closed.set_result(None)
+
+
+def post(url: str, body: bytes) -> bytes:
+    """The bytes of a POST of JSON to `url`."""
+    parts = urlsplit(url)
+    path = parts.path + (f"?{parts.query}" if parts.query else "")
+    head = (
+        f"POST {path} HTTP/1.1\r\nHost: {parts.netloc}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+    )
+    return head.encode() + b"\r\n\r\n" + body
+
+
+async def drive(url: str, body: bytes, connections: int, on_reply: OnReply, going: Callable[[], bool]) -> None:
+    """Keep `connections` busy until `going()` is false; a dropped connection is opened again."""
+    parts = urlsplit(url)
+    request = post(url, body)
+
+    async def keep() -> None:
+        loop = asyncio.get_running_loop()
+        while going():
+            try:
+                _, connection = await loop.create_connection(
+                    lambda: Connection(request, on_reply), parts.hostname, parts.port
+                )
+            except OSError:
+                on_reply(0, b"", time.perf_counter())
+                await asyncio.sleep(0.05)
+                continue
+            await connection.closed
+
+    await asyncio.gather(*(keep() for _ in range(connections)))
+
+
+async def run(url: str, body: bytes, connections: int, seconds: float, warm_up: float) -> Load:
+    """Load `url` for `warm_up + seconds`; the warm-up is not counted."""
+    statuses: Counter[str] = Counter()
+    latencies: list[float] = []
+    start = time.perf_counter() + warm_up
+    stop = start + seconds
+
+    def on_reply(status: int, _: bytes, sent_at: float) -> bool:
+        now = time.perf_counter()
+        if start <= now <= stop:
+            statuses[str(status)] += 1
+            latencies.append(now - sent_at)
+        return now < stop
+
+    await drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop)
+    times = np.array(latencies or [np.nan]) * 1e3
+    p50, p99 = np.percentile(times, [50, 99])
+    requests = statuses.total()
+    return Load(
+        requests, seconds, requests - statuses["200"], dict(statuses), float(p50), float(p99), float(times.max())
+    )
+
+
+def measure(url: str, body: bytes, *, connections: int, seconds: float, warm_up: float = 1.0) -> Load:
+    """Run the generator in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.load", url]
+    command += ["--connections", str(connections), "--seconds", str(seconds), "--warm-up", str(warm_up)]
+    done = subprocess.run(command, input=body, stdout=subprocess.PIPE, check=True)
+    return Load(**json.loads(done.stdout))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("url")
+    parser.add_argument("--connections", type=int, default=32)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--warm-up", type=float, default=1.0)
+    arguments = parser.parse_args()
+    import uvloop
+
+    body = sys.stdin.buffer.read()
+    load = uvloop.run(run(arguments.url, body, arguments.connections, arguments.seconds, arguments.warm_up))
+    print(json.dumps(asdict(load)))
+
+
+if __name__ == "__main__":
+    main()

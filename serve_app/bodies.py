@@ -1,0 +1,63 @@
+"""Reading the body of a request without ever holding more than its limit."""
+
+from typing import Any
+
+import orjson
+from starlette.types import Receive, Scope
+
+from serve_app.error_handlers import BodyTooLarge, MalformedBody, UnsupportedMediaType
+from serve_app.observations import kind
+
+JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")
+"""What may stand for JSON. The last is what curl says when it is told nothing."""
+
+
+async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
+    """The body, of at most `limit` bytes. Raises BodyTooLarge, as soon as that is known, or UnsupportedMediaType."""
+    for name, value in scope["headers"]:
+        if name == b"content-length" and int(value) > limit:
+            raise _too_large(limit)
+        if name == b"content-type":
+            _check_type(value)
+    message = await receive()
+    body: bytes = message.get("body", b"")
+    if message.get("more_body", False):
+        body = await _rest(body, receive, limit)
+    if len(body) > limit:
+        raise _too_large(limit)
+    return body
+
+
+def parse_object(body: bytes) -> dict[str, Any]:
+    """The JSON object that a body is. Raises MalformedBody."""
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        reason = "it is empty" if not body else str(error)
+        raise MalformedBody(f"the body is not JSON: {reason}") from None
+    if type(document) is not dict:
+        raise MalformedBody(f"the body is {kind(document)}, expected an object")
+    return document
+
+
+async def _rest(body: bytes, receive: Receive, limit: int) -> bytes:
+    parts, size, more = [body], len(body), True
+    while more and size <= limit:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise MalformedBody("the connection ended before the body did")
+        parts.append(message.get("body", b""))
+        size += len(parts[-1])
+        more = message.get("more_body", False)
+    return b"".join(parts)
+
+
+def _check_type(value: bytes) -> None:
+    media_type = value.partition(b";")[0].strip().lower()
+    if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
+        given = media_type.decode("latin-1")[:64]
+        raise UnsupportedMediaType(f"the body is said to be {given!r}, expected application/json")
+
+
+def _too_large(limit: int) -> BodyTooLarge:
+    return BodyTooLarge(f"the body is larger than {limit} bytes")

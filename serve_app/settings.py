@@ -1,0 +1,47 @@
+"""The limits of a serving replica, each with what it must keep to. `args` in deploy.yaml overrides them.
+
+What Ray Serve itself limits (replicas, requests at once, queue, drain) stands in deploy.yaml.
+"""
+
+from datetime import timedelta
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+ACKNOWLEDGED_WITHIN = timedelta(seconds=15)
+"""What a replica said longer ago counts as silence: `Registry.acknowledgements` looks back this far."""
+
+
+class ServeSettings(BaseModel):
+    """Times in seconds, sizes in bytes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_body: int = Field(default=4 * 2**20, ge=1024)
+    """A larger request body is refused with 413. A replica may hold `max_in_flight` of them at once, and HAProxy
+    repeats a request on another replica only if it fits into RAY_SERVE_HAPROXY_TUNE_BUFSIZE."""
+    max_in_flight: int = Field(default=256, ge=1)
+    """Requests for actions that a replica has begun and not yet answered; beyond them it answers 429."""
+    max_batch: int = Field(default=1024, ge=1)
+    """Most observations in one request."""
+    cached_versions: int = Field(default=8, ge=1)
+    """Versions kept because somebody asked for them by number. Those that an alias names are kept besides."""
+    poll: float = Field(default=0.2, gt=0)
+    """Between two looks at the registry's aliases. A promotion reaches every replica after at most this, plus loading;
+    within a second, as promised, if poll ≤ 0.5."""
+    poll_slowest: float = Field(default=5.0, gt=0)
+    """The longest pause between looks while the database fails; pauses double up to it. At least `poll`."""
+    heartbeat: float = Field(default=4.0, gt=0)
+    """Between two acknowledgements of the same. At most a third of ACKNOWLEDGED_WITHIN: two may get lost."""
+    retry: float = Field(default=3.0, gt=0)
+    """How long a version that could not be loaded is not tried again; also the `Retry-After` of a 503."""
+    inline: float = Field(default=0.001, gt=0)
+    """Inference that takes longer runs in a thread, so that it holds up neither other requests nor health checks."""
+
+    @model_validator(mode="after")
+    def _in_proportion(self) -> Self:
+        if self.poll_slowest < self.poll:
+            raise ValueError(f"poll_slowest must be at least poll ({self.poll:g})")
+        if 3 * self.heartbeat > ACKNOWLEDGED_WITHIN.total_seconds():
+            raise ValueError(f"heartbeat must be at most {ACKNOWLEDGED_WITHIN.total_seconds() / 3:g} s")
+        return self

@@ -1,0 +1,132 @@
+"""A replica follows the registry, says what it serves, and goes on when the registry is gone."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from time import monotonic
+
+import pytest
+from sqlalchemy.orm import Session
+from starlette.testclient import TestClient
+
+from league.errors import StorageError
+from league.registry.registry import Registry
+from league.registry.rows import Acknowledgement
+from serve_app.app import Server
+from tests.serve_app.conftest import QUICK, replica
+from tests.serve_app.leagues import promote
+from tests.serve_app.test_action import BOARD, act
+
+
+def until(condition: Callable[[], object], seconds: float = 20) -> None:
+    deadline = monotonic() + seconds
+    while not condition():
+        assert monotonic() < deadline
+
+
+def said(registry: Registry, league: str = "board") -> Acknowledgement | None:
+    found = registry.acknowledgements(league, since=timedelta(minutes=1))
+    return found[0] if found else None
+
+
+def serves(registry: Registry, version: int) -> bool:
+    return (row := said(registry)) is not None and row.version == version
+
+
+def test_a_replica_that_started_serves_and_has_said_so(client: TestClient, registry: Registry) -> None:
+    until(lambda: serves(registry, 1))
+    row = said(registry)
+    assert row is not None
+    assert (row.replica, row.sha256, row.fault) == ("replica-1", registry.version("board", 1).sha256, None)
+    assert said(registry, "headless") is None
+    assert client.get("/v1/health/ready").status_code == 200
+
+
+def test_a_promotion_is_acknowledged_once_it_is_served(client: TestClient, registry: Registry) -> None:
+    for version in (2, 3, 2):
+        promote(registry, "board", version)
+        until(lambda version=version: serves(registry, version))
+        assert act(client, observation=BOARD)["version"] == version
+
+
+def test_a_rollback_is_followed_too(client: TestClient, registry: Registry) -> None:
+    promote(registry, "board", 3)
+    until(lambda: serves(registry, 3))
+    registry.rollback("board", actor="test", reason="test")
+    until(lambda: serves(registry, 1))
+    assert act(client, observation=BOARD)["version"] == 1
+
+
+@pytest.mark.usefixtures("client")
+def test_a_replica_says_again_what_it_serves(registry: Registry) -> None:
+    until(lambda: said(registry))
+
+    def seen_at() -> datetime:
+        row = said(registry)
+        assert row is not None
+        return row.seen_at
+
+    first = seen_at()
+    until(lambda: seen_at() > first)
+
+
+def test_a_replica_that_stops_is_forgotten(registry: Registry) -> None:
+    with replica(registry.storage):
+        until(lambda: said(registry))
+    assert said(registry) is None
+
+
+def test_a_tampered_champion_is_told(client: TestClient, registry: Registry) -> None:
+    (registry.artifacts.path("board", 2) / "shared.onnx").write_bytes(b"tampered")
+    promote(registry, "board", 2)
+    until(lambda: (row := said(registry)) and row.fault)
+    league = client.get("/v1/leagues/board").json()
+    assert league["champion"] == 2
+    assert [(row["version"], "shared.onnx was changed" in row["fault"]) for row in league["replicas"]] == [(1, True)]
+    assert league["faults"]
+    assert act(client, observation=BOARD)["version"] == 1
+    reply = client.post("/v1/policies/board/action?version=2", json={"observation": BOARD})
+    assert (reply.status_code, reply.json()["code"]) == (503, "artifact_corrupt")
+
+
+def test_serving_outlives_the_database(registry: Registry) -> None:
+    server = Server(Registry.open(registry.storage), QUICK, "replica-1")
+    with TestClient(server.application()) as client:
+        act(client, version=2, observation=BOARD)
+        with outage(server.registry):
+            until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")
+            reply = client.get("/v1/leagues")
+            assert (reply.status_code, int(reply.headers["retry-after"])) == (503, 1)
+            assert act(client, observation=BOARD)["version"] == 1
+            assert act(client, version=2, observation=BOARD)["version"] == 2
+            reply = client.post("/v1/policies/board/action?version=3", json={"observation": BOARD})
+            assert (reply.status_code, reply.json()["code"]) == (503, "storage_error")
+            assert client.get("/v1/health/ready").status_code == 200
+            promote(registry, "board", 3)
+        until(lambda: serves(registry, 3))
+        assert act(client, observation=BOARD)["version"] == 3
+
+
+@contextmanager
+def outage(registry: Registry) -> Iterator[None]:
+    """Every transaction of `registry` fails."""
+
+    @contextmanager
+    def transaction() -> Iterator[Session]:
+        raise StorageError("the database cannot be used: it is gone")
+        yield
+
+    database = registry.database
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(database, "read", transaction)
+        patch.setattr(database, "write", transaction)
+        yield
+
+
+def test_serving_outlives_the_artefacts(client: TestClient, registry: Registry) -> None:
+    registry.artifacts.root.rename(registry.artifacts.root.with_name("elsewhere"))
+    promote(registry, "board", 2)
+    until(lambda: (row := said(registry)) and row.fault)
+    assert act(client, observation=BOARD)["version"] == 1
+    registry.artifacts.root.with_name("elsewhere").rename(registry.artifacts.root)
+    until(lambda: serves(registry, 2))

@@ -1,0 +1,45 @@
+"""What cannot be started is told in one sentence, and before Ray is."""
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
+from league.settings import Storage
+from serve_app.launch import running
+
+
+def test_a_taken_port(storage: Storage) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with (
+            pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is taken"),
+            running(storage, port=port),
+        ):
+            pass
+
+
+@pytest.mark.parametrize("text", ["", "applications: []", "http_options: {}", "a: [", "- 1"])
+def test_a_broken_deploy_yaml(storage: Storage, tmp_path: Path, text: str) -> None:
+    deploy = tmp_path / "deploy.yaml"
+    deploy.write_text(text)
+    with pytest.raises(ConfigError, match=r"deploy\.yaml"), running(storage, deploy=deploy):
+        pass
+
+
+def test_no_deploy_yaml(storage: Storage, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml"), running(storage, deploy=tmp_path / "nowhere.yaml"):
+        pass
+
+
+def test_a_home_that_cannot_be_used(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a directory")
+    with pytest.raises(StorageError, match="file"), running(Storage.at(tmp_path / "file" / "home")):
+        pass
+
+
+def test_haproxy_is_missing(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", "/nowhere/haproxy")
+    with pytest.raises(NotReady, match="HAProxy is missing"), running(storage):
+        pass

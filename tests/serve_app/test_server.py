@@ -1,0 +1,228 @@
+"""The real thing: Ray Serve, HAProxy and two replicas, under load, promotions and blows."""
+
+import os
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic, sleep
+
+import httpx
+import numpy as np
+import pytest
+
+from league.errors import UnknownLeague
+from league.policies.onnx import OnnxPolicy
+from league.policies.remote import RemotePolicy
+from league.registry.registry import Registry
+from league.settings import Storage
+from serve_app import haproxy
+from serve_app.launch import running
+from tests.league.policies.graphs import masked_mlp
+from tests.serve_app.leagues import everything, promote, publish
+from tests.serve_app.test_action import BOARD
+
+ACTION = "/v1/policies/board/action"
+BATCH = {"observation": np.zeros((1, 6, 7, 2), np.int8), "action_mask": np.ones((1, 7), np.int8)}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
+    registry = everything(Storage.at(tmp_path_factory.mktemp("served")))
+    yield registry
+    registry.close()
+
+
+@pytest.fixture(scope="module")
+def url(served: Registry) -> Iterator[str]:
+    with running(served.storage, replicas=2) as url:
+        yield url
+    until(lambda: not processes(served.storage, ""), seconds=10)  # a server that stopped leaves no process
+
+
+def processes(storage: Storage, name: str) -> list[int]:
+    """Processes of that name that serve `storage`, which they have in their environment."""
+    home = f"LEAGUE_HOME={storage.home}\0".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            with suppress(OSError):
+                if home in (entry / "environ").read_bytes() and name.encode() in (entry / "cmdline").read_bytes():
+                    found.append(int(entry.name))
+    return found
+
+
+def until(condition: Callable[[], object], seconds: float = 60) -> None:
+    deadline = monotonic() + seconds
+    while not condition():
+        assert monotonic() < deadline
+        sleep(0.01)
+
+
+def serving(registry: Registry, version: int) -> int:
+    """How many replicas say that they serve a version of `board`."""
+    return sum(said.version == version for said in registry.acknowledgements("board"))
+
+
+@dataclass
+class Load:
+    """What callers saw."""
+
+    versions: Counter[int] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
+
+
+@contextmanager
+def load(caller: Callable[[], Callable[[], int]], callers: int) -> Iterator[Load]:
+    """Call without pause from several threads while the context lasts.
+
+    `caller` makes what one of them calls, which returns the version that answered.
+    """
+    seen, stop = Load(), threading.Event()
+
+    def run() -> None:
+        call = caller()
+        while not stop.is_set():
+            try:
+                seen.versions[call()] += 1
+            except Exception as error:
+                seen.failures.append(repr(error))
+
+    threads = [threading.Thread(target=run) for _ in range(callers)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield seen
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+def test_every_replica_answers_and_says_so(url: str, served: Registry) -> None:
+    until(lambda: serving(served, 1) == 2)
+    with httpx.Client(base_url=url) as client:
+        found: set[str] = set()
+        until(
+            lambda: (
+                found.add(client.post(ACTION, json={"observation": BOARD}).headers["x-league-replica"])
+                or len(found) == 2
+            )
+        )
+        assert found == {row["replica"] for row in client.get("/v1/leagues/board").json()["replicas"]}
+        assert client.get("/v1/health/ready").status_code == 200
+
+
+def test_the_client_acts_as_the_graph_does(url: str) -> None:
+    random = np.random.default_rng(0)
+    mask = random.integers(0, 2, (50, 7), dtype=np.int8)
+    mask[:, 0] = 1
+    batch = {"observation": random.integers(0, 2, (50, 6, 7, 2), dtype=np.int8), "action_mask": mask}
+    expected = OnnxPolicy(masked_mlp(seed=1)).act(batch).actions
+    with RemotePolicy(url, "board", version=2) as policy:
+        np.testing.assert_array_equal(policy.act(batch).actions, expected)
+        explored = [
+            policy.act(batch, explore=True, rng=[np.random.default_rng((7, row)) for row in range(50)]).actions
+            for _ in range(2)
+        ]
+        np.testing.assert_array_equal(*explored)
+        assert mask[np.arange(50), explored[0]].all()
+    with RemotePolicy(url, "nobody") as policy, pytest.raises(UnknownLeague, match="known: board"):
+        policy.act(BATCH)
+
+
+def test_promotions_under_load_cost_no_request(url: str, served: Registry) -> None:
+    def caller() -> Callable[[], int]:
+        client = httpx.Client(base_url=url)
+
+        def call() -> int:
+            reply = client.post(ACTION, json={"observation": BOARD})
+            assert reply.status_code == 200, reply.text
+            return int(reply.json()["version"])
+
+        return call
+
+    ask = caller()
+    with load(caller, callers=8) as seen:
+        for version in (2, 3, 1) * 4:
+            promote(served, "board", version)
+            until(lambda version=version: serving(served, version) == 2)
+            assert {ask() for _ in range(4)} == {version}, "nobody answers with the old one any more"
+    assert seen.failures == []
+    assert seen.versions.keys() == {1, 2, 3}
+
+
+@pytest.mark.parametrize("has_length", [True, False], ids=["of a stated length", "in parts"])
+def test_a_hundred_megabytes_are_refused(url: str, served: Registry, has_length: bool) -> None:
+    size, part = 100 * 2**20, b" " * 2**16
+    headers = {"content-type": "application/json"} | ({"content-length": str(size)} if has_length else {})
+    before = memory(served.storage)
+    with httpx.Client(base_url=url) as client:
+        try:
+            reply = client.post(ACTION, content=(part for _ in range(size // len(part))), headers=headers)
+        except httpx.WriteError:
+            pytest.fail("the connection was cut before the answer could be read")
+        assert (reply.status_code, reply.json()["code"]) == (413, "body_too_large")
+        assert client.post(ACTION, json={"observation": BOARD}).status_code == 200
+    assert memory(served.storage) - before < 20 * 2**20
+
+
+def memory(storage: Storage) -> int:
+    """The largest resident size that a replica ever had, in bytes."""
+    peaks = []
+    for pid in processes(storage, "ServeReplica"):
+        status = Path(f"/proc/{pid}/status").read_text()
+        peaks += [int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM")]
+    return max(peaks)
+
+
+def test_the_death_of_a_replica_costs_our_client_no_request(url: str, served: Registry) -> None:
+    victim = processes(served.storage, "ServeReplica")[0]
+
+    def caller() -> Callable[[], int]:
+        policy = RemotePolicy(url, "board")
+        return lambda: int(policy.post({"observation": BOARD})["version"])
+
+    with load(caller, callers=8) as seen:
+        until(lambda: seen.versions.total() > 200)
+        os.kill(victim, signal.SIGKILL)
+        after = seen.versions.total()
+        until(lambda: seen.versions.total() > after + 2000)
+    assert seen.failures == []
+    until(lambda: len(set(processes(served.storage, "ServeReplica")) - {victim}) == 2)
+
+
+def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
+    promote(served, "board", 1)
+    until(lambda: serving(served, 1) >= 2)
+    new = publish(served, "board", {"shared": masked_mlp(seed=8)}, "run/new").number
+    graph = served.artifacts.path("board", new) / "shared.onnx"
+    whole = graph.read_bytes()
+    graph.write_bytes(masked_mlp(seed=9))
+    promote(served, "board", new)
+    with httpx.Client(base_url=url) as client:
+        until(lambda: client.get("/v1/leagues/board").json()["faults"])
+        for _ in range(20):
+            assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 1
+        graph.write_bytes(whole)
+        until(lambda: serving(served, new) >= 2)
+
+
+def test_a_server_that_was_killed_can_be_started_again(storage: Storage) -> None:
+    (port,) = haproxy.free_ports(1, "127.0.0.1")
+    with running(storage, port=port, replicas=1) as url:
+        os.kill(launcher(port), signal.SIGKILL)
+        with running(storage, port=port, replicas=1) as again:
+            assert again == url
+            reply = httpx.post(f"{url}{ACTION}", json={"observation": BOARD})
+            assert reply.json()["version"] == 1
+    assert haproxy.is_free("127.0.0.1", port)
+
+
+def launcher(port: int) -> int:
+    """The process that `running` started to serve on a port."""
+    children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+    return next(int(pid) for pid in children if f'"port": {port}' in Path(f"/proc/{pid}/cmdline").read_text())

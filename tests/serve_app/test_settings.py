@@ -1,0 +1,45 @@
+"""Limits keep their proportions, and deploy.yaml is one that Serve takes."""
+
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from serve_app.launch import DEPLOY_YAML
+from serve_app.settings import ACKNOWLEDGED_WITHIN, ServeSettings
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ({"heartbeat": 6}, "heartbeat must be at most 5"),
+        ({"poll": 10}, "poll_slowest must be at least poll"),
+        ({"max_body": 1}, "max_body"),
+        ({"max_bodies": 1}, "max_bodies"),
+    ],
+)
+def test_settings_out_of_proportion_are_refused(setting: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        ServeSettings.model_validate(setting)
+
+
+def test_two_heartbeats_may_get_lost() -> None:
+    assert 3 * ServeSettings().heartbeat <= ACKNOWLEDGED_WITHIN.total_seconds()
+
+
+def test_deploy_yaml_updates_without_a_lost_request() -> None:
+    from ray.serve.schema import ServeDeploySchema
+
+    schema = ServeDeploySchema.model_validate(yaml.safe_load(DEPLOY_YAML.read_text()))
+    (application,) = schema.applications
+    (deployment,) = application.deployments
+    assert application.import_path == "serve_app.app:build_app"
+    ServeSettings.model_validate(application.args)
+    assert schema.http_options.host == "127.0.0.1"
+    assert deployment.num_replicas >= 2, "one may die"
+    assert deployment.max_surge_percent == 100, "new ones start before old ones stop"
+    assert deployment.graceful_shutdown_timeout_s >= 40, "the drain of an ingress holds 30 s"
+    assert deployment.backpressure_config.status_code == 429
+    both = 2 * deployment.num_replicas * deployment.ray_actor_options.num_cpus
+    assert both <= 2, "old and new replicas fit on two cores"
