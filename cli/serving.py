@@ -91,6 +91,7 @@ def _act_here(
 
     from league.policies.loading import load
     from league.registry.registry import Registry
+    from league.seeds import generator
     from serve_app.observations import ObservationReader, refuse_strings
 
     registry = Registry.open()
@@ -99,7 +100,9 @@ def _act_here(
     space = version.manifest.policies[policy or next(iter(version.manifest.policies))].observation
     refuse_strings(value)
     observations = ObservationReader(space).read([value])
-    actions = loaded.act(observations, explore=explore, rng=[np.random.default_rng(seed)] if explore else None)
+    # The server draws from the same generator, so that both sample the same action.
+    rng = np.random.default_rng() if seed is None else generator(seed, 0)
+    actions = loaded.act(observations, explore=explore, rng=[rng] if explore else None)
     return {
         "action": actions.actions[0].tolist(),
         "model": str(PolicyRef(ref.league, policy)),

@@ -4,6 +4,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from league.errors import ConfigError
+
 
 @dataclass(frozen=True, slots=True)
 class Storage:
@@ -30,10 +32,14 @@ class Storage:
             artifacts=Path(artifacts).expanduser().absolute() if artifacts else default.artifacts,
         )
 
-    @property
-    def is_shared(self) -> bool:
-        """Whether other machines can reach it: a database server, and artefacts on a mount of their own."""
-        return not self.database_url.startswith("sqlite") and not self.artifacts.is_relative_to(self.home)
+    def check_reach(self, machines: set[str]) -> None:
+        """Raise ConfigError if several machines (by address) cannot share this: SQLite, or artefacts in the home."""
+        is_shared = not self.database_url.startswith("sqlite") and not self.artifacts.is_relative_to(self.home)
+        if len(machines) > 1 and not is_shared:
+            raise ConfigError(
+                f"the cluster has {len(machines)} machines: set LEAGUE_DATABASE_URL to a PostgreSQL server and"
+                " LEAGUE_ARTIFACTS to a directory that all of them mount"
+            )
 
     def export(self) -> None:
         """Pin the three variables in this process, so that Ray's workers, started elsewhere, read the same."""

@@ -184,11 +184,7 @@ def _serve_on(address: str, storage: Storage, document: dict[str, Any], on_ready
     except ConnectionError as error:
         raise NotReady(f"Ray at {address} cannot be reached: {_last_line(str(error.__cause__ or error))}") from error
     try:
-        if len([node for node in ray.nodes() if node["Alive"]]) > 1 and not storage.is_shared:
-            raise ConfigError(
-                f"the cluster at {address} has several nodes: set LEAGUE_DATABASE_URL to a PostgreSQL server and "
-                "LEAGUE_ARTIFACTS to a directory that all of them mount"
-            )
+        storage.check_reach({node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]})
         try:
             _deploy(document, on_ready)
         finally:

@@ -20,7 +20,7 @@ def connected(address: str | None, storage: Storage) -> Iterator[None]:
     if ours:
         _connect(address)
     try:
-        _check_storage(storage)
+        storage.check_reach({node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]})
         yield
     finally:
         if ours:
@@ -35,12 +35,3 @@ def _connect(address: str | None) -> None:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError) as error:
         raise ConfigError(f"no Ray cluster at {address!r}: {' '.join(str(error).split())}") from error
-
-
-def _check_storage(storage: Storage) -> None:
-    machines = {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
-    if len(machines) > 1 and not storage.is_shared:
-        raise ConfigError(
-            f"the cluster has {len(machines)} machines: set LEAGUE_DATABASE_URL to a database server and "
-            "LEAGUE_ARTIFACTS to a directory that all of them mount"
-        )

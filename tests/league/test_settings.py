@@ -1,0 +1,47 @@
+from pathlib import Path
+
+import pytest
+
+from league.errors import ConfigError
+from league.settings import Storage
+
+SERVER = "postgresql://db/league"
+
+
+def test_everything_lies_in_the_home_unless_it_is_moved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("LEAGUE_HOME", "LEAGUE_DATABASE_URL", "LEAGUE_ARTIFACTS"):
+        monkeypatch.delenv(name, raising=False)
+    home = tmp_path / "league-home"
+    assert Storage.from_environment() == Storage(home, f"sqlite:///{home}/league.db", home / "artifacts")
+    monkeypatch.setenv("LEAGUE_HOME", "elsewhere")
+    monkeypatch.setenv("LEAGUE_DATABASE_URL", SERVER)
+    monkeypatch.setenv("LEAGUE_ARTIFACTS", "shelf")
+    assert Storage.from_environment() == Storage(tmp_path / "elsewhere", SERVER, tmp_path / "shelf")
+
+
+def test_what_is_exported_is_read_back_from_any_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("LEAGUE_HOME", "LEAGUE_DATABASE_URL", "LEAGUE_ARTIFACTS"):
+        monkeypatch.setenv(name, "")  # restored afterwards
+    storage = Storage.at(tmp_path / "home")
+    storage.export()
+    monkeypatch.chdir("/")
+    assert Storage.from_environment() == storage
+
+
+@pytest.mark.parametrize(
+    ("url", "artifacts", "is_shared"),
+    [
+        ("sqlite:////home/league.db", "/mnt/artifacts", False),
+        (SERVER, "/home/artifacts", False),
+        (SERVER, "/mnt/artifacts", True),
+    ],
+)
+def test_several_machines_need_a_database_server_and_a_mount(url: str, artifacts: str, is_shared: bool) -> None:
+    storage = Storage(Path("/home"), url, Path(artifacts))
+    storage.check_reach({"192.0.2.1"})
+    if is_shared:
+        storage.check_reach({"192.0.2.1", "192.0.2.2"})
+        return
+    with pytest.raises(ConfigError, match=r"2 machines: set LEAGUE_DATABASE_URL .* LEAGUE_ARTIFACTS"):
+        storage.check_reach({"192.0.2.1", "192.0.2.2"})
