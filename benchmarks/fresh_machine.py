@@ -1,7 +1,8 @@
 """How long from a machine with Python and nothing installed to a promoted endpoint that answers?
 
 Clones the committed state, runs `make demo` in the clone without pip's cache, and asks the endpoint for actions until
-it answers. Target: 10 minutes, of which training takes at most 5.
+it answers. Target: 10 minutes, of which training takes at most 5. Then plays the champion that came of it against the
+scripts (`benchmarks.strength`).
 """
 
 import argparse
@@ -40,6 +41,10 @@ def main() -> None:
         arguments = f"--port {options.port}" + (" --minutes 0.5" if options.quick else "")
         print("fresh clone, then: make demo", flush=True)
         marks, answered = _run(clone, arguments, f"http://127.0.0.1:{options.port}")
+        print("\nthe champion of this demo:", flush=True)
+        strength = [".venv/bin/python", "-m", "benchmarks.strength", "--hold", "demo"]
+        subprocess.run(strength, cwd=clone, env=_environment(clone))
+        print()
     previous = 0.0
     for phase, _ in PHASES:
         if phase in marks:
@@ -51,12 +56,11 @@ def main() -> None:
 
 
 def _run(clone: Path, arguments: str, url: str) -> tuple[dict[str, float], float]:
-    environment = os.environ | {"PIP_NO_CACHE_DIR": "1", "LEAGUE_HOME": str(clone / "league-home")}
     start = time.perf_counter()
     demo = subprocess.Popen(
         ["make", "demo", f"DEMO={arguments}"],
         cwd=clone,
-        env=environment,
+        env=_environment(clone),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -72,6 +76,10 @@ def _run(clone: Path, arguments: str, url: str) -> tuple[dict[str, float], float
             os.killpg(demo.pid, signal.SIGINT)
         demo.wait(120)
         reader.join()
+
+
+def _environment(clone: Path) -> dict[str, str]:
+    return os.environ | {"PIP_NO_CACHE_DIR": "1", "LEAGUE_HOME": str(clone / "league-home")}
 
 
 def _read(demo: "subprocess.Popen[str]", start: float, marks: dict[str, float]) -> None:

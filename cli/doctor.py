@@ -74,7 +74,7 @@ def _stack() -> Iterator[Check]:
 
 
 def _processor() -> Iterator[Check]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = os.cpu_count() or 1
     yield Check("CPU", "ok" if cores > 1 else "note", f"{cores} cores", "" if cores > 1 else "2 or more are better")
 
 

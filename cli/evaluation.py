@@ -15,7 +15,7 @@ from league.refs import check_slug
 from league.registry.registry import Registry
 from league.settings import Storage
 
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+CORES = os.cpu_count() or 1
 
 Workers = Annotated[int, typer.Option(min=0, help="Ray tasks that play at once; 0 plays in this process.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]

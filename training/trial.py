@@ -61,7 +61,7 @@ class Trial(tune.Trainable):
         self.start: Start = config["start"]
         self.checkpoints: Path = config["checkpoints"]
         # While the learner works, the runners wait: the cores are its own.
-        torch.set_num_threads(min(len(os.sched_getaffinity(0)), MAX_THREADS))
+        torch.set_num_threads(min(os.cpu_count() or 1, MAX_THREADS))
         self.algorithm = build(self.league, self.interface, self.start.checkpoint, config["runner_cpus"])
         self.steps = self.start.steps
         self.seconds = self.start.seconds
