@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+SMALLEST = np.finfo(np.float32).tiny
+
 
 def log_softmax(logits: NDArray) -> NDArray:
     """(k, n) float32 logits → (k, n) float32 log-probabilities."""
@@ -14,7 +16,8 @@ def sample(log_probabilities: NDArray, rng: np.random.Generator) -> NDArray:
     """One index per row, (k,) int64, by the Gumbel-max trick: argmax(log p + Gumbel noise) is distributed as p
     (Maddison, Tarlow and Minka, 2014, "A* sampling")."""
     noise = rng.standard_exponential(log_probabilities.shape, dtype=np.float32)
-    return (log_probabilities - np.log(noise)).argmax(axis=-1)
+    # One number in some millions is exactly 0, whose infinite Gumbel noise would choose even what is masked.
+    return (log_probabilities - np.log(np.maximum(noise, SMALLEST))).argmax(axis=-1)
 
 
 def entropy(log_probabilities: NDArray) -> NDArray:

@@ -20,6 +20,15 @@ def test_samples_follow_the_distribution() -> None:
     assert chisquare(counts[:3], 20_000 * p[:3]).pvalue > 1e-3
 
 
+def test_what_is_masked_is_not_sampled_even_where_the_noise_is_exactly_0() -> None:
+    class Zeros:
+        def standard_exponential(self, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+            return np.where(np.arange(shape[-1]) == 0, 0, np.ones(shape)).astype(dtype)
+
+    log_p = np.array([[-1e9, -0.7, -0.7]], np.float32)
+    assert categorical.sample(log_p, Zeros()) == [1]  # type: ignore[arg-type]
+
+
 def test_entropy_in_nats() -> None:
     uniform = categorical.log_softmax(np.zeros((1, 4), np.float32))
     certain = categorical.log_softmax(np.array([[0.0, -1e9]], np.float32))
