@@ -38,7 +38,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="policy-league-") as folder:
         clone = Path(folder) / "policy-league"
         subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
-        arguments = f"--port {options.port}" + (" --minutes 0.5" if options.quick else "")
+        arguments = f"--exit --port {options.port}" + (" --minutes 0.5" if options.quick else "")
         print("fresh clone, then: make demo", flush=True)
         marks, answered = _run(clone, arguments, f"http://127.0.0.1:{options.port}")
         print("\nthe champion of this demo:", flush=True)
@@ -70,11 +70,13 @@ def _run(clone: Path, arguments: str, url: str) -> tuple[dict[str, float], float
     reader = threading.Thread(target=_read, args=(demo, start, marks))
     reader.start()
     try:
-        return marks, _answer(url, start, demo)
+        answered = _answer(url, start, demo)
+        demo.wait(120)
+        return marks, answered
     finally:
         if demo.poll() is None:
             os.killpg(demo.pid, signal.SIGINT)
-        demo.wait(120)
+            demo.wait()
         reader.join()
 
 

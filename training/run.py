@@ -2,6 +2,10 @@
 
 import logging
 import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -141,11 +145,24 @@ def _tune(run: Run, interface: Interface, start: Start, publisher: Publisher, pr
             verbose=0,
         ),
     )
-    result = tuner.fit()[0]
+    with _signals_as_before():
+        result = tuner.fit()[0]
     if result.error is not None:
         raise _cause(result.error)
     if publisher.error is None and not (result.metrics or {}).get("done"):
         raise KeyboardInterrupt
+
+
+@contextmanager
+def _signals_as_before() -> Iterator[None]:
+    """Tune leaves its handler of Ctrl-C behind, which would swallow the next one."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGUSR1)}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
 def _quiet() -> None:

@@ -46,8 +46,9 @@ def curves(run: Path) -> EventAccumulator:
 
 @pytest.mark.usefixtures("ray_session")
 def test_a_run_publishes_its_checkpoints_and_further_training_names_its_parent(registry: Registry) -> None:
-    shown = io.StringIO()
+    shown, interrupt = io.StringIO(), signal.getsignal(signal.SIGINT)
     versions = train(LEAGUE, registry=registry, console=Console(file=shown))
+    assert signal.getsignal(signal.SIGINT) is interrupt, "Ctrl-C after training is not Tune's"
     assert lineage(versions) == [(1, 512, None), (2, 1024, 1)]
     assert "Published tictactoe@1 after 512 steps" in shown.getvalue()
     assert "shared: return" in shown.getvalue()
