@@ -34,4 +34,8 @@ def _connect(address: str | None) -> None:
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError) as error:
-        raise ConfigError(f"no Ray cluster at {address!r}: {' '.join(str(error).split())}") from error
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"no Ray cluster at {address!r}: {reason} (if it asks for a token, as `ray start` does by default: set"
+            " RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN on other machines)"
+        ) from error
