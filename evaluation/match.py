@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from league.results.records import Game, Match, Schedule, rotation
+from league.results.records import Schedule, rotation
 from league.seeds import generator
 
 
@@ -59,17 +59,3 @@ def scores(returns: Sequence[float]) -> tuple[float, ...]:
 
 def _point(mine: float, other: float) -> float:
     return 1.0 if mine > other else 0.5 if mine == other else 0.0
-
-
-def assemble(schedule: Schedule, position: int, games: Sequence[Game]) -> Match:
-    """The record of a played block."""
-    return Match(
-        id=schedule.match_id(position),
-        league=schedule.league,
-        schedule=schedule.id,
-        position=position,
-        contestants=schedule.contestants_at(position),
-        seed=schedule.seed_at(position),
-        environment_digest=schedule.environment_digest,
-        games=tuple(games),
-    )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.match import GamePlan, assemble, plan, scores
+from evaluation.match import GamePlan, plan, scores
 from league.environments.stepping import Batch, BatchedEnvironment, Episode, Turn
 from league.errors import EnvironmentMismatch, GameHung, IllegalAction
 from league.interface import Interface
@@ -50,7 +50,7 @@ def play(
     positions = list(positions)
     table = _Table(schedule, positions, environment, interface, roster, max_moves)
     table.run()
-    return [assemble(schedule, position, table.finished[position]) for position in positions]
+    return [schedule.match(position, table.finished[position]) for position in positions]
 
 
 @dataclass(slots=True)

@@ -74,7 +74,7 @@ class Ledger:
             if after is not None:
                 query = query.where(tables.Match.position > after)
             found = session.execute(query)
-            return [_match(schedules[of], position, moves) for of, position, moves in found]
+            return [schedules[of].match(position, load_games(moves)) for of, position, moves in found]
 
     def positions(self, schedule: str) -> set[int]:
         """Which positions of a schedule were played."""
@@ -136,16 +136,3 @@ def _row(match: Match) -> dict[str, Any]:
         "moves": dump_games(match.games),
         "played_at": datetime.now(UTC),
     }
-
-
-def _match(schedule: Schedule, position: int, moves: str) -> Match:
-    return Match(
-        id=schedule.match_id(position),
-        league=schedule.league,
-        schedule=schedule.id,
-        position=position,
-        contestants=schedule.contestants_at(position),
-        seed=schedule.seed_at(position),
-        environment_digest=schedule.environment_digest,
-        games=load_games(moves),
-    )

@@ -4,6 +4,7 @@ A *schedule* lists pairings in order. A *match* is one block of its games, in wh
 sides, from one seed and one opening. Position i of a schedule is match `"<schedule>/<i>"`, always.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,19 @@ class Schedule:
     def match_id(self, position: int) -> str:
         """The id of match `position`."""
         return f"{self.id}/{position}"
+
+    def match(self, position: int, games: "Sequence[Game]") -> "Match":
+        """The record of match `position`, of which these are the games."""
+        return Match(
+            id=self.match_id(position),
+            league=self.league,
+            schedule=self.id,
+            position=position,
+            contestants=self.contestants_at(position),
+            seed=self.seed_at(position),
+            environment_digest=self.environment_digest,
+            games=tuple(games),
+        )
 
 
 @dataclass(frozen=True, slots=True)
