@@ -88,8 +88,7 @@ def rate(sample: Callable[..., list[Any]], seconds: float) -> float:
 
 def ours(copies: int) -> EnvRunner:
     """LockstepEnvRunner as training builds it."""
-    settings = LEAGUE.training.model_copy(update={"copies": copies})
-    config = algorithm_config(settings, LEAGUE.environment, interface(LEAGUE))
+    config = algorithm_config(LEAGUE.with_training(copies=copies), interface(LEAGUE))
     return config.env_runner_cls(config=config, worker_index=0)
 
 

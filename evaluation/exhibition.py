@@ -7,7 +7,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from league.config import LeagueConfig
-from league.environments.aec import AECStepping
+from league.environments.lockstep import stepping
 from league.environments.building import build
 from league.environments.stepping import Episode
 from league.errors import UnknownPolicy
@@ -31,7 +31,7 @@ class Moment:
 
 def exhibit(config: LeagueConfig, players: Mapping[str, Policy], seed: int) -> Iterator[Moment]:
     """Play one game, agent → policy, and yield it moment by moment. Checkpoints play greedily."""
-    environment = AECStepping(config.environment, copies=1)
+    environment = stepping(config.environment, copies=1)
     episodes = iter([Episode(seed, environment.agents)])
     draws = {agent: generator(seed, agent) for agent in environment.agents}
     try:

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from evaluation.play import Roster, play
 from league.config import LeagueConfig
-from league.environments.aec import AECStepping
+from league.environments.lockstep import stepping
 from league.environments.building import interface
 from league.errors import EnvironmentMismatch
 from league.policies.loading import contestant
@@ -28,7 +28,7 @@ class Player:
         self.config = config
         self.interface = interface(config)
         self._registry = registry
-        self._environment = AECStepping(config.environment, config.play.copies)
+        self._environment = stepping(config.environment, config.play.copies)
         self._contestants: OrderedDict[str, dict[str, tuple[str, Policy]]] = OrderedDict()
 
     def play(self, schedule: Schedule, positions: Iterable[int]) -> list[Match]:

@@ -54,8 +54,9 @@ class EnvironmentConfig(_Part):
 
     entry_point: str
     """A PettingZoo module (`pettingzoo.classic.connect_four_v3`) or a function (`package.module:function`)."""
-    api: Literal["aec"] = "aec"
-    """The environment's API. This release steps PettingZoo AEC environments."""
+    api: Literal["aec", "parallel", "rllib"] | None = None
+    """PettingZoo's AEC or Parallel API, or RLlib's MultiAgentEnv. By default that of what a function returns; a module
+    with `parallel_env` is taken as Parallel, one with `env` alone as AEC."""
     kwargs: JSON = {}
     """Arguments of the environment's constructor."""
     wrappers: tuple[WrapperConfig, ...] = ()
@@ -82,6 +83,48 @@ class ConvolutionConfig(_Part):
 
     filters: int = Field(ge=1)
     kernel: int = Field(default=3, ge=1)
+    stride: int = Field(default=1, ge=1)
+
+
+class RecurrenceConfig(_Part):
+    """A long short-term memory between the hidden layers and the heads (Hochreiter and Schmidhuber, 1997)."""
+
+    width: int = Field(default=128, ge=1)
+    sequence: int = Field(default=20, ge=1)
+    """Steps through which gradients flow back."""
+
+
+class OpponentConfig(_Part):
+    """Somebody who plays the other sides in a share of the episodes, and does not learn."""
+
+    ref: str
+    """A script (`script:random`), a version (`connect_four@3`), or an alias, which is pinned when training begins;
+    `@3` and `@champion` are short for those of the league itself."""
+    share: float = Field(gt=0, le=1)
+    """Of the episodes. What is left of 1 is self-play."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        return {"ref": value, "share": 1.0} if isinstance(value, str) else value
+
+
+class PhaseConfig(_Part):
+    """A part of training in which some policies learn and the others stay as they are."""
+
+    policies: tuple[str, ...] = Field(min_length=1)
+    iterations: int = Field(ge=1)
+    """Updates until the next phase; after the last one the first follows again."""
+
+
+class PolicySettings(_Part):
+    """Settings of one policy that differ from the league's. See PPOConfig."""
+
+    lr: float | None = Field(default=None, gt=0)
+    gamma: float | None = Field(default=None, ge=0, le=1)
+    lambda_: float | None = Field(default=None, ge=0, le=1, alias="lambda")
+    clip: float | None = Field(default=None, gt=0)
+    entropy: float | None = Field(default=None, ge=0)
 
 
 class PPOConfig(_Part):
@@ -116,6 +159,26 @@ class PPOConfig(_Part):
     """Layers over those parts of the observation that are planes, (height, width, channels). Others are flattened."""
     hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
     """Widths of the hidden layers."""
+    recurrence: RecurrenceConfig | None = None
+    """A memory over the steps of an episode, null for none."""
+    normalize_observations: bool = False
+    """Shift and scale each number of the observations by its running mean and deviation, inside the exported graph."""
+    shared_encoder: bool = False
+    """All policies share the convolutions and hidden layers, each has heads of its own."""
+    per_policy: dict[str, PolicySettings] = {}
+    """policy id → settings that differ for it."""
+    policies_to_train: tuple[str, ...] | tuple[PhaseConfig, ...] | None = None
+    """The policies that learn, or phases that follow one another in a circle; null for all. The others play on with the
+    weights that they have: those of the version that training began from (`--from`), else their initial ones."""
+    opponents: tuple[OpponentConfig, ...] = ()
+    """Who plays against the learners in some episodes: one side, drawn anew in each, learns, and the opponent has all
+    others."""
+    gpus: float = Field(default=0, ge=0)
+    """GPUs of the learner; a fraction shares one."""
+    runner_gpus: float = Field(default=0, ge=0)
+    """GPUs of each runner, for its inference."""
+    crashes: int = Field(default=3, ge=0)
+    """Times in a row that a copy of the environment may raise and is built anew; its episode is not learned from."""
     opening_plies: int = Field(default=0, ge=0)
     """Up to this many random legal moves begin each episode. They are not learned from, but lead to positions that
     self-play alone would not visit."""
@@ -124,6 +187,14 @@ class PPOConfig(_Part):
     def _minibatch_fits(self) -> Self:
         if self.minibatch_size > self.train_batch_size:
             raise ValueError(f"minibatch_size must be at most train_batch_size ({self.train_batch_size})")
+        return self
+
+    @model_validator(mode="after")
+    def _shares_fit(self) -> Self:
+        if (total := sum(opponent.share for opponent in self.opponents)) > 1 + 1e-9:
+            raise ValueError(f"the shares of opponents must not exceed 1, got {total:g}")
+        if self.shared_encoder and self.recurrence is not None:
+            raise ValueError("shared_encoder has no memory: leave recurrence out")
         return self
 
 
@@ -168,18 +239,46 @@ class GateConfig(_Part):
         return self
 
 
+class AshaConfig(_Part):
+    """Asynchronous successive halving: bad trials end early (Li et al., 2020, arXiv 1810.05934)."""
+
+    grace_steps: int = Field(default=50_000, ge=1)
+    """Actions that each trial gets."""
+    reduction_factor: int = Field(default=3, ge=2)
+    """One of this many trials goes on at each rung."""
+
+
+class SweepConfig(_Part):
+    """A search over training settings: `league sweep`."""
+
+    parameters: dict[str, JSON | list[Any]] = Field(min_length=1)
+    """Training setting → a list of values (all are tried), or one of `{choice: [..]}`, `{uniform: [low, high]}`,
+    `{loguniform: [low, high]}`, `{randint: [low, high]}`. A setting of one policy is `per_policy.<id>.<setting>`."""
+    samples: int = Field(default=1, ge=1)
+    """Draws of the random parameters, for each combination of the lists."""
+    concurrent: int = Field(default=1, ge=1)
+    """Trials at once, as far as there are CPUs."""
+    metric: str = "return"
+    """What is compared: a curve of the run, `return` or `<policy>/return`."""
+    mode: Literal["max", "min"] = "max"
+    asha: AshaConfig | None = None
+    """End bad trials early; null lets each use its whole budget."""
+
+
 class LeagueConfig(_Part):
     """One league. Only `league` and `environment` are required."""
 
     league: str
     environment: EnvironmentConfig
-    policies: dict[str, tuple[str, ...]] = {"shared": ("*",)}
-    """policy id → agents, by name or pattern (`player_*`); the first policy whose pattern fits takes the agent."""
+    policies: dict[str, tuple[str, ...]] | str = {"shared": ("*",)}
+    """policy id → agents, by name or pattern (`player_*`); the first policy whose pattern fits takes the agent. Or a
+    function `package.module:function`: agent → policy id."""
     sides: dict[str, tuple[str, ...]] | None = None
     """side → agents, by name or pattern; by default each agent is a side of its own."""
     play: PlayConfig = PlayConfig()
     training: TrainingConfig = PPOConfig()
     gate: GateConfig = GateConfig()
+    sweep: SweepConfig | None = None
 
     @field_validator("league")
     @classmethod
@@ -188,10 +287,12 @@ class LeagueConfig(_Part):
 
     @field_validator("policies", "sides")
     @classmethod
-    def _keys_are_slugs(cls, value: dict[str, Any] | None) -> dict[str, Any] | None:
-        if value is not None and not value:
+    def _keys_are_slugs(cls, value: dict[str, Any] | str | None) -> dict[str, Any] | str | None:
+        if isinstance(value, str) and not all(part.strip() for part in value.partition(":")):
+            raise ValueError("expected policy ids with their agents, or a function package.module:function")
+        if isinstance(value, dict) and not value:
             raise ValueError("must name at least one")
-        for key in value or ():
+        for key in value if isinstance(value, dict) else ():
             _slug("name", key)
         return value
 

@@ -11,7 +11,7 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.torch import TorchRLModule
 
 from league.config import EnvironmentConfig
-from league.environments.aec import AECStepping
+from league.environments.lockstep import stepping
 from league.environments.stepping import Episode
 from league.errors import ParityError
 from league.interface import Interface
@@ -44,12 +44,12 @@ def gather(
     policies do meet and what they do not is among them. Raises ParityError if a policy does not get to act enough.
     """
     rng = generator(seed, "parity")
-    stepping = AECStepping(environment, COPIES)
+    batched = stepping(environment, COPIES)
     resets = itertools.count()
-    groups = [[(interface.policies[agent], explores) for agent in stepping.agents] for explores in (False, True)]
+    groups = [[(interface.policies[agent], explores) for agent in batched.agents] for explores in (False, True)]
     met: dict[str, Batches] = defaultdict(list)
     try:
-        turn = stepping.start(lambda copy: Episode(derive(seed, "parity", next(resets)), groups[copy % 2]))
+        turn = batched.start(lambda copy: Episode(derive(seed, "parity", next(resets)), groups[copy % 2]))
         for _ in range(MOVES_PER_OBSERVATION * OBSERVATIONS // COPIES):
             actions = {}
             for (policy, explores), batch in turn.batches.items():
@@ -60,9 +60,9 @@ def gather(
                 actions[policy, explores] = chosen + _first_action(interface, policy)
             if all(_count(met[policy]) >= OBSERVATIONS for policy in interface.policy_ids):
                 return dict(met)
-            turn = stepping.step(actions)
+            turn = batched.step(actions)
     finally:
-        stepping.close()
+        batched.close()
     rarest = min(interface.policy_ids, key=lambda policy: _count(met[policy]))
     raise ParityError(
         f"policy {rarest} met {_count(met[rarest])} observations in "

@@ -126,7 +126,7 @@ def build(
     league: LeagueConfig, interface: Interface, checkpoint: Path | None = None, runner_cpus: float = 1.0
 ) -> Algorithm:
     """RLlib's Algorithm of a league, with the state of `checkpoint` if there is one."""
-    config = algorithm_config(league.training, league.environment, interface)
+    config = algorithm_config(league, interface)
     algorithm = config.env_runners(num_cpus_per_env_runner=runner_cpus).build_algo()
     if checkpoint is not None:
         algorithm.restore_from_path(str(checkpoint))

@@ -67,6 +67,9 @@ class Turn:
     batches: dict[Group, Batch] = field(default_factory=dict)
     endings: list[Ending] = field(default_factory=list)
     finished: list[int] = field(default_factory=list)
+    crashed: list[int] = field(default_factory=list)
+    """Copies whose environment raised and was built anew. Their episode has no endings and is not in `finished`: what
+    was reported of it is to be dropped. Their next one has begun in this call."""
 
 
 class BatchedEnvironment(Protocol):
@@ -93,6 +96,10 @@ class BatchedEnvironment(Protocol):
 
     def assign(self, copy: int, groups: Sequence[Group]) -> None:
         """Change the groups of a copy's agents from the next Turn on."""
+        ...
+
+    def render(self, copy: int) -> NDArray:
+        """A picture of the copy as it stands, (height, width, 3) uint8. Raises EnvironmentMismatch if it has none."""
         ...
 
     def close(self) -> None:

@@ -9,12 +9,13 @@ from ray.rllib.algorithms import ppo
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
-from league.config import EnvironmentConfig, PPOConfig
+from league.config import LeagueConfig, PPOConfig
 from league.interface import Interface
+from league.settings import Storage
 from training.learners.ppo import PPOLearner
 from training.learners.train_batch import train_batch_connector
 from training.modules.actor_critic import ActorCritic
-from training.sampling.env_runner import ENVIRONMENT, INTERFACE, OPENING_PLIES, LockstepEnvRunner, module_spaces
+from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, LockstepEnvRunner, module_spaces
 
 
 class PPO(ppo.PPO):
@@ -24,14 +25,18 @@ class PPO(ppo.PPO):
         pass
 
 
-def algorithm_config(settings: PPOConfig, environment: EnvironmentConfig, interface: Interface) -> ppo.PPOConfig:
-    """RLlib's configuration of a league's training: our module, runner and learner."""
+def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> ppo.PPOConfig:
+    """RLlib's configuration of a league's training: our module, runner and learner.
+
+    storage: where the versions are that play as opponents; not needed without.
+    """
+    settings = league.training
     config = ppo.PPOConfig(algo_class=PPO)
     config.environment(
         env_config={
-            ENVIRONMENT: environment.model_dump(mode="json"),
+            LEAGUE: league.model_dump(mode="json", by_alias=True),
             INTERFACE: interface.model_dump(mode="json"),
-            OPENING_PLIES: settings.opening_plies,
+            STORAGE: storage,
         }
     )
     config.multi_agent(

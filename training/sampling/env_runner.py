@@ -16,18 +16,19 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME, WEIGHTS_SEQ_NO
 
-from league.config import EnvironmentConfig
-from league.environments.aec import AECStepping
+from league.config import LeagueConfig
+from league.environments.lockstep import stepping
+from league.environments.stepping import BatchedEnvironment
 from league.interface import Interface
 from league.seeds import generator
 from league.spaces import inputs, to_gymnasium
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import SelfPlay
 
-ENVIRONMENT = "environment"
+LEAGUE = "league"
 INTERFACE = "interface"
-OPENING_PLIES = "opening_plies"
-"""Keys of `env_config`: an EnvironmentConfig and an Interface, dumped; the longest random opening of an episode."""
+STORAGE = "storage"
+"""Keys of `env_config`: a LeagueConfig and an Interface, dumped; the Storage that opponents are loaded from, or None."""
 
 Spaces = dict[str, tuple[gymnasium.Space, gymnasium.Space]]
 
@@ -40,13 +41,14 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
     the next. Acting runs on one thread, without gradients, on the module's own exploration or inference pass.
     """
 
-    env: AECStepping | None
+    env: BatchedEnvironment | None
     module: MultiRLModule
     worker_index: int
     _play: SelfPlay | None = None
 
     def __init__(self, config: AlgorithmConfig, **kwargs: Any) -> None:
         super().__init__(config=config, **kwargs)
+        self.league = LeagueConfig.model_validate(self.config.env_config[LEAGUE])
         self.interface = Interface.model_validate(self.config.env_config[INTERFACE])
         self.worker_index = self.worker_index or 0
         self._weights_seq_no = 0
@@ -59,8 +61,7 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
     def make_env(self) -> None:
         """Build the copies, closing those of before."""
         self.stop()
-        environment = EnvironmentConfig.model_validate(self.config.env_config[ENVIRONMENT])
-        self.env = AECStepping(environment, self.config.num_envs_per_env_runner)
+        self.env = stepping(self.league.environment, self.config.num_envs_per_env_runner)
         self._play = None
 
     def make_module(self) -> None:
@@ -171,7 +172,7 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
             steps=steps,
         )
         rng = generator(seed, "play", self.worker_index, steps)
-        self._play = SelfPlay(self.env, self.interface, seeds, self.config.env_config[OPENING_PLIES], rng)
+        self._play = SelfPlay(self.env, self.interface, seeds, self.league.training.opening_plies, rng)
         return self._play
 
     def _explore(self, policy: str, observations: dict[str, NDArray]) -> NDArray:

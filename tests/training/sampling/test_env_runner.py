@@ -35,7 +35,7 @@ CASES = ([], [0], [1], [0, 1])
 
 
 def runner_of(league: LeagueConfig) -> LockstepEnvRunner:
-    config = algorithm_config(league.training, league.environment, interface(league))
+    config = algorithm_config(league, interface(league))
     return LockstepEnvRunner(config, worker_index=0)
 
 
@@ -142,7 +142,7 @@ def test_every_reset_has_its_own_seed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Counting, "reset", recording)
     league = counting(LIVES, [], runners=2)
-    config = algorithm_config(league.training, league.environment, interface(league))
+    config = algorithm_config(league, interface(league))
     for index in (1, 2):
         runner = LockstepEnvRunner(config, worker_index=index)
         for _ in range(3):
@@ -207,7 +207,7 @@ def test_rllibs_own_learner_takes_the_episodes_and_agrees_on_value_targets(trunc
     league = counting(LIVES, truncated)
     runner = runner_of(league)
     episodes = [episode for _ in range(3) for episode in runner.sample(num_timesteps=50)]
-    config = algorithm_config(league.training, league.environment, interface(league))
+    config = algorithm_config(league, interface(league))
     config.learners(
         learner_class=PPOTorchLearner,
         learner_connector=lambda *_: [],
