@@ -1,7 +1,11 @@
-"""Self-play sampling of connect four in one runner: ours against RLlib's MultiAgentEnvRunner with its PettingZooEnv.
+"""How fast training samples, against RLlib's own runner and against the bare environment. One torch thread per runner.
 
-Both play the same network (a masked 2×256 multilayer perceptron) with exploration on one torch thread, both return
-episodes that a Learner takes. Numbers of copies take turns within a round; a rate is the median over the rounds.
+Parts: simple_spread and connect_four (one runner against RLlib's MultiAgentEnvRunner with its wrappers of PettingZoo,
+over numbers of copies), stock (one runner, its network included, against the stock environment with random legal
+actions and without a network), iteration (PPO in one process: 4,000 environment steps, 4 epochs), runners (two against
+one). Everybody plays and learns by the same network, a 2×256 multilayer perceptron of ours, in RLlib too. What is
+compared takes turns within a round; a rate is the median over the rounds. Steps are those of the environment: all
+agents act once.
 """
 
 import argparse
@@ -10,104 +14,303 @@ import statistics
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
+import gymnasium
+import numpy as np
+import ray
 import torch
-from pettingzoo.classic import connect_four_v3
+from mpe2 import simple_spread_v3
+from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
+from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
-from ray.rllib.env.wrappers.pettingzoo_env import PettingZooEnv
+from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv, PettingZooEnv
+from ray.rllib.execution.rollout_ops import synchronous_parallel_sample
 from ray.tune.registry import register_env
 
 from league.config import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.ppo import algorithm_config
 from training.modules.actor_critic import ActorCritic
+from training.sampling.env_runner import LockstepEnvRunner
+from training.trial import build
 
-COPIES = (1, 8, 16, 32, 64)
+COPIES = (1, 4, 8, 16, 32, 64)
 HIDDEN = (256, 256)
-LEAGUE = LeagueConfig.from_mapping(
-    {
-        "league": "connect_four",
-        "environment": {"entry_point": "pettingzoo.classic.connect_four_v3"},
-        "training": {"runners": 0, "hidden": HIDDEN},
-    }
+SPREAD, FOUR, LEDUC = (
+    "mpe2.simple_spread_v3",
+    "pettingzoo.classic.connect_four_v3",
+    "pettingzoo.classic.leduc_holdem_v4",
 )
-TARGET_BEST, TARGET_DEFAULT = 2.0, 12.0
+AGENTS = {SPREAD: 3, FOUR: 1, LEDUC: 1}
+"""That act in one step."""
+STEPS, EPOCHS, MINIBATCH = 4000, 4, 128
+"""Of an iteration; the size of a minibatch is RLlib's default."""
+
+Rates = dict[Hashable, float]
 
 
-def main() -> int:
-    """Print the rates and the two ratios; 1 if a ratio is below its target."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="shorter measurements, for a look")
-    quick = parser.parse_args().quick
-    logging.disable(logging.WARNING)
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
-    runners = {("ours", copies): ours(copies) for copies in COPIES}
-    runners |= {("RLlib", copies): rllib(copies) for copies in COPIES}
-    rates = measure(runners, rounds=2 if quick else 5, seconds=0.5 if quick else 2.0)
-    print(f"{'copies':>8} {'ours':>12} {'RLlib':>12}   moves/s in one runner")
-    for copies in COPIES:
-        print(f"{copies:>8} {rates['ours', copies]:>12,.0f} {rates['RLlib', copies]:>12,.0f}")
-    best = {name: max(rates[name, copies] for copies in COPIES) for name in ("ours", "RLlib")}
-    return verdict("RLlib's best", best["ours"] / best["RLlib"], TARGET_BEST) | verdict(
-        "RLlib's default (1 copy)", best["ours"] / rates["RLlib", 1], TARGET_DEFAULT
-    )
+class Flat(ActorCritic):
+    """The same network on observations that are no dictionary, as RLlib's wrappers give them."""
+
+    def setup(self) -> None:
+        self.observation_space = gymnasium.spaces.Dict({"observation": self.observation_space})
+        super().setup()
+
+    def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
+        return super()._forward({Columns.OBS: {"observation": batch[Columns.OBS]}})
+
+    def _forward_train(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
+        return super()._forward_train({Columns.OBS: {"observation": batch[Columns.OBS]}})
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
+        return super().compute_values({Columns.OBS: {"observation": batch[Columns.OBS]}}, embeddings)
 
 
-def verdict(peer: str, ratio: float, target: float) -> int:
-    """Print a ratio against its target; 1 if it is below."""
-    print(f"ours against {peer}: {ratio:.1f}x (target {target:g}x){'' if ratio >= target else '  BELOW TARGET'}")
-    return int(ratio < target)
+def simple_spread(quick: bool) -> bool:
+    """At least 1.4 times RLlib's best, and 6 times its default."""
+    return against_rllib(SPREAD, quick, best=1.4, default=6.0)
 
 
-def measure(runners: dict[Any, EnvRunner], rounds: int, seconds: float) -> dict[Any, float]:
-    """Moves per second of each runner."""
-    samples: dict[Any, list[float]] = {key: [] for key in runners}
+def connect_four(quick: bool) -> bool:
+    """At least 2 times RLlib's best, and 12 times its default."""
+    return against_rllib(FOUR, quick, best=2.0, default=12.0)
+
+
+def against_rllib(entry_point: str, quick: bool, best: float, default: float) -> bool:
+    """One runner against RLlib's, over numbers of copies."""
+    runners: dict[Hashable, EnvRunner] = {("ours", copies): ours(entry_point, copies) for copies in COPIES}
+    runners |= {("RLlib", copies): rllib(entry_point, copies) for copies in COPIES}
     for runner in runners.values():
         runner.sample(num_timesteps=500)
+    seconds = 0.5 if quick else 2.0
+    rates = in_rounds(
+        {key: lambda runner=runner: sampled(runner, entry_point, seconds) for key, runner in runners.items()},
+        rounds=2 if quick else 5,
+    )
+    print(f"{'copies':>8} {'ours':>12} {'RLlib':>12}   environment steps/s in one runner")
+    for copies in COPIES:
+        print(f"{copies:>8} {rates['ours', copies]:>12,.0f} {rates['RLlib', copies]:>12,.0f}")
+    top = {name: max(rates[name, copies] for copies in COPIES) for name in ("ours", "RLlib")}
+    met = [
+        told("ours against RLlib's best", top["ours"] / top["RLlib"], best),
+        told("ours against RLlib's default (1 copy)", top["ours"] / rates["RLlib", 1], default),
+    ]
+    for runner in runners.values():
+        runner.stop()
+    return all(met)
+
+
+def stock(quick: bool) -> bool:
+    """At least 75 % of what the stock environment does alone."""
+    modules = {SPREAD: simple_spread_v3, FOUR: connect_four_v3, LEDUC: leduc_holdem_v4}
+    met = [against_stock(name, module, quick) for name, module in modules.items()]
+    return all(met)
+
+
+def against_stock(entry_point: str, module: Any, quick: bool) -> bool:
+    """One runner of 32 copies."""
+    runner, seconds = ours(entry_point, copies=32), 0.5 if quick else 2.0
+    runner.sample(num_timesteps=3000)
+    alone = in_parallel if entry_point == SPREAD else in_turns
+    rates = in_rounds(
+        {"ours": lambda: sampled(runner, entry_point, seconds), "stock": lambda: alone(module, seconds)},
+        rounds=3 if quick else 7,
+    )
+    runner.stop()
+    name = entry_point.rpartition(".")[2]
+    print(f"{name}: ours {rates['ours']:,.0f}, the stock environment alone {rates['stock']:,.0f} steps/s")
+    return told(f"{name}, ours against the stock environment", rates["ours"] / rates["stock"], 0.75)
+
+
+def iteration(quick: bool) -> bool:
+    """At least 4.5 times RLlib's default; its best is printed beside."""
+    algorithms = {"ours": our_ppo(), "RLlib's default": rllib_ppo(1), "RLlib's best (32 copies)": rllib_ppo(32)}
+    for algorithm in algorithms.values():
+        algorithm.train()
+    rates = in_rounds(
+        {key: lambda algorithm=algorithm: iterated(algorithm) for key, algorithm in algorithms.items()},
+        rounds=1 if quick else 3,
+    )
+    for name, rate in rates.items():
+        print(f"{name}: {STEPS / rate:.2f} s per iteration of {STEPS:,} environment steps, {EPOCHS} epochs")
+    for algorithm in algorithms.values():
+        algorithm.stop()
+    default, best = (rates["ours"] / rates[name] for name in list(rates)[1:])
+    print(f"an iteration, ours against RLlib's best: {best:.1f}x")
+    return told("an iteration, ours against RLlib's default", default, 4.5)
+
+
+def runners(quick: bool) -> bool:
+    """Two runners sample at least 1.7 times as fast as one."""
+    batch = 9600
+    algorithms = {
+        count: build(league(SPREAD, runners=count, train_batch_size=batch), interface(league(SPREAD)))
+        for count in (1, 2)
+    }
+    rates = in_rounds(
+        {count: lambda algorithm=algorithm: gathered(algorithm, batch) for count, algorithm in algorithms.items()},
+        rounds=5 if quick else 15,
+    )
+    for algorithm in algorithms.values():
+        algorithm.stop()
+    print(f"one runner {rates[1]:,.0f}, two {rates[2]:,.0f} actions/s, in batches of {batch:,}")
+    return told("two runners against one", rates[2] / rates[1], 1.7)
+
+
+def league(entry_point: str, **training: Any) -> LeagueConfig:
+    """A league of that environment with one policy."""
+    settings = {"runners": 0, "copies": 32, "hidden": HIDDEN} | training
+    document = {"league": "benchmark", "environment": {"entry_point": entry_point}, "training": settings}
+    return LeagueConfig.from_mapping(document)
+
+
+def ours(entry_point: str, copies: int) -> EnvRunner:
+    """LockstepEnvRunner as training builds it."""
+    config = league(entry_point, copies=copies)
+    return LockstepEnvRunner(algorithm_config(config, interface(config)), worker_index=0)
+
+
+def rllib(entry_point: str, copies: int) -> EnvRunner:
+    """RLlib's runner as its documentation sets it up for a PettingZoo environment."""
+    return MultiAgentEnvRunner(config=rllib_config(entry_point, copies), worker_index=0)
+
+
+def rllib_config(entry_point: str, copies: int) -> PPOConfig:
+    """RLlib's PPO with its default settings, but for the number of copies and the network."""
+    if entry_point == SPREAD:
+        wrapped: Any = ParallelPettingZooEnv(simple_spread_v3.parallel_env())
+        register_env(entry_point, lambda _: ParallelPettingZooEnv(simple_spread_v3.parallel_env()))
+    else:
+        wrapped = PettingZooEnv(connect_four_v3.env())
+        register_env(entry_point, lambda _: PettingZooEnv(connect_four_v3.env()))
+    agent = wrapped.possible_agents[0]
+    observation = wrapped.observation_space[agent]
+    module = RLModuleSpec(
+        module_class=ActorCritic if isinstance(observation, gymnasium.spaces.Dict) else Flat,
+        observation_space=observation,
+        action_space=wrapped.action_space[agent],
+        model_config={"hidden": list(HIDDEN)},
+    )
+    config = PPOConfig().environment(entry_point, disable_env_checking=True)
+    config.env_runners(num_env_runners=0, num_envs_per_env_runner=copies)
+    config.multi_agent(policies={"shared"}, policy_mapping_fn=lambda *_, **__: "shared")
+    return config.rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs={"shared": module}))
+
+
+def our_ppo() -> Algorithm:
+    """Of each environment step, all agents' actions are learned from; RLlib counts the steps, we the actions."""
+    config = league(SPREAD, train_batch_size=STEPS * AGENTS[SPREAD], epochs=EPOCHS, minibatch_size=MINIBATCH, runners=0)
+    return build(config, interface(config))
+
+
+def rllib_ppo(copies: int) -> Algorithm:
+    """RLlib's."""
+    config = rllib_config(SPREAD, copies)
+    config.training(train_batch_size_per_learner=STEPS, num_epochs=EPOCHS, minibatch_size=MINIBATCH)
+    return config.build_algo()
+
+
+def in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int) -> Any:
+    """What each measures, in turns; the median of the rounds."""
+    found: dict[Any, list[float]] = {key: [] for key in measures}
     for _ in range(rounds):
-        for key, runner in runners.items():
-            samples[key].append(rate(runner.sample, seconds))
-    return {key: statistics.median(found) for key, found in samples.items()}
+        for key, measure in measures.items():
+            found[key].append(measure())
+    return {key: statistics.median(values) for key, values in found.items()}
 
 
-def rate(sample: Callable[..., list[Any]], seconds: float) -> float:
-    """Moves per second over about `seconds`. Both count a move as one time step."""
+def sampled(runner: EnvRunner, entry_point: str, seconds: float) -> float:
+    """Environment steps per second, episodes that a learner takes included. RLlib counts them, ours counts actions."""
+    share = AGENTS[entry_point] if isinstance(runner, LockstepEnvRunner) else 1
     steps, began = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
-        sample(num_timesteps=1024)
+        runner.sample(num_timesteps=1024 * share)
         steps += 1024
     return steps / elapsed
 
 
-def ours(copies: int) -> EnvRunner:
-    """LockstepEnvRunner as training builds it."""
-    config = algorithm_config(LEAGUE.with_training(copies=copies), interface(LEAGUE))
-    return config.env_runner_cls(config=config, worker_index=0)
+def in_parallel(module: Any, seconds: float) -> float:
+    """Steps per second of the stock `parallel_env()`, with random actions."""
+    env, rng, steps = module.parallel_env(), np.random.default_rng(0), 0
+    spaces = {agent: int(env.action_space(agent).n) for agent in env.possible_agents}
+    began = time.perf_counter()
+    while (elapsed := time.perf_counter() - began) < seconds:
+        env.reset()
+        while env.agents:
+            env.step({agent: int(rng.integers(spaces[agent])) for agent in env.agents})
+            steps += 1
+    return steps / elapsed
 
 
-def rllib(copies: int) -> EnvRunner:
-    """RLlib's runner as its documentation sets it up for a PettingZoo AEC environment."""
-    register_env("connect_four", lambda _: PettingZooEnv(connect_four_v3.env()))
-    env = connect_four_v3.env()
-    agent = env.possible_agents[0]
-    module = RLModuleSpec(
-        module_class=ActorCritic,
-        observation_space=env.observation_space(agent),
-        action_space=env.action_space(agent),
-        model_config={"hidden": list(HIDDEN)},
+def in_turns(module: Any, seconds: float) -> float:
+    """Moves per second of the stock `env()`, with random legal actions, in PettingZoo's own loop."""
+    env, rng, moves = module.env(), np.random.default_rng(0), 0
+    began = time.perf_counter()
+    while (elapsed := time.perf_counter() - began) < seconds:
+        env.reset()
+        for _ in env.agent_iter():
+            observation, _, terminated, truncated, _ = env.last()
+            if terminated or truncated:
+                env.step(None)
+            else:
+                env.step(int(rng.choice(np.flatnonzero(observation["action_mask"]))))
+                moves += 1
+    return moves / elapsed
+
+
+def iterated(algorithm: Algorithm) -> float:
+    """Environment steps per second of one iteration, learning included."""
+    began = time.perf_counter()
+    algorithm.train()
+    return STEPS / (time.perf_counter() - began)
+
+
+def gathered(algorithm: Algorithm, batch: int) -> float:
+    """Actions per second until a batch has come from all runners."""
+    began = time.perf_counter()
+    episodes = synchronous_parallel_sample(
+        worker_set=algorithm.env_runner_group, max_env_steps=batch, _uses_new_env_runners=True
     )
-    config = PPOConfig().environment("connect_four", disable_env_checking=True)
-    config.env_runners(num_env_runners=0, num_envs_per_env_runner=copies)
-    config.multi_agent(policies={"shared"}, policy_mapping_fn=lambda *_, **__: "shared")
-    config.rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs={"shared": module}))
-    return MultiAgentEnvRunner(config=config, worker_index=0)
+    return sum(len(episode) for episode in episodes) / (time.perf_counter() - began)
+
+
+def told(what: str, ratio: float, target: float) -> bool:
+    """Print a ratio against its target; whether it is met."""
+    print(f"{what}: {ratio:.2f}x (target {target:g}x){'' if ratio >= target else '  BELOW TARGET'}", flush=True)
+    return ratio >= target
+
+
+PARTS: dict[str, Callable[[bool], bool]] = {
+    part.__name__: part for part in (simple_spread, connect_four, stock, iteration, runners)
+}
+
+
+def main() -> int:
+    """Run the parts that were asked for; 1 if a target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
+    parser.add_argument("--quick", action="store_true", help="shorter measurements, for a look")
+    options = parser.parse_args()
+    if unknown := [part for part in options.parts if part not in PARTS]:
+        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
+    logging.disable(logging.WARNING)
+    warnings.simplefilter("ignore")
+    ray.init(address="local", num_cpus=4, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    torch.set_num_threads(1)
+    missed = []
+    for name in options.parts or PARTS:
+        print(f"\n-- {name} --", flush=True)
+        if not PARTS[name](options.quick):
+            missed.append(name)
+    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
+    return bool(missed)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import signal
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -67,6 +68,7 @@ def _hold_league(config: LeagueConfig) -> None:
 
 def _play(config: LeagueConfig, url: str) -> None:
     from evaluation.exhibition import exhibit
+    from league.environments.lockstep import stepping
     from league.policies.remote import RemotePolicy
     from league.policies.scripted import script
     from league.refs import ScriptRef
@@ -77,15 +79,14 @@ def _play(config: LeagueConfig, url: str) -> None:
     first, second = interface.agents
     spaces = interface.agents[second]
     opponent = script(ScriptRef.parse(OPPONENT).name, spaces.observation, spaces.action)
-    moves, outcome, board = [], 0.0, None
-    with RemotePolicy(url, config.league) as champion:
-        for moment in exhibit(config, {first: champion, second: opponent}, seed=config.training.seed):
-            if moment.action is not None:
-                moves.append(f"{'●' if moment.agent == first else '○'}{moment.action}")
-            elif moment.agent == first:
-                outcome, board = moment.reward, drawing(moment.observation["observation"])
+    environment = stepping(config.environment, copies=1)
+    with closing(environment), RemotePolicy(url, config.league) as champion:
+        moments = list(exhibit(environment, {first: champion, second: opponent}, seed=config.training.seed))
+    moves = [move for moment in moments for move in moment.moves]
+    board = next(drawing(e.observation["observation"]) for e in moments[-1].endings if e.agent == 0)
+    outcome = moments[-1].returns[first]
     say(f"\n{board}\n")
-    say("Moves: " + " ".join(moves))
+    say("Moves: " + " ".join(f"{'●' if move.agent == first else '○'}{move.action}" for move in moves))
     say("The champion won." if outcome > 0 else "The champion lost." if outcome < 0 else "A draw.")
 
 

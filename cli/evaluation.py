@@ -8,7 +8,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from cli.output import console, elo, emit, errors, say, table
-from evaluation.report import Listener, NightReport, Standing, VerdictReport
+from evaluation.report import Difference, EvaluationReport, Listener, NightReport, Standing, VerdictReport
 from evaluation.report import Progress as Games
 from league.config import LeagueConfig
 from league.refs import check_slug
@@ -28,7 +28,7 @@ def evaluate(
         typer.Argument(metavar="[REF]…", help="Who plays, e.g. connect_four@3. Default: all versions."),
     ] = None,
     blocks: Annotated[
-        int, typer.Option(min=1, help="Matches of each pair; a match is one game per seat, with one opening.")
+        int, typer.Option(min=1, help="Matches of each pair; a match is two games from one seed, places changed.")
     ] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Another one plays fresh games.")] = 0,
     workers: Workers = CORES,
@@ -56,9 +56,10 @@ def evaluate(
         return
     say(f"{league}: {report.games} games, {report.distinct_games} of them different\n")
     _show_standings(report.standings)
-    say("\nScore of the row against the column (1 wins always, 0.5 is even):")
-    names = [_short(ref) for ref in report.payoff.contestants]
-    table(("", *names), [(name, *row) for name, row in zip(names, report.payoff.score, strict=True)])
+    for side, standings in report.by_side.items():
+        say(f"\nAs {side}:")
+        _show_standings(standings)
+    _show_payoff(report)
 
 
 def nightly(
@@ -118,6 +119,24 @@ def _show_standings(standings: tuple[Standing, ...]) -> None:
     )
 
 
+def _show_payoff(report: EvaluationReport) -> None:
+    payoff = report.payoff
+    names = [_short(ref) for ref in payoff.contestants]
+    compared = "" if report.scoring == "game" else ", compared on the same side of the same seed"
+    say(f"\nScore of the row against the column{compared} (1 wins always, 0.5 is even):")
+    table(("", *names), [(name, *row) for name, row in zip(names, payoff.score, strict=True)])
+    if report.scoring == "side":
+        say("\nMean return of the row minus that of the column in the same blocks [95 %]:")
+        cells = [[None if gap is None else _difference(gap) for gap in row] for row in payoff.difference]
+        table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
+
+
+def _difference(gap: Difference) -> str:
+    """`+1.5 [0.9, 2.1]`"""
+    span = "" if gap.low is None or gap.high is None else f" [{gap.low:.4g}, {gap.high:.4g}]"
+    return f"{gap.mean:+.4g}{span}"
+
+
 def _verdict(report: VerdictReport) -> str:
     """`connect_four@2 against connect_four@1: promote after 40 games, score 0.71 (LLR 2.97 ≥ 2.94)`"""
     score = "–" if report.score is None else f"{report.score:.3f}"
@@ -125,6 +144,8 @@ def _verdict(report: VerdictReport) -> str:
     place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
     note = f": {report.note}" if report.note else ""
     games = f"after {report.games} games ({report.distinct_games} different), score {score}, {place}"
+    if report.difference:
+        games += f", returns differ by {_difference(report.difference)}"
     return f"{report.candidate} against {report.opponent}: {report.outcome} {games}{note}"
 
 

@@ -7,10 +7,12 @@ import typer
 
 from cli.demo import demo
 from cli.doctor import doctor
+from cli.environments import check_env
 from cli.evaluation import evaluate, nightly
 from cli.output import errors
+from cli.replay import replay
 from cli.serving import act, serve
-from cli.training import train
+from cli.training import sweep, train
 from cli.versions import history, promote, rollback, versions
 from league.errors import InvalidInput, LeagueError, NotFound
 
@@ -25,7 +27,22 @@ app = typer.Typer(
     "A first look: `league demo`. The usual way: `train`, `nightly`, `serve`, `act`. What lives where is set by "
     "LEAGUE_HOME (default ./league-home), LEAGUE_DATABASE_URL and LEAGUE_ARTIFACTS.",
 )
-for command in (demo, doctor, train, versions, evaluate, nightly, promote, rollback, history, serve, act):
+for command in (
+    demo,
+    doctor,
+    check_env,
+    train,
+    sweep,
+    versions,
+    evaluate,
+    nightly,
+    promote,
+    rollback,
+    history,
+    replay,
+    serve,
+    act,
+):
     app.command()(command)
 
 CALLERS_MISTAKE = 2

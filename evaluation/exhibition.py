@@ -1,4 +1,4 @@
-"""One game for people to watch: any policies, near or behind HTTP, one move at a time. Nothing is recorded."""
+"""One game for people to watch: any policies, near or behind HTTP, one step at a time. Nothing is recorded."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -6,70 +6,124 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from evaluation.running import State
 from league.config import LeagueConfig
 from league.environments.lockstep import stepping
-from league.environments.building import build
-from league.environments.stepping import Episode
+from league.environments.stepping import Batch, BatchedEnvironment, Ending, Episode, Turn
 from league.errors import UnknownPolicy
 from league.interface import Interface
+from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.seeds import generator
+from league.spaces import Space, paths
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """What an agent saw, and what it did; action None and a reward once it is out of the game.
+class Move:
+    """What an agent saw, and what it did.
 
     observation: ONNX input name → array, as that agent sees it.
+    action: as JSON. dist_inputs: (d,) of the distribution that it is the mode of; None unless a graph was played.
     """
 
     agent: str
     observation: dict[str, NDArray]
     action: Any
-    reward: float
+    dist_inputs: NDArray | None = None
 
 
-def exhibit(config: LeagueConfig, players: Mapping[str, Policy], seed: int) -> Iterator[Moment]:
-    """Play one game, agent → policy, and yield it moment by moment. Checkpoints play greedily."""
-    environment = stepping(config.environment, copies=1)
-    episodes = iter([Episode(seed, environment.agents)])
-    draws = {agent: generator(seed, agent) for agent in environment.agents}
-    try:
-        turn = environment.start(lambda _: next(episodes, None))
-        while turn.batches:
-            actions = {}
-            for agent, batch in turn.batches.items():
-                name = str(agent)
-                actions[agent] = players[name].act(batch.observations, rng=[draws[name]]).actions
-                seen = {key: array[0] for key, array in batch.observations.items()}
-                yield Moment(name, seen, actions[agent][0].tolist(), batch.rewards[0])
-            turn = environment.step(actions)
-            for ending in turn.endings:
-                yield Moment(environment.agents[ending.agent], ending.observation, None, ending.reward)
-    finally:
-        environment.close()
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One step of a game, and what has come of it; the first moment is the beginning, without moves.
+
+    moves: of all that acted in it, in the environment's order of agents.
+    endings: of all that it led out of the game. returns: agent → return so far. is_over: whether nobody is left to act.
+    """
+
+    step: int
+    moves: tuple[Move, ...]
+    endings: tuple[Ending, ...]
+    returns: dict[str, float]
+    is_over: bool
+
+
+def exhibit(environment: BatchedEnvironment, players: Mapping[str, Policy], seed: int) -> Iterator[Moment]:
+    """Play one game on copy 0, agent → policy, and yield it step by step. Checkpoints play greedily.
+
+    The environment is left as the game left it, so that each moment can be rendered. Closing it is the caller's.
+    """
+    agents = environment.agents
+    episodes = iter([Episode(seed, agents)])
+    cast = {agent: _Actor(agent, players[agent], seed) for agent in agents}
+    returns = dict.fromkeys(agents, 0.0)
+    turn, step = environment.start(lambda _: next(episodes, None)), 0
+    yield Moment(step, (), tuple(turn.endings), dict(returns), not turn.batches)
+    while turn.batches:
+        batches = sorted(turn.batches.items(), key=_place)
+        answers = {agent: cast[agent].act(batch) for agent, batch in batches}
+        turn = environment.step({agent: actions for agent, (actions, _) in answers.items()})
+        step += 1
+        for agent, batch in turn.batches.items():
+            returns[agent] += batch.rewards[0]
+        for ending in turn.endings:
+            returns[agents[ending.agent]] += ending.reward
+        moves = tuple(move for _, move in answers.values())
+        yield Moment(step, moves, tuple(turn.endings), dict(returns), not turn.batches)
 
 
 def first_observation(config: LeagueConfig, interface: Interface, policy: str | None, seed: int = 0) -> Any:
     """What `policy` (None: whoever begins) sees first in a fresh episode, as nested lists: the body of a request.
 
-    Raises UnknownPolicy if no agent of that policy ever has the first turn.
+    Raises UnknownPolicy if no agent of that policy acts in the first step.
     """
-    env = build(config.environment)
+    environment = stepping(config.environment, copies=1)
     try:
-        env.reset(seed=seed)
-        agent = env.agent_selection
-        if policy is not None and interface.policies[agent] != policy:
-            raise UnknownPolicy(
-                f"{policy!r} does not begin an episode of {config.league} ({interface.policies[agent]!r} does):"
-                " give an observation"
-            )
-        return _lists(env.observe(agent))
+        episodes = iter([Episode(seed, environment.agents)])
+        turn: Turn = environment.start(lambda _: next(episodes, None))
     finally:
-        env.close()
+        environment.close()
+    for agent, batch in sorted(turn.batches.items(), key=_place):
+        if policy in (None, interface.policies[agent]):
+            return _value(interface.agents[agent].observation, batch)
+    beginning = ", ".join(sorted({repr(interface.policies[agent]) for agent in turn.batches}))
+    raise UnknownPolicy(
+        f"{policy!r} does not begin an episode of {config.league} ({beginning} does): give an observation"
+    )
 
 
-def _lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _lists(part) for key, part in value.items()}
-    return value.tolist() if hasattr(value, "tolist") else value
+class _Actor:
+    """One agent's policy with what it remembers and draws from."""
+
+    def __init__(self, agent: str, policy: Policy, seed: int) -> None:
+        self._agent, self._policy = agent, policy
+        self._draws = generator(seed, agent)
+        self._state: State | None = None
+
+    def act(self, batch: Batch) -> tuple[NDArray, Move]:
+        """The actions (1, …) of a batch of this agent alone, and the move that they are."""
+        if isinstance(self._policy, OnnxPolicy):
+            answer = self._policy.distribution(batch.observations, state=self._state)
+        else:
+            answer = self._policy.act(batch.observations, state=self._state, rng=[self._draws])
+        self._state, inputs = answer.state, answer.dist_inputs
+        seen = {name: array[0] for name, array in batch.observations.items()}
+        move = Move(self._agent, seen, answer.actions[0].tolist(), None if inputs is None else inputs[0])
+        return answer.actions, move
+
+
+def _place(item: tuple[str, Batch]) -> int:
+    return item[1].agents[0]
+
+
+def _value(space: Space, batch: Batch) -> Any:
+    """The first row of a batch as a value of `space`: nested lists, under nested keys."""
+    value: Any = {}
+    for name, path in paths(space).items():
+        part = batch.observations[name][0].tolist()
+        if not path:
+            return part
+        inner = value
+        for key in path[:-1]:
+            inner = inner.setdefault(key, {})
+        inner[path[-1]] = part
+    return value

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evaluation.sequential import EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config import GateConfig
-from league.results.records import Action, Match
+from league.results.records import GAMES_PER_BLOCK, Action, Game, Match
 
 Outcome = Literal["promote", "reject", "inconclusive"]
 
@@ -49,15 +49,17 @@ class Decision:
         return sum(i * n for i, n in enumerate(self.counts)) / (top * self.blocks) if self.blocks else None
 
 
-def decide(settings: GateConfig, block_scores: Sequence[float], games_per_block: int = 2) -> Decision:
+def decide(settings: GateConfig, block_scores: Sequence[float], comparisons: int = 2) -> Decision:
     """Decide on the challenger's mean score in each block, in schedule order.
 
     `promote` at the first block whose LLR reaches the upper bound, `reject` at the lower one, `inconclusive` at
-    `max_blocks` without either. Blocks behind the stopping block do not count. Raises ValueError for scores that blocks
-    of `games_per_block` games cannot have.
+    `max_blocks` without either. Blocks behind the stopping block do not count.
+
+    comparisons: how often a block compares the two: in both games, or once where each plays a game alone.
+    Raises ValueError for scores that such blocks cannot have.
     """
     lower, upper = bounds(settings.alpha, settings.beta)
-    counts = _cumulated(block_scores[: settings.max_blocks], games_per_block)
+    counts = _cumulated(block_scores[: settings.max_blocks], comparisons)
     curve = gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
     crossed = _crossed(curve, (lower, upper))
     blocks = int(crossed[0]) + 1 if crossed.size else len(counts)
@@ -71,20 +73,17 @@ def decide(settings: GateConfig, block_scores: Sequence[float], games_per_block:
         llr=float(curve[blocks - 1]) if blocks else 0.0,
         bounds=(lower, upper),
         blocks=blocks,
-        games=blocks * games_per_block,
+        games=blocks * GAMES_PER_BLOCK,
         distinct_games=None,
-        counts=tuple(int(n) for n in counts[blocks - 1]) if blocks else (0,) * (2 * games_per_block + 1),
+        counts=tuple(int(n) for n in counts[blocks - 1]) if blocks else (0,) * (2 * comparisons + 1),
         curve=tuple(float(llr) for llr in curve[:blocks]),
         estimate=elo_estimate(counts[blocks - 1], "logistic") if blocks else None,
     )
 
 
 def judge(settings: GateConfig, matches: Sequence[Match], challenger: str) -> Decision:
-    """Decide on matches in schedule order, two contestants each, and count the distinct games among those
-    that count.
-    """
-    scores = [match.score(match.contestants.index(challenger)) for match in matches]
-    decision = decide(settings, scores, len(matches[0].games) if matches else 2)
+    """Decide on matches in schedule order, and count the distinct games among those that count."""
+    decision = decide(settings, *_block_scores(matches, challenger))
     return replace(decision, distinct_games=distinct_games(matches[: decision.blocks]))
 
 
@@ -105,8 +104,7 @@ class Watch:
         """Whether the test is decided or exhausted by `matches`, all of the schedule so far in its order."""
         new = matches[self._seen : self._settings.max_blocks]
         if new:
-            scores = [match.score(match.contestants.index(self._challenger)) for match in new]
-            counts = _cumulated(scores, len(new[0].games))
+            counts = _cumulated(*_block_scores(new, self._challenger))
             counts = counts if self._counts is None else counts + self._counts
             curve = gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
             self._counts, self.llr = counts[-1], float(curve[-1])
@@ -116,31 +114,44 @@ class Watch:
         return self._seen >= self._settings.max_blocks
 
 
-def distinct_games(matches: Iterable[Match]) -> int:
-    """How many different games were played, by who met and by all moves from the opening on.
+def distinct_games(matches: Iterable[Match], contestant: str | None = None) -> int:
+    """How many different games were played, by who met, all moves from the opening on, and the returns.
 
     Greedy policies in a deterministic game repeat themselves; n copies of one game are not n pieces of evidence.
+    contestant: only games in which it took part.
     """
     return len(
         {
-            (frozenset(match.contestants), _frozen(game.opening), _frozen(game.actions))
+            (frozenset(match.contestants), _frozen(game.opening), _frozen(game.actions), frozenset(game.returns))
             for match in matches
             for game in match.games
+            if contestant is None or _took_part(match, game, contestant)
         }
     )
 
 
+def _took_part(match: Match, game: Game, contestant: str) -> bool:
+    return contestant in (match.contestants[number] for number in game.sides)
+
+
 def _frozen(actions: Sequence[Action]) -> tuple[Hashable, ...]:
-    return tuple(tuple(action) if isinstance(action, list) else action for action in actions)
+    return tuple(_frozen(action) if isinstance(action, list) else action for action in actions)
 
 
-def _cumulated(block_scores: Sequence[float], games: int) -> NDArray[np.int64]:
-    """(blocks, 2 games + 1): how many of the blocks so far ended in each cell, after each block."""
-    halves = np.asarray(block_scores, dtype=np.float64) * 2 * games
+def _block_scores(matches: Sequence[Match], challenger: str) -> tuple[list[float], int]:
+    """The challenger's score in each block, and how many comparisons make one."""
+    scores = [match.score(match.contestants.index(challenger)) for match in matches]
+    return scores, matches[0].result().games if matches else GAMES_PER_BLOCK
+
+
+def _cumulated(block_scores: Sequence[float], comparisons: int) -> NDArray[np.int64]:
+    """(blocks, 2 comparisons + 1): how many of the blocks so far ended in each cell, after each block."""
+    halves = np.asarray(block_scores, dtype=np.float64) * 2 * comparisons
     cells = np.rint(halves)
-    if not (np.abs(halves - cells) < 1e-6).all() or ((cells < 0) | (cells > 2 * games)).any():
-        raise ValueError(f"scores of blocks of {games} game(s) are multiples of {1 / (2 * games):g} in [0, 1]")
-    return np.eye(2 * games + 1, dtype=np.int64)[cells.astype(np.intp)].cumsum(axis=0)
+    if not (np.abs(halves - cells) < 1e-6).all() or ((cells < 0) | (cells > 2 * comparisons)).any():
+        step = 1 / (2 * comparisons)
+        raise ValueError(f"scores of blocks of {comparisons} comparison(s) are multiples of {step:g} in [0, 1]")
+    return np.eye(2 * comparisons + 1, dtype=np.int64)[cells.astype(np.intp)].cumsum(axis=0)
 
 
 def _crossed(curve: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.intp]:

@@ -1,14 +1,16 @@
-"""The payoff table: who scores how much against whom, and on which side."""
+"""The payoff table: who scores how much against whom, on which side, and by how much returns differ."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.paired import paired_difference
 from evaluation.report import Payoff
-from league.results.records import Match
+from league.results.records import Game, Match
 
 Row = tuple[float | None, ...]
 
@@ -16,17 +18,35 @@ Row = tuple[float | None, ...]
 def tabulate(contestants: Sequence[str], sides: Sequence[str], matches: Iterable[Match]) -> Payoff:
     """Mean scores and games of each ordered pair of `contestants`, over all games and by the side that the row played.
 
-    Matches are of two contestants each. `score[i][j] + score[j][i] = 1` for pairs that met.
+    A game counts for a side where the row played that side and no other.
+    `score[i][j] + score[j][i] = 1` for pairs that met, and `difference[i][j].mean = -difference[j][i].mean`.
     """
     total, by_side = _Table(contestants), {side: _Table(contestants) for side in sides}
+    met: defaultdict[tuple[str, str], list[Match]] = defaultdict(list)
     for match in matches:
-        for game in match.games:
-            for side, row in zip(sides, game.sides, strict=True):
-                pair = (match.contestants[row], match.contestants[1 - row])
-                total.add(pair, game.scores[row])
-                by_side[side].add(pair, game.scores[row])
-    tables = {side: table.means() for side, table in by_side.items()}
-    return Payoff(tuple(contestants), total.means(), total.counts(), tables)
+        for row in (0, 1):
+            pair = (match.contestants[row], match.contestants[1 - row])
+            met[pair].append(match)
+            for game in match.games:
+                score = game.scores[row]
+                if score is None:
+                    continue
+                total.add(pair, score)
+                if (side := only_side(game, row)) is not None:
+                    by_side[sides[side]].add(pair, score)
+    return Payoff(
+        tuple(contestants),
+        total.means(),
+        total.counts(),
+        {side: table.means() for side, table in by_side.items()},
+        tuple(tuple(paired_difference(met[row, column], row) for column in contestants) for row in contestants),
+    )
+
+
+def only_side(game: Game, contestant: int) -> int | None:
+    """The side that a contestant played in a game, None if it played several or none."""
+    own = [side for side, player in enumerate(game.sides) if player == contestant]
+    return own[0] if len(own) == 1 else None
 
 
 class _Table:

@@ -8,8 +8,8 @@ from functools import lru_cache
 
 from evaluation.play import Roster, play
 from league.config import LeagueConfig
-from league.environments.lockstep import stepping
 from league.environments.building import interface
+from league.environments.lockstep import stepping
 from league.errors import EnvironmentMismatch
 from league.policies.loading import contestant
 from league.policies.policy import Policy

@@ -1,4 +1,4 @@
-"""A recorded game, played again move by move from its seed, and checked against the record."""
+"""A recorded game, played again step by step from its seed, and checked against the record."""
 
 from __future__ import annotations
 
@@ -7,45 +7,65 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from evaluation.exhibition import Moment, exhibit
-from evaluation.match import scores
-from evaluation.play import contestant_returns, sides_of
+from evaluation.play import sides_of
+from evaluation.running import contestant_returns
 from league.config import LeagueConfig
+from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, IllegalAction
 from league.interface import Interface
 from league.policies.policy import Actions, Arrays
 from league.results.records import Action, Match
+from league.spaces import DictSpace, Space
 
 
-def replay(config: LeagueConfig, interface: Interface, match: Match, index: int) -> Iterator[Moment]:
-    """Play game `index` of a match again and yield it moment by moment.
+def replay(
+    environment: BatchedEnvironment, config: LeagueConfig, interface: Interface, match: Match, index: int
+) -> Iterator[Moment]:
+    """Play game `index` of a match again, on copy 0, and yield it step by step.
 
     Raises EnvironmentMismatch if the environment is not the one of the record, or does not go the way of the record.
     """
     if match.environment_digest != config.environment.digest():
         raise EnvironmentMismatch(f"match {match.id} was played in another environment than {config.league}'s")
     game = match.games[index]
-    agents = list(interface.agents)
-    script = _Recorded(match.id, [*game.opening, *game.actions])
-    returns = dict.fromkeys(agents, 0.0)
+    record = _Record(match.id, [*game.opening, *game.actions])
+    players = {agent: _Recorded(record, spaces.action) for agent, spaces in interface.agents.items()}
+    moment = None
     try:
-        for moment in exhibit(config, dict.fromkeys(agents, script), game.seed):
-            returns[moment.agent] += moment.reward
+        for moment in exhibit(environment, players, game.seed):
             yield moment
     except IllegalAction as error:
         raise EnvironmentMismatch(f"match {match.id} cannot be replayed: {error}") from error
-    replayed = contestant_returns(list(returns.values()), sides_of(agents, interface), game.sides)
-    if script.left or replayed != game.returns or scores(replayed) != game.scores:
+    assert moment is not None, "a game has a beginning"
+    agents = environment.agents
+    returns = [moment.returns[agent] for agent in agents]
+    replayed = contestant_returns(returns, sides_of(agents, interface), game.sides)
+    if record.left or replayed != game.returns:
         raise EnvironmentMismatch(
             f"match {match.id} cannot be replayed: game {index} returned {replayed}, {game.returns} in the record"
         )
 
 
-class _Recorded:
-    """Answers with the recorded actions in their order, whoever is asked."""
+class _Record:
+    """The recorded actions in their order."""
 
     def __init__(self, match: str, actions: Sequence[Action]) -> None:
         self._match, self._actions = match, iter(actions)
         self.left = len(actions)
+
+    def take(self) -> Action:
+        if not self.left:
+            raise EnvironmentMismatch(f"match {self._match} cannot be replayed: the game goes on after its last move")
+        self.left -= 1
+        return next(self._actions)
+
+
+class _Recorded:
+    """Answers for one agent with the next recorded action; agents are asked in the order of the record."""
+
+    def __init__(self, record: _Record, space: Space) -> None:
+        assert not isinstance(space, DictSpace), "no policy acts in a dictionary"
+        self._record, self._dtype = record, space.dtype
 
     def act(
         self,
@@ -55,7 +75,4 @@ class _Recorded:
         explore: bool = False,  # noqa: ARG002
         rng: Sequence[np.random.Generator] | None = None,  # noqa: ARG002
     ) -> Actions:
-        if not self.left:
-            raise EnvironmentMismatch(f"match {self._match} cannot be replayed: the game goes on after its last move")
-        self.left -= 1
-        return Actions(np.array([next(self._actions)]))
+        return Actions(np.array([self._record.take()], dtype=self._dtype))

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from league.results.records import Scoring
+
 
 class _Document:
     """A dataclass that is a JSON document."""
@@ -44,21 +46,37 @@ class Standing(_Document):
 
 
 @dataclass(frozen=True, slots=True)
+class Difference(_Document):
+    """A mean difference of returns, in the environment's own unit, with the bounds of its 95 % interval; these take two
+    blocks at least.
+    """
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Payoff(_Document):
     """score[i][j] is contestant i's mean score against j over games[i][j] games; None if they did not meet.
 
-    by_side[side][i][j] is the same for the games in which i played that side.
+    by_side[side][i][j] is the same for the games in which i played that side alone.
+    difference[i][j] is i's mean return minus j's in the games of the same blocks.
     """
 
     contestants: tuple[str, ...]
     score: tuple[tuple[float | None, ...], ...]
     games: tuple[tuple[int, ...], ...]
     by_side: dict[str, tuple[tuple[float | None, ...], ...]]
+    difference: tuple[tuple[Difference | None, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationReport(_Document):
-    """A round robin: who stands where, best first, and who beats whom."""
+    """A round robin: who stands where, best first, and who beats whom.
+
+    by_side: who stands where on each side; empty where sides are alike, or there is one.
+    """
 
     league: str
     schedule: str
@@ -67,6 +85,8 @@ class EvaluationReport(_Document):
     distinct_games: int
     standings: tuple[Standing, ...]
     payoff: Payoff
+    scoring: Scoring
+    by_side: dict[str, tuple[Standing, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +98,7 @@ class VerdictReport(_Document):
     blocks, games: those that counted. distinct_games: how many different games are among them.
     score: the challenger's mean score. elo, interval: its strength over the opponent in logistic Elo, with its 95 %
     interval; None where a side of it is infinite.
+    difference: its mean return minus the opponent's, where contestants are compared on the same side; else None.
     promoted: whether this verdict made the challenger champion; `note` says why not where `promote` was refused.
     """
 
@@ -94,6 +115,7 @@ class VerdictReport(_Document):
     elo: float | None
     interval: tuple[float | None, float | None] | None
     promoted: bool
+    difference: Difference | None = None
     note: str | None = None
 
 

@@ -1,6 +1,7 @@
 """Schedules: who meets whom, how often, in which order. Pure: the same arguments give the same schedule and id.
 
-The order goes round by round, every pairing once in each, so that any prefix of a schedule is balanced.
+Two contestants meet at a time, in leagues of any number of sides (see match.py). The order goes round by round, every
+pairing once in each, so that any prefix of a schedule is balanced.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 from league.config import LeagueConfig
 from league.errors import EnvironmentMismatch
 from league.interface import Interface, digest
-from league.results.records import Schedule
+from league.results.records import Schedule, Scoring
 from league.seeds import derive
 
 Pairing = tuple[int, ...]
@@ -52,6 +53,18 @@ def verdict(config: LeagueConfig, interface: Interface, challenger: str, champio
     return replace(schedule, id=f"{schedule.id}-{digest(gate)[:8]}")
 
 
+def scoring(interface: Interface) -> Scoring:
+    """`game` where there are several sides and all are alike, by the spaces of their agents; else `side`.
+
+    Chess has two alike sides, an adversary and those whom it works against are unlike, a team is one side.
+    """
+    kinds = {
+        tuple(sorted(digest(interface.agents[agent].model_dump(mode="json")) for agent in agents))
+        for agents in interface.sides.values()
+    }
+    return "game" if len(interface.sides) > 1 and len(kinds) == 1 else "side"
+
+
 def _schedule(
     config: LeagueConfig,
     interface: Interface,
@@ -61,16 +74,12 @@ def _schedule(
     length: int,
     seed: int,
 ) -> Schedule:
-    sides = tuple(interface.sides)
-    if len(sides) != 2:
-        raise EnvironmentMismatch(
-            f"league {config.league} has {len(sides)} side(s) ({', '.join(sides)}): matches are played between two"
-        )
     if not pairings:
         raise EnvironmentMismatch(f"a schedule of league {config.league} needs two contestants that can meet")
     content: dict[str, Any] = {
         "environment": config.environment.digest(),
         "sides": {side: list(agents) for side, agents in interface.sides.items()},
+        "scoring": scoring(interface),
         "opening_plies": config.play.opening_plies,
         "contestants": list(contestants),
         "pairings": [list(pairing) for pairing in pairings],
@@ -84,9 +93,10 @@ def _schedule(
         kind=kind,
         seed=derive(seed, name),
         environment_digest=config.environment.digest(),
-        sides=sides,
+        sides=tuple(interface.sides),
         contestants=tuple(contestants),
         pairings=tuple(pairings),
         length=length,
         opening_plies=config.play.opening_plies,
+        scoring=scoring(interface),
     )

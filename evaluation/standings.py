@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from evaluation.contestants import ANCHOR
+from evaluation.payoff import only_side
 from evaluation.ratings import rate
 from evaluation.report import Standing
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Match
+from league.results.records import BlockResult, Game, Match
 
 
 def standings(registry: Registry, league: str) -> tuple[Standing, ...]:
@@ -19,17 +21,27 @@ def standings(registry: Registry, league: str) -> tuple[Standing, ...]:
     return ranked(Ledger(registry).results(league, digest))
 
 
-def block_result(match: Match) -> BlockResult:
-    """A match without its moves."""
-    contestants = range(len(match.contestants))
-    return BlockResult(
-        schedule=match.schedule,
-        position=match.position,
-        contestants=match.contestants,
-        games=len(match.games),
-        scores=tuple(sum(game.scores[c] for game in match.games) for c in contestants),
-        returns=tuple(sum(game.returns[c] for game in match.games) for c in contestants),
+def by_side(sides: Sequence[str], matches: Sequence[Match]) -> dict[str, tuple[Standing, ...]]:
+    """Who stands where on each side, where contestants are compared with one another on the same side."""
+    results: dict[str, list[BlockResult]] = {side: [] for side in sides}
+    for match in matches:
+        for number, side in enumerate(sides):
+            games = [_on_side(game, number) for game in match.games]
+            part = replace(match, games=tuple(game for game in games if game is not None))
+            if part.games:
+                results[side].append(part.result())
+    return {side: ranked(own) for side, own in results.items()}
+
+
+def _on_side(game: Game, side: int) -> Game | None:
+    """The part of a game that says something about one side: what the contestant did that played it and no other."""
+    own = game.sides[side]
+    if only_side(game, own) != side:
+        return None
+    scores, returns = (
+        tuple(v if c == own else None for c, v in enumerate(each)) for each in (game.scores, game.returns)
     )
+    return replace(game, scores=scores, returns=returns)
 
 
 def ranked(results: Iterable[BlockResult], distinct_games: Mapping[str, int] | None = None) -> tuple[Standing, ...]:

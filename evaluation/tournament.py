@@ -23,11 +23,11 @@ from evaluation.payoff import tabulate
 from evaluation.player import player
 from evaluation.report import EvaluationReport, Listener, Progress
 from evaluation.schedule import round_robin
-from evaluation.standings import block_result, ranked
+from evaluation.standings import by_side, ranked
 from league.errors import LeagueError, WorkerLost
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from league.results.records import Match, Schedule
+from league.results.records import GAMES_PER_BLOCK, Match, Schedule
 from league.settings import Storage
 
 GAMES_PER_COPY = 4
@@ -60,7 +60,7 @@ def run(
     schedule = ledger.open(schedule)
     config = registry.league(schedule.league).config
     matches = ledger.matches(league=schedule.league, schedule=schedule.id)
-    chunks = chunks_of(schedule.length, len(matches), config.play.copies, len(schedule.sides))
+    chunks = chunks_of(schedule.length, len(matches), config.play.copies)
     document = config.model_dump_json(by_alias=True)
     played = (
         _in_ray(schedule, chunks, registry.storage, document, workers)
@@ -101,8 +101,9 @@ def evaluate(
     schedule = round_robin(row.config, row.interface, contestants, blocks, seed)
     with cluster():
         matches = run(schedule, registry=registry, workers=workers, listener=listener)
-    distinct = {ref: distinct_games(m for m in matches if ref in m.contestants) for ref in contestants}
-    table = ranked((block_result(match) for match in matches), distinct)
+    distinct = {ref: distinct_games(matches, ref) for ref in contestants}
+    table = ranked((match.result() for match in matches), distinct)
+    rated_by_side = schedule.scoring == "side" and len(schedule.sides) > 1
     return EvaluationReport(
         league=league,
         schedule=schedule.id,
@@ -111,6 +112,8 @@ def evaluate(
         distinct_games=distinct_games(matches),
         standings=table,
         payoff=tabulate([standing.ref for standing in table], schedule.sides, matches),
+        scoring=schedule.scoring,
+        by_side=by_side(schedule.sides, matches) if rated_by_side else {},
     )
 
 
@@ -137,12 +140,12 @@ def _start_ray(workers: int) -> None:
     )
 
 
-def chunks_of(length: int, played: int, copies: int, games: int) -> list[range]:
+def chunks_of(length: int, played: int, copies: int) -> list[range]:
     """What is missing of `length` positions behind the first `played`, cut at multiples of a chunk's size.
 
-    A chunk keeps `copies` environments busy for a few games each; blocks have `games` games.
+    A chunk keeps `copies` environments busy for a few games each.
     """
-    size = math.ceil(GAMES_PER_COPY * copies / games)
+    size = math.ceil(GAMES_PER_COPY * copies / GAMES_PER_BLOCK)
     cuts = [played, *range((played // size + 1) * size, length, size), length]
     return [range(start, end) for start, end in pairwise(cuts) if start < end]
 

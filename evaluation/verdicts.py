@@ -16,7 +16,8 @@ from typing import Any
 
 from evaluation import promotion, tournament
 from evaluation.gate import Decision, Watch, judge
-from evaluation.report import Listener, Progress, VerdictReport
+from evaluation.paired import paired_difference
+from evaluation.report import Difference, Listener, Progress, VerdictReport
 from evaluation.schedule import verdict as verdict_schedule
 from league.config import GateConfig
 from league.refs import CHAMPION
@@ -100,9 +101,18 @@ def _challenger(verdict: VerdictRow) -> str:
     return f"{verdict.league}@{verdict.candidate}"
 
 
+def _matches(registry: Registry, verdict: VerdictRow) -> Sequence[Match]:
+    return Ledger(registry).matches(league=verdict.league, schedule=verdict.schedule)
+
+
 def _decision(registry: Registry, verdict: VerdictRow) -> Decision:
-    matches: Sequence[Match] = Ledger(registry).matches(league=verdict.league, schedule=verdict.schedule)
-    return judge(_gate(verdict), matches, _challenger(verdict))
+    return judge(_gate(verdict), _matches(registry, verdict), _challenger(verdict))
+
+
+def _difference(registry: Registry, verdict: VerdictRow, decision: Decision) -> Difference | None:
+    if _schedule(registry, verdict).scoring == "game":
+        return None
+    return paired_difference(_matches(registry, verdict)[: decision.blocks], _challenger(verdict))
 
 
 def _reason(verdict: VerdictRow, decision: Decision) -> str:
@@ -130,6 +140,7 @@ def _close(
         elo=estimate.elo if estimate else None,
         interval=(estimate.low, estimate.high) if estimate else None,
         promoted=promotion.is_applied(registry, verdict),
+        difference=_difference(registry, verdict, decision),
         note=note,
     )
     evidence: dict[str, Any] = report.to_json() | {"counts": list(decision.counts)}

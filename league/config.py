@@ -70,12 +70,13 @@ class PlayConfig(_Part):
     """How matches are played."""
 
     opening_plies: int = Field(default=0, ge=0)
-    """Random legal moves at the start of each game. A deterministic game between greedy policies needs some:
+    """Random legal steps at the start of each game. A deterministic game between greedy policies needs some:
     without them it repeats one game for ever."""
     copies: int = Field(default=32, ge=1)
     """Games stepped together in one worker. Has no influence on any result."""
     max_moves: int = Field(default=10_000, ge=1)
-    """Actions after which a game counts as hung and the match fails."""
+    """Steps of the environment after which a game counts as hung and the match fails; where several agents act at once,
+    their actions are one step."""
 
 
 class ConvolutionConfig(_Part):

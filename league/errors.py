@@ -7,6 +7,7 @@ LeagueError
 │   ├── ObservationError        an array that does not fit its space
 │   ├── IllegalMask             an action mask that is not one, or allows nothing
 │   ├── IllegalAction           an action outside the mask or the space
+│   ├── InvalidReward           a reward that is no finite number
 │   └── EnvironmentMismatch     an environment, script or version that does not belong together
 ├── NotFound
 │   ├── UnknownLeague
@@ -71,6 +72,12 @@ class IllegalAction(InvalidInput):
     """An action outside its space or its mask."""
 
     code = "illegal_action"
+
+
+class InvalidReward(InvalidInput):
+    """A reward that is no finite number: nothing can be learned from it, and no return computed."""
+
+    code = "invalid_reward"
 
 
 class EnvironmentMismatch(InvalidInput):

@@ -13,7 +13,7 @@ from league.config import LeagueConfig, PPOConfig
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-ROOMS = ("cli", "evaluation", "league", "serve_app", "training")
+ROOMS = ("cli", "evaluation", "examples", "league", "serve_app", "training")
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 

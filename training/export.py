@@ -6,70 +6,139 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import torch
 from ray.rllib.core.columns import Columns
-from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
 from league.interface import AgentInterface
-from league.policies.onnx import ACTION, DIST_INPUTS
+from league.policies.actions import bounds, dist_inputs_size
+from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.registry.manifest import Tensor as TensorManifest
-from league.spaces import Discrete, inputs
+from league.spaces import Box, DictSpace, Discrete, MultiDiscrete, Space, inputs
+from training.modules.actor_critic import ActorCritic
 
 BATCH = "batch"
 
 
 class ActingGraph(nn.Module):
-    """What is exported: observations, as positional tensors → (`action`, `action_dist_inputs`).
+    """What is exported: observations, then states, as positional tensors → (`action`, `action_dist_inputs`, states).
 
     `action` is greedy and in the agent's own action space; as the distribution's inputs are masked, it is legal.
     """
 
-    def __init__(self, module: TorchRLModule, names: tuple[str, ...], first_action: int) -> None:
+    def __init__(self, module: ActorCritic, observed: tuple[str, ...], action: Space) -> None:
         super().__init__()
         self.module = module
-        self.names = names
-        self.first_action = first_action
+        self.observed = observed
+        self.remembered = tuple(module.get_initial_state())
+        self.to_environment = _to_environment(action)
 
-    def forward(self, *observations: Tensor) -> tuple[Tensor, Tensor]:
-        batch = {Columns.OBS: dict(zip(self.names, observations, strict=True))}
-        dist_inputs = self.module._forward(batch)[Columns.ACTION_DIST_INPUTS]
-        return dist_inputs.argmax(dim=-1) + self.first_action, dist_inputs
+    def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
+        batch = {
+            Columns.OBS: dict(zip(self.observed, arrays, strict=False)),
+            Columns.STATE_IN: dict(zip(self.remembered, arrays[len(self.observed) :], strict=True)),
+        }
+        answer = self.module._forward(batch)
+        dist_inputs = answer[Columns.ACTION_DIST_INPUTS]
+        states = [answer[Columns.STATE_OUT][key] for key in self.remembered]
+        return self.to_environment(self.module.distribution.mode(dist_inputs)), dist_inputs, *states
 
 
-def export_policy(module: TorchRLModule, spaces: AgentInterface, path: Path) -> None:
+class Shifted(nn.Module):
+    """Raw integers → those of the space: see league/policies/actions.py."""
+
+    start: Tensor
+
+    def __init__(self, space: Discrete | MultiDiscrete) -> None:
+        super().__init__()
+        self.shape = space.shape
+        self.dtype = _dtype(space.dtype)
+        self.register_buffer("start", torch.as_tensor(np.asarray(space.start)))
+
+    def forward(self, raw: Tensor) -> Tensor:
+        return (raw.reshape(-1, *self.shape) + self.start).to(self.dtype)
+
+
+class Spanned(nn.Module):
+    """Raw numbers → those inside the bounds of the space: see league/policies/actions.py."""
+
+    low: Tensor
+    high: Tensor
+    finite: Tensor
+
+    def __init__(self, space: Box) -> None:
+        super().__init__()
+        self.shape = space.shape
+        self.dtype = _dtype(space.dtype)
+        largest = np.finfo(space.dtype).max
+        low, high = (np.clip(bound, -largest, largest) for bound in bounds(space))
+        finite = np.logical_and(*map(np.isfinite, bounds(space)))
+        self.is_bounded, self.is_free = bool(finite.all()), not finite.any()
+        self.register_buffer("low", torch.as_tensor(low))
+        self.register_buffer("high", torch.as_tensor(high))
+        self.register_buffer("finite", torch.as_tensor(finite))
+
+    def forward(self, raw: Tensor) -> Tensor:
+        raw = raw.reshape(-1, *self.shape).double()
+        clipped = raw.clamp(self.low, self.high)
+        if self.is_free:
+            return clipped.to(self.dtype)
+        share = (raw.clamp(-1.0, 1.0) + 1) / 2
+        spanned = (self.low * (1 - share) + self.high * share).clamp(self.low, self.high)
+        return (spanned if self.is_bounded else torch.where(self.finite, spanned, clipped)).to(self.dtype)
+
+
+def export_policy(module: ActorCritic, spaces: AgentInterface, path: Path) -> None:
     """Write the graph of `module` to `path`. Inputs and outputs are those of `graph_tensors`, the batch is dynamic."""
-    assert isinstance(spaces.action, Discrete), f"no graph for actions {spaces.action}"
-    leaves = inputs(spaces.observation)
+    taken, answered, _ = graph_tensors(module, spaces)
     # Two rows: torch.export takes a batch of one for a constant.
-    examples = tuple(torch.zeros((2, *leaf.shape), dtype=_dtype(leaf.dtype)) for leaf in leaves.values())
-    graph = ActingGraph(module, tuple(leaves), spaces.action.start).eval()
+    examples = tuple(torch.zeros([size or 2 for size in tensor.shape], dtype=_dtype(tensor.dtype)) for tensor in taken)
+    graph = ActingGraph(module, tuple(inputs(spaces.observation)), spaces.action).eval()
     with _quiet():
         program = torch.onnx.export(
             graph,
             examples,
             dynamo=True,
-            input_names=list(leaves),
-            output_names=[ACTION, DIST_INPUTS],
-            dynamic_shapes=(tuple({0: torch.export.Dim(BATCH)} for _ in leaves),),
+            input_names=[tensor.name for tensor in taken],
+            output_names=[tensor.name for tensor in answered],
+            dynamic_shapes=(tuple({0: torch.export.Dim(BATCH)} for _ in taken),),
             verbose=False,
         )
     assert program is not None, "the exporter returns a program unless it is told to write one"
     program.save(str(path), external_data=False)
 
 
-def graph_tensors(spaces: AgentInterface) -> tuple[tuple[TensorManifest, ...], tuple[TensorManifest, ...]]:
-    """Inputs and outputs of a policy's graph, as its manifest states them."""
-    assert isinstance(spaces.action, Discrete)
+Tensors = tuple[TensorManifest, ...]
+
+
+def graph_tensors(module: ActorCritic, spaces: AgentInterface) -> tuple[Tensors, Tensors, Tensors]:
+    """Inputs, outputs and recurrent inputs of a policy's graph, as its manifest states them. The last are among the
+    first, behind the observations."""
+    assert not isinstance(spaces.action, DictSpace), "module_spec refuses it"
     observed = tuple(
         TensorManifest(name=name, dtype=leaf.dtype, shape=(None, *leaf.shape))
         for name, leaf in inputs(spaces.observation).items()
     )
-    answered = (
-        TensorManifest(name=ACTION, dtype="int64", shape=(None,)),
-        TensorManifest(name=DIST_INPUTS, dtype="float32", shape=(None, spaces.action.n)),
+    acted = (
+        TensorManifest(name=ACTION, dtype=spaces.action.dtype, shape=(None, *spaces.action.shape)),
+        TensorManifest(name=DIST_INPUTS, dtype="float32", shape=(None, dist_inputs_size(spaces.action))),
     )
-    return observed, answered
+    before, after = (
+        tuple(
+            TensorManifest(name=f"{prefix}{i}", dtype=state.dtype.name, shape=(None, *state.shape))
+            for i, state in enumerate(module.get_initial_state().values())
+        )
+        for prefix in (STATE_IN, STATE_OUT)
+    )
+    return (*observed, *before), (*acted, *after), before
+
+
+def _to_environment(space: Space) -> nn.Module:
+    if isinstance(space, Box):
+        return Spanned(space)
+    assert isinstance(space, Discrete | MultiDiscrete), "module_spec refuses it"
+    return Shifted(space)
 
 
 def _dtype(name: str) -> torch.dtype:

@@ -1,108 +1,203 @@
 """The proof that an exported graph acts as the trained module does, on observations from play."""
 
 import itertools
+import time
 from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
-from ray.rllib.core.rl_module.torch import TorchRLModule
 
 from league.config import EnvironmentConfig
 from league.environments.lockstep import stepping
 from league.environments.stepping import Episode
 from league.errors import ParityError
 from league.interface import Interface
-from league.policies.onnx import OnnxPolicy
+from league.policies.actions import bounds, to_environment
+from league.policies.draws import elements
+from league.policies.onnx import STATE_IN, OnnxPolicy
 from league.registry.manifest import Parity
 from league.seeds import derive, generator
-from league.spaces import Discrete
-from training.modules.actor_critic import MASKED
-from training.sampling import categorical
+from league.spaces import ACTION_MASK, Box, MultiDiscrete, Space
+from training.modules.actor_critic import ActorCritic
+from training.sampling.distributions import distribution
+from training.sampling.memories import Memories
+from training.sampling.reset_seeds import SEEDS
 
 OBSERVATIONS = 2048
 """Observations that each policy is compared on."""
+MEGABYTES = 128
+"""Large observations are compared on as many as fit into this, but on no fewer than FEWEST."""
+FEWEST = 256
+ENOUGH_SECONDS, MOST_SECONDS = 8.0, 120.0
+"""Of play, after which FEWEST observations are enough, and after which a policy with fewer counts as never acting."""
+COPIES = 8
 NEAR_TIE = 1e-5
 """Two actions whose logits are closer may swap by the order of summation in another runtime."""
 TOLERANCE = 1e-3
-"""Largest difference of a logit x, relative to 1 + |x|: beyond it, the two would not explore alike."""
-COPIES = 32
-MOVES_PER_OBSERVATION = 100
-"""Bounds the play where some policy hardly ever acts."""
-
-Batches = list[dict[str, NDArray]]
+"""Largest difference of an input x of the distribution, or of a number of the state, relative to 1 + |x|: beyond it,
+the two would not explore alike."""
+ACTION_TOLERANCE = 1e-4
+"""Largest difference of a number of an action, relative to the span between its bounds, else to 1 + |x|."""
 
 
+@dataclass(frozen=True, slots=True)
+class Met:
+    """k situations of a policy.
+
+    observations: ONNX input name → (k, …). state: key → (k, width), as the module names it; empty without a memory.
+    """
+
+    observations: dict[str, NDArray]
+    state: dict[str, NDArray]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.observations.values())))
+
+
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """Agents of one policy that explore by its own distributions, or play at random."""
+
+    policy: str
+    explores: bool
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """For passes over a few rows, several threads wait for one another longer than they work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_one_thread()
 def gather(
-    environment: EnvironmentConfig, interface: Interface, modules: dict[str, TorchRLModule], seed: int
-) -> dict[str, Batches]:
-    """Play until each policy has met OBSERVATIONS observations; policy → batches of them, (k, …) each.
+    environment: EnvironmentConfig, interface: Interface, modules: Mapping[str, ActorCritic], seed: int
+) -> dict[str, list[Met]]:
+    """Play until each policy has met enough observations; policy → batches of them, with its states carried along.
 
-    Every other copy explores by the modules' own distributions, the rest is uniformly random, so that both what the
-    policies do meet and what they do not is among them. Raises ParityError if a policy does not get to act enough.
+    Every other copy explores by the modules' own distributions, the rest is random, so that both what the policies do
+    meet and what they do not is among them. Raises ParityError if a policy does not get to act enough.
     """
     rng = generator(seed, "parity")
     batched = stepping(environment, COPIES)
     resets = itertools.count()
-    groups = [[(interface.policies[agent], explores) for agent in batched.agents] for explores in (False, True)]
-    met: dict[str, Batches] = defaultdict(list)
+    groups = [[_Group(interface.policies[agent], explores) for agent in batched.agents] for explores in (False, True)]
+    memories = {policy: Memories(module.get_initial_state()) for policy, module in modules.items()}
+    distributions = {policy: distribution(interface.of_policy(policy).action) for policy in modules}
+    met: dict[str, list[Met]] = defaultdict(list)
+    began = time.monotonic()
     try:
-        turn = batched.start(lambda copy: Episode(derive(seed, "parity", next(resets)), groups[copy % 2]))
-        for _ in range(MOVES_PER_OBSERVATION * OBSERVATIONS // COPIES):
+        turn = batched.start(lambda copy: Episode(derive(seed, "parity", next(resets)) % SEEDS, groups[copy % 2]))
+        while not _is_enough(met, interface, time.monotonic() - began):
+            for copy, memory in itertools.product(turn.finished, memories.values()):
+                memory.forget(copy)
             actions = {}
-            for (policy, explores), batch in turn.batches.items():
-                met[policy].append(batch.observations)
-                logits = _logits(modules[policy], batch.observations)
-                logits = logits if explores else np.where(logits > MASKED / 2, np.float32(0), logits)
-                chosen = categorical.sample(categorical.log_softmax(logits), rng)
-                actions[policy, explores] = chosen + _first_action(interface, policy)
-            if all(_count(met[policy]) >= OBSERVATIONS for policy in interface.policy_ids):
-                return dict(met)
+            for group, batch in turn.batches.items():
+                memory = memories[group.policy]
+                situation = Met(batch.observations, memory.before(batch))
+                met[group.policy].append(situation)
+                dist_inputs, state = _answer(modules[group.policy], situation)
+                memory.keep(batch, state)
+                drawn = distributions[group.policy]
+                if group.explores:
+                    raw, _ = drawn.sample(dist_inputs, rng)
+                else:
+                    raw, _ = drawn.uniform(batch.observations.get(ACTION_MASK), len(situation), rng)
+                actions[group] = to_environment(raw, interface.of_policy(group.policy).action)
             turn = batched.step(actions)
     finally:
         batched.close()
-    rarest = min(interface.policy_ids, key=lambda policy: _count(met[policy]))
-    raise ParityError(
-        f"policy {rarest} met {_count(met[rarest])} observations in "
-        f"{MOVES_PER_OBSERVATION * OBSERVATIONS} moves, expected {OBSERVATIONS}"
-    )
+    return dict(met)
 
 
-def prove(path: Path, policy: str, module: TorchRLModule, batches: Batches, first_action: int = 0) -> Parity:
-    """Compare the graph at `path`, as it is served, with `module`, row by row.
+@_one_thread()
+def prove(path: Path, policy: str, module: ActorCritic, batches: list[Met], space: Space) -> Parity:
+    """Compare the graph at `path`, as it is served, with `module`, row by row. space: that of the actions.
 
-    Raises ParityError if a greedy action differs that is no near tie, or a logit by more than TOLERANCE.
+    Raises ParityError if a greedy action differs that is no near tie, or an input of the distribution, or a number of
+    the state, by more than TOLERANCE.
     """
     graph = OnnxPolicy(path)
     near_ties = mismatches = 0
     largest = worst = 0.0
-    for observations in batches:
-        expected = _logits(module, observations)
+    for situation in batches:
+        expected, state = _answer(module, situation)
         if not np.isfinite(expected).all():
-            raise ParityError(f"policy {policy} has logits that are not finite: training has diverged")
-        rows = len(expected)
-        greedy = graph.act(observations).actions - first_action
-        answered = graph.act(observations, explore=True, rng=[np.random.default_rng(0)] * rows).dist_inputs
-        differs = greedy != expected.argmax(axis=-1)
-        near_ties += int((differs & (_margin(expected) < NEAR_TIE)).sum())
-        mismatches += int((differs & (_margin(expected) >= NEAR_TIE)).sum())
-        difference = np.abs(answered - expected)
-        largest = max(largest, float(difference.max()))
-        worst = max(worst, float((difference / (1 + np.abs(expected))).max()))
-    count = _count(batches)
+            raise ParityError(f"policy {policy} has outputs that are not finite: training has diverged")
+        mode = module.distribution.mode(torch.from_numpy(expected)).numpy()
+        before = {f"{STATE_IN}{i}": value for i, value in enumerate(situation.state.values())}
+        answer = graph.distribution(situation.observations, state=before or None)
+        assert answer.dist_inputs is not None
+        wrong, tied = _differing(answer.actions, to_environment(mode, space), expected, space)
+        mismatches, near_ties = mismatches + wrong, near_ties + tied
+        largest = max(largest, float(np.abs(answer.dist_inputs - expected).max()))
+        pairs = [(answer.dist_inputs, expected)]
+        pairs += zip((answer.state or {}).values(), state.values(), strict=True)
+        worst = max(worst, *(float((np.abs(found - known) / (1 + np.abs(known))).max()) for found, known in pairs))
+    count = sum(map(len, batches))
     if mismatches or not worst <= TOLERANCE:
         raise ParityError(
             f"the graph of policy {policy} differs from its module on {mismatches} of {count} greedy actions, "
-            f"and by up to {largest:g} in a logit"
+            f"and by up to {largest:g} in an input of the distribution"
         )
     return Parity(observations=count, mismatches=mismatches, near_ties=near_ties, max_difference=largest)
 
 
-def _logits(module: TorchRLModule, observations: dict[str, NDArray]) -> NDArray:
-    tensors = {name: torch.from_numpy(array) for name, array in observations.items()}
-    return module.forward_inference({Columns.OBS: tensors})[Columns.ACTION_DIST_INPUTS].numpy()
+def _answer(module: ActorCritic, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:
+    """What a module answers: inputs of its distribution (k, d), and the states after."""
+    answer = module.forward_inference(
+        {
+            Columns.OBS: {name: torch.from_numpy(array) for name, array in situation.observations.items()},
+            Columns.STATE_IN: {key: torch.from_numpy(array) for key, array in situation.state.items()},
+        }
+    )
+    state = {key: value.numpy() for key, value in answer.get(Columns.STATE_OUT, {}).items()}
+    return answer[Columns.ACTION_DIST_INPUTS].numpy(), state
+
+
+def _is_enough(met: Mapping[str, list[Met]], interface: Interface, seconds: float) -> bool:
+    lacking = {policy: _wanted(met[policy], seconds) - _count(met[policy]) for policy in interface.policy_ids}
+    rarest = max(lacking, key=lambda policy: lacking[policy])
+    if lacking[rarest] > 0 and seconds > MOST_SECONDS:
+        raise ParityError(
+            f"policy {rarest} met {_count(met[rarest])} observations in {seconds:.0f} s of play, expected {FEWEST}"
+        )
+    return lacking[rarest] <= 0
+
+
+def _wanted(batches: list[Met], seconds: float) -> int:
+    if not batches or seconds > ENOUGH_SECONDS:
+        return FEWEST
+    size = sum(array[0].nbytes for array in batches[0].observations.values())
+    return min(OBSERVATIONS, max(FEWEST, MEGABYTES * 2**20 // size))
+
+
+def _count(batches: list[Met]) -> int:
+    return sum(map(len, batches))
+
+
+def _differing(actions: NDArray, expected: NDArray, dist_inputs: NDArray, space: Space) -> tuple[int, int]:
+    """Rows whose actions differ, and rows that do so in near ties only."""
+    if isinstance(space, Box):
+        low, high = bounds(space)
+        span = np.where(np.isfinite(low) & np.isfinite(high), high - low, 1 + np.abs(expected))
+        differs = np.abs(actions - expected) > ACTION_TOLERANCE * span
+        return int(differs.reshape(len(differs), -1).any(axis=1).sum()), 0
+    parts = elements(dist_inputs, space) if isinstance(space, MultiDiscrete) else [dist_inputs]
+    margins = np.stack([_margin(logits) for logits in parts], axis=1)
+    differs = (actions != expected).reshape(len(actions), -1)
+    wrong = (differs & (margins >= NEAR_TIE)).any(axis=1)
+    return int(wrong.sum()), int((differs.any(axis=1) & ~wrong).sum())
 
 
 def _margin(logits: NDArray) -> NDArray:
@@ -111,12 +206,3 @@ def _margin(logits: NDArray) -> NDArray:
         return np.full(len(logits), np.inf)
     ordered = np.sort(logits, axis=-1)
     return ordered[:, -1] - ordered[:, -2]
-
-
-def _first_action(interface: Interface, policy: str) -> int:
-    space = interface.of_policy(policy).action
-    return space.start if isinstance(space, Discrete) else 0
-
-
-def _count(batches: Batches) -> int:
-    return sum(len(next(iter(batch.values()))) for batch in batches)

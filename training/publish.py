@@ -7,18 +7,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
-from ray.rllib.core.rl_module.torch import TorchRLModule
 
 from league.config import LeagueConfig
 from league.interface import Interface
 from league.registry.manifest import TRAINING, Manifest, PolicyManifest
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
-from league.spaces import Discrete
 from league.stack import installed
 from training import parity
 from training.algorithms.ppo import module_spec
 from training.export import export_policy, graph_tensors
+from training.modules.actor_critic import ActorCritic
 
 MODULES = Path(COMPONENT_LEARNER_GROUP, COMPONENT_LEARNER, COMPONENT_RL_MODULE)
 """Where RLlib keeps the modules inside an Algorithm's checkpoint."""
@@ -78,7 +77,7 @@ def publish(
     return registry.publish(config.league, build, source=checkpoint.source, parent=parent)
 
 
-def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, TorchRLModule]:
+def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, ActorCritic]:
     """The policies' modules in the state of `checkpoint`. Reads pickles: only for what our own training wrote."""
     modules = module_spec(config.training, interface).build()
     modules.restore_from_path(checkpoint / MODULES)
@@ -103,18 +102,18 @@ def _git(directory: Path, *arguments: str) -> str:
 
 
 def _export(
-    staging: Path, policy: str, module: TorchRLModule, interface: Interface, observations: parity.Batches
+    staging: Path, policy: str, module: ActorCritic, interface: Interface, observations: list[parity.Met]
 ) -> PolicyManifest:
     spaces = interface.of_policy(policy)
-    assert isinstance(spaces.action, Discrete)
     file = f"{policy}.onnx"
     export_policy(module, spaces, staging / file)
-    inputs, outputs = graph_tensors(spaces)
+    inputs, outputs, state = graph_tensors(module, spaces)
     return PolicyManifest(
         file=file,
         observation=spaces.observation,
         action=spaces.action,
         inputs=inputs,
         outputs=outputs,
-        parity=parity.prove(staging / file, policy, module, observations, spaces.action.start),
+        state=state,
+        parity=parity.prove(staging / file, policy, module, observations, spaces.action),
     )

@@ -1,33 +1,35 @@
 """One training run: Ray Tune trains, the driver publishes each checkpoint as a version."""
 
-import logging
-import os
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import ray
+from pydantic import TypeAdapter
 from ray import tune
 from rich.console import Console
 
-from league.config import LeagueConfig
+from league.config import LeagueConfig, TrainingConfig
 from league.environments.building import interface as interface_of
-from league.errors import ConfigError, InterfaceChanged, LeagueError
+from league.errors import ConfigError, InterfaceChanged
 from league.interface import Interface
 from league.refs import CheckpointRef
 from league.registry.manifest import TRAINING
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
-from training.algorithms.ppo import module_spec
-from training.cluster import connected
+from training.algorithms.ppo import algorithm_config, module_spec
+from training.cluster import UNLIMITED, LocalRay, connected
+from training.faults import told
+from training.interrupts import Interrupted
+from training.pinning import pin
 from training.progress import Progress
 from training.publish import git_commit
 from training.publisher import Publisher, versions
-from training.runs import CHECKPOINTS, Run
-from training.trial import Start, Trial, read_progress
+from training.resources import cpu_share, placement
+from training.runs import CHECKPOINTS, END, Run
+from training.trial import AFRESH, Plan, Start, Trial, read_progress
+from training.tuning import Unpickled, fit, quiet, run_config
+
+NETWORK = ("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder")
+"""Settings that decide what the network is: a version's weights fit no other."""
 
 
 def train(
@@ -37,50 +39,70 @@ def train(
     parent: CheckpointRef | None = None,
     resume: bool = False,
     address: str | None = None,
+    local: LocalRay = UNLIMITED,
     config_path: Path | None = None,
     console: Console | None = None,
 ) -> list[VersionRow]:
     """Train `config` until its budget (`training.steps`, `training.minutes`) is spent.
 
-    Registers the league, runs one Ray Tune trial, shows its progress on `console` (live in a terminal, plain lines
+    Registers the league, runs one Ray Tune trial, shows its progress on `console` (a bar in a terminal, plain lines
     elsewhere), writes TensorBoard files below `<home>/runs/<league>/<run>` and publishes a version at each checkpoint.
 
     parent: train on from this version; the first version of the run names it as its parent.
-    resume: go on with the newest run of the league, which was interrupted. What it published stays, nothing is
-        published twice, and what it had saved but not published yet is published first.
-    address: a running Ray cluster; None takes the Ray that the process is connected to, or starts a local one, which
-        ends with the run.
+    resume: go on with the newest run of the league, which was interrupted, or has a larger budget now. What it
+        published stays, nothing is published twice, and what it had saved but not published yet is published first.
+        With a cadence in steps and one runner, its versions are those of a run that was not interrupted.
+    address: a running Ray cluster; None takes the Ray that the process is connected to, or starts one within `local`,
+        which ends with the run.
     config_path: where `config` was read; its git commit is recorded in the manifests if it lies in a repository.
 
     Returns the versions of this run, ascending, those of before an interruption included.
 
+    SIGINT or SIGTERM, once: Interrupted, after the run has saved and published where it is. Again: KeyboardInterrupt,
+    at once. In both cases the run can be resumed.
+
     Raises LeagueError: nothing to resume, or with other settings than it began with; an unknown parent, or one of
-    another interface or network; a run that another process is on; a cluster whose machines do not share storage; an
-    export that fails its parity proof (the versions published before stay). KeyboardInterrupt leaves a run that can be
-    resumed.
+    another interface or network; opponents that do not exist or fit; a run that another process is on; a cluster whose
+    machines do not share storage; a fault of the environment; an export that fails its parity proof (the versions
+    published before stay).
     """
     if resume and parent is not None:
         raise ConfigError("a run that is resumed has its parent already: give either --from or --resume")
-    _quiet()
+    quiet()
     interface = interface_of(config)
-    module_spec(config.training, interface).build()  # what does not fit fails here, before anything is started
+    check(config, interface)
     registry.register(config, interface)
     number = None if parent is None else _parent(registry, parent, config, interface).number
     interrupted = Run.resume(registry.storage, config) if resume else None
-    with connected(address, registry.storage):
-        run = interrupted or Run.begin(registry.storage, config, number, git_commit(config_path))
-        with run.locked(), Progress(console or Console(), config.training, interface.policy_ids) as progress:
+    pins = {} if interrupted else pin(config, registry, interface)
+    with connected(address, registry.storage, local) as dashboard:
+        run = interrupted or Run.begin(registry.storage, config, number, git_commit(config_path), pins)
+        progress = Progress(console or Console(), run.record.config.training, interface.policy_ids)
+        with run.locked(), progress:
+            if dashboard:
+                progress.say(f"Ray's dashboard: {dashboard}")
             _work(run, registry, interface, progress)
     return versions(registry, run)
+
+
+def check(config: LeagueConfig, interface: Interface) -> None:
+    """Raise ConfigError for settings that do not fit the league or one another, before anything is started."""
+    algorithm_config(config, interface)
+    module_spec(config.training, interface).build()
 
 
 def _work(run: Run, registry: Registry, interface: Interface, progress: Progress) -> None:
     publisher = Publisher(run, registry, interface, progress)
     try:
         _publish_rest(run, publisher)
-        _tune(run, interface, _start(run, registry), publisher, progress)
-    finally:
+        spent = _tune(run, interface, registry, publisher, progress)
+    except Exception:
         publisher.settle()
+        raise
+    publisher.settle()
+    if not spent:
+        published = ", ".join(version.ref for version in versions(registry, run)) or "nothing yet"
+        raise Interrupted(f"Ended early. Published: {published}. Curves: {run.path}. To go on: --resume.")
     run.complete()
 
 
@@ -91,11 +113,18 @@ def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
     version = registry.resolve(ref)
     if version.manifest.interface.digest() != interface.digest():
         raise InterfaceChanged(f"{version.ref} has other spaces or policies than the environment has now")
-    now = config.training.model_dump(mode="json", by_alias=True)
-    for key in ("algorithm", "convolutions", "hidden"):
-        if (before := version.manifest.settings.get(key)) != now[key]:
-            raise ConfigError(f"training.{key}: {version.ref} was trained with {before}, got {now[key]}")
+    check_network(version, config)
     return version
+
+
+def check_network(version: VersionRow, config: LeagueConfig) -> None:
+    """Raise ConfigError if `config` trains another network than the version has. What its settings do not name yet,
+    it has by default."""
+    settings: TrainingConfig = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
+    for key in NETWORK:
+        if before[key] != now[key]:
+            raise ConfigError(f"training.{key}: {version.ref} was trained with {before[key]}, got {now[key]}")
 
 
 def _publish_rest(run: Run, publisher: Publisher) -> None:
@@ -117,72 +146,37 @@ def _start(run: Run, registry: Registry) -> Start:
         return Start(state, steps, before, seconds)
     if parent is not None:
         return Start(registry.fetch(league, parent) / TRAINING, before, before, 0.0)
-    return Start(None, 0, 0, 0.0)
+    return AFRESH
 
 
-def _tune(run: Run, interface: Interface, start: Start, publisher: Publisher, progress: Progress) -> None:
-    """One life of the run, as a Tune experiment of one trial."""
+def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publisher, progress: Progress) -> bool:
+    """One life of the run, as a Tune experiment of one trial. Whether its budget is spent."""
     config, life = run.record.config, run.next_life()
-    checkpoints = life / CHECKPOINTS
-    checkpoints.mkdir(parents=True)
-    share = _cpu_share(config.training.runners)
+    (life / CHECKPOINTS).mkdir(parents=True)
+    share = cpu_share(config.training.runners)
+    plan = Plan(_start(run, registry), life / CHECKPOINTS, life / END, registry.storage, cpus=share)
+
+    def ask_to_end() -> None:
+        plan.end.touch()
+        progress.say("Ending after this update, and publishing what there is. Ctrl-C again ends at once.")
+
     tuner = tune.Tuner(
-        tune.with_resources(Trial, _resources(config.training.runners, share)),
+        tune.with_resources(Trial, placement(config.training, share)),
         param_space={
             "league": config.model_dump(mode="json", by_alias=True),
             "interface": interface.model_dump(mode="json"),
-            "start": start,
-            "checkpoints": checkpoints,
-            "runner_cpus": share,
+            "plan": plan,
         },
         tune_config=tune.TuneConfig(trial_dirname_creator=lambda _: life.name),
-        run_config=tune.RunConfig(
-            name=run.id,
-            storage_path=str(run.path.parent),
-            callbacks=[_Driver(publisher, progress)],
-            stop=_StopOnError(publisher),
-            checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
-            verbose=0,
-        ),
+        run_config=run_config(run.path, [_Driver(publisher, progress)], _StopOnError(publisher)),
     )
-    with _signals_as_before():
-        result = tuner.fit()[0]
+    result = fit(tuner, ask_to_end)[0]
     if result.error is not None:
-        raise _cause(result.error)
-    if publisher.error is None and not (result.metrics or {}).get("done"):
-        raise KeyboardInterrupt
+        raise told(result.error, config.league, life / "error.txt") from result.error
+    return bool((result.metrics or {}).get("spent"))
 
 
-@contextmanager
-def _signals_as_before() -> Iterator[None]:
-    """Tune leaves its handler of Ctrl-C behind, which would swallow the next one."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGUSR1)}
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-
-
-def _quiet() -> None:
-    """The progress is ours: none of Tune's tables, hints and traces, nor RLlib's deprecations of its own calls.
-    And the trial stays in this directory, where a user's own environment is importable."""
-    os.environ["RAY_CHDIR_TO_TRIAL_DIR"] = "0"
-    os.environ["RAY_AIR_NEW_OUTPUT"] = "0"
-    logging.getLogger("ray._common.deprecation").setLevel(logging.ERROR)
-    os.environ["TUNE_PRINT_ALL_TRIAL_ERRORS"] = "0"
-    logging.getLogger("ray.tune").setLevel(logging.CRITICAL)
-
-
-class _Unpickled:
-    """Tune pickles what it is given, for a way of resuming that is not ours: nothing of the driver goes into it."""
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {}
-
-
-class _Driver(_Unpickled, tune.Callback):
+class _Driver(Unpickled, tune.Callback):
     """Hears each result of the trial, in the driver's process."""
 
     def __init__(self, publisher: Publisher, progress: Progress) -> None:
@@ -195,7 +189,7 @@ class _Driver(_Unpickled, tune.Callback):
             self._publisher.add(Path(result["checkpoint"]))
 
 
-class _StopOnError(_Unpickled, tune.Stopper):
+class _StopOnError(Unpickled, tune.Stopper):
     """Ends training when a version cannot be published."""
 
     def __init__(self, publisher: Publisher) -> None:
@@ -206,28 +200,3 @@ class _StopOnError(_Unpickled, tune.Stopper):
 
     def stop_all(self) -> bool:
         return self._publisher.error is not None
-
-
-def _cpu_share(runners: int) -> float:
-    """CPUs of the learner and of each runner: one, less where there are not as many.
-
-    They take turns, so that a machine is not overloaded by a few more of them than it has CPUs.
-    """
-    cpus = ray.cluster_resources().get("CPU", 1.0)
-    return min(1.0, int(100 * cpus / (1 + runners)) / 100)
-
-
-def _resources(runners: int, share: float) -> tune.PlacementGroupFactory:
-    """The learner on the driver's machine, where checkpoints are read; each runner anywhere."""
-    here = f"node:{ray.util.get_node_ip_address()}"
-    return tune.PlacementGroupFactory([{"CPU": share, here: 0.001}] + [{"CPU": share}] * runners)
-
-
-def _cause(error: BaseException) -> BaseException:
-    """The fault of a person behind an error of Ray's, if it is one."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, LeagueError):
-            return cause
-        cause = getattr(cause, "cause", None) or cause.__cause__
-    return error

@@ -4,32 +4,34 @@
     run.json            what is trained; written before training, and when it is complete
     lock                held while a driver works on it
     life-<n>/           Tune's trial and its TensorBoard files; a new life at each start
+        end                 made to ask the trial to save and end
         checkpoints/<steps>/    RLlib's state, until it is published
 """
 
 import json
-import os
+import math
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
-from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
 
-from league.config import LeagueConfig
-from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.config import LeagueConfig, PPOConfig
+from league.errors import ConfigError, NotFound
 from league.registry.faults import disk_faults
 from league.settings import Storage
+from training.pinning import with_pins
+from training.records import locked, write
 
 RUN_FILE = "run.json"
 LIFE = "life-"
 CHECKPOINTS = "checkpoints"
-MAY_CHANGE = {"steps", "minutes", "checkpoint_every", "checkpoint_minutes", "runners"}
-"""Training settings that a run may be resumed with other values of: they decide how long, not what is learned."""
+END = "end"
+MAY_CHANGE = {"steps", "minutes", "checkpoint_every", "checkpoint_minutes", "runners", "gpus", "runner_gpus", "crashes"}
+"""Training settings that a run may be resumed with other values of: how long, and on what; not what is learned."""
 
 
 class RunRecord(BaseModel):
@@ -38,6 +40,9 @@ class RunRecord(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     config: LeagueConfig
+    """Its opponents are pinned."""
+    pins: dict[str, str] = {}
+    """Opponents as the user wrote them → what they were when the run began."""
     parent: int | None
     git_commit: str | None
     started_at: datetime
@@ -57,11 +62,20 @@ class Run:
         return self.path.name
 
     @classmethod
-    def begin(cls, storage: Storage, config: LeagueConfig, parent: int | None, git_commit: str | None) -> Self:
-        """Make the directory of a new run."""
+    def begin(
+        cls,
+        storage: Storage,
+        config: LeagueConfig,
+        parent: int | None,
+        git_commit: str | None,
+        pins: dict[str, str] | None = None,
+    ) -> Self:
+        """Make the directory of a new run. pins: what the opponents' references mean."""
+        pins = pins or {}
+        config = with_pins(config, pins)
         now = datetime.now(UTC)
         path = _runs(storage, config.league) / f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
-        run = cls(path, RunRecord(config=config, parent=parent, git_commit=git_commit, started_at=now))
+        run = cls(path, RunRecord(config=config, pins=pins, parent=parent, git_commit=git_commit, started_at=now))
         with disk_faults(path):
             path.mkdir(parents=True)
             run._write()
@@ -69,35 +83,33 @@ class Run:
 
     @classmethod
     def resume(cls, storage: Storage, config: LeagueConfig) -> Self:
-        """The league's newest run, if it is not complete. Raises NotFound; ConfigError if `config` is another."""
+        """The league's newest run, if there is something left to do: it was interrupted, or its budget is larger now.
+
+        Raises NotFound; ConfigError if `config` is another.
+        """
         runs = _runs(storage, config.league)
         newest = max(runs.glob(f"*/{RUN_FILE}"), default=None)
         if newest is None:
             raise NotFound(f"league {config.league} has no training run in {runs}: there is nothing to resume")
         record = RunRecord.model_validate_json(newest.read_text())
-        if record.complete:
-            raise NotFound(f"training run {newest.parent.name} is complete: there is nothing to resume")
-        if (changed := _changed(record.config, config)) is not None:
+        config = with_pins(config, record.pins)
+        if (changed := changed_part(record.config, config)) is not None:
             raise ConfigError(
                 f"{changed} has changed since training run {newest.parent.name} began, so that it cannot go on: "
                 f"start a new one, with --from if it should build on a version"
             )
-        run = cls(newest.parent, record.model_copy(update={"config": config}))
+        if record.complete and not _has_larger_budget(record.config.training, config.training):
+            raise NotFound(
+                f"training run {newest.parent.name} is complete: there is nothing to resume, unless --steps or"
+                " --minutes is larger"
+            )
+        run = cls(newest.parent, record.model_copy(update={"config": config, "complete": False}))
         run._write()
         return run
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self) -> AbstractContextManager[None]:
         """Keep other drivers off. Raises AlreadyRunning. A driver that dies lets go."""
-        lock = FileLock(self.path / "lock", timeout=0)
-        try:
-            lock.acquire()
-        except Timeout as error:
-            raise AlreadyRunning(f"training run {self.id} is under way in another process") from error
-        try:
-            yield
-        finally:
-            lock.release()
+        return locked(self.path, f"training run {self.id}")
 
     def lives(self) -> list[Path]:
         """The directories of the run's starts, oldest first."""
@@ -124,19 +136,14 @@ class Run:
         self._write()
 
     def _write(self) -> None:
-        draft = self.path / f".{RUN_FILE}"
-        with draft.open("w") as file:
-            file.write(self.record.model_dump_json(indent=2, by_alias=True))
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(self.path / RUN_FILE)
+        write(self.record, self.path / RUN_FILE)
 
 
 def _runs(storage: Storage, league: str) -> Path:
     return storage.home / "runs" / league
 
 
-def _changed(old: LeagueConfig, new: LeagueConfig) -> str | None:
+def changed_part(old: LeagueConfig, new: LeagueConfig) -> str | None:
     """The first part that differs in what is learned."""
     for key in ("environment", "policies"):
         if getattr(old, key) != getattr(new, key):
@@ -146,3 +153,9 @@ def _changed(old: LeagueConfig, new: LeagueConfig) -> str | None:
         if key not in MAY_CHANGE and before.get(key) != after.get(key):
             return f"training.{key}"
     return None
+
+
+def _has_larger_budget(old: PPOConfig, new: PPOConfig) -> bool:
+    """Whether one limit is larger; the trial finds out whether the other one was what ended it."""
+    before, now = (settings.minutes or math.inf for settings in (old, new))
+    return new.steps > old.steps or now > before

@@ -1,6 +1,6 @@
 """From a reference to something that acts."""
 
-from league.errors import EnvironmentMismatch, UnknownPolicy
+from league.errors import EnvironmentMismatch, InvalidInput, UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
@@ -27,9 +27,10 @@ def load(ref: str, policy: str | None = None, registry: Registry | None = None) 
         registry.close()
 
 
-def contestant(ref: str, registry: Registry, interface: Interface) -> dict[str, tuple[str, Policy]]:
+def contestant(ref: str, registry: Registry | None, interface: Interface) -> dict[str, tuple[str, Policy]]:
     """Who acts for each agent: agent → (policy id, policy). Agents of one policy id share one object.
 
+    registry: where versions are; not needed for a script.
     Raises what `load` does, and EnvironmentMismatch if the version or script does not fit `interface`.
     """
     parsed = parse_ref(ref)
@@ -42,7 +43,9 @@ def _script(ref: ScriptRef, interface: Interface) -> dict[str, Policy]:
     return {policy: script(ref.name, space.observation, space.action) for policy, space in spaces.items()}
 
 
-def _version(ref: CheckpointRef, registry: Registry, interface: Interface) -> dict[str, Policy]:
+def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface) -> dict[str, Policy]:
+    if registry is None:
+        raise InvalidInput(f"{ref} is a version: without a registry, only scripts can be loaded")
     version = registry.resolve(ref)
     if version.manifest.interface.digest() != interface.digest():
         raise EnvironmentMismatch(f"{version.ref} has other spaces or policies than the environment that it is to play")

@@ -9,10 +9,11 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError
+from league.policies.actions import to_environment
 from league.policies.draws import sample
 from league.policies.policy import Actions, Arrays
 from league.registry.manifest import PolicyManifest
-from league.spaces import Discrete
+from league.spaces import Discrete, Space
 
 ACTION = "action"
 DIST_INPUTS = "action_dist_inputs"
@@ -36,8 +37,7 @@ class OnnxPolicy:
         self._inputs = {node.name: node for node in self._session.get_inputs()}
         self._outputs = {node.name: node for node in self._session.get_outputs()}
         _check_graph(self._inputs, self._outputs, manifest)
-        self._first_action = manifest.action.start if manifest and isinstance(manifest.action, Discrete) else 0
-        self._is_categorical = isinstance(manifest.action, Discrete) if manifest else _is_discrete(self._outputs)
+        self._action = manifest.action if manifest else _discrete(self._outputs)
         self._observed = tuple(name for name in self._inputs if not name.startswith(STATE_IN))
         self._recurrent = tuple(name for name in self._inputs if name.startswith(STATE_IN))
         state_out = [STATE_OUT + name.removeprefix(STATE_IN) for name in self._recurrent]
@@ -56,10 +56,22 @@ class OnnxPolicy:
 
         state: arrays (k, …) under the names `state_in_<i>`; None at the start of episodes.
         Raises ObservationError if an array is missing or has another shape or dtype than the graph takes, and
-        EnvironmentMismatch if it cannot explore: only categorical policies of a Discrete action space can.
+        EnvironmentMismatch if it cannot explore: without a manifest, only one action of several is told from the graph.
         """
-        if explore and not self._is_categorical:
-            raise EnvironmentMismatch("this policy cannot explore: its action space is not Discrete")
+        if explore and self._action is None:
+            raise EnvironmentMismatch("this policy cannot explore without a manifest, which says its action space")
+        outputs = self._run(observations, state, self._exploring if explore else self._greedy)
+        if not explore or self._action is None:
+            return Actions(outputs[0], self._state(outputs[1:]))
+        actions = to_environment(sample(outputs[1], self._action, rng), self._action)
+        return Actions(actions, self._state(outputs[2:]), outputs[1])
+
+    def distribution(self, observations: Arrays, *, state: Arrays | None = None) -> Actions:
+        """As a greedy `act`, with the distribution's inputs."""
+        outputs = self._run(observations, state, self._exploring)
+        return Actions(outputs[0], self._state(outputs[2:]), outputs[1])
+
+    def _run(self, observations: Arrays, state: Arrays | None, answers: list[str]) -> list[NDArray]:
         try:
             feed = {name: observations[name] for name in self._observed}
             if self._recurrent:
@@ -67,14 +79,10 @@ class OnnxPolicy:
             rows = {name: len(array) for name, array in feed.items()}
             if len(set(rows.values())) != 1:
                 raise ValueError(f"rows differ: {rows}")
-            outputs = self._session.run(self._exploring if explore else self._greedy, feed)
+            return self._session.run(answers, feed)
         except Exception as error:
             self._explain(observations, state)
             raise ObservationError(f"the graph refuses its input: {_one_line(error)}") from error
-        if not explore:
-            return Actions(outputs[0], self._state(outputs[1:]))
-        actions = sample(outputs[1], rng) + self._first_action
-        return Actions(actions, self._state(outputs[2:]), outputs[1])
 
     def initial_state(self, batch: int) -> dict[str, NDArray]:
         """The recurrent state of `batch` episodes that start; empty for a graph without."""
@@ -143,6 +151,8 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _is_discrete(outputs: dict[str, Any]) -> bool:
+def _discrete(outputs: dict[str, Any]) -> Space | None:
+    """The action space of a graph whose action is one integer."""
     action = outputs[ACTION]
-    return len(action.shape) == 1 and _dtype(action) in ("int32", "int64")
+    is_discrete = len(action.shape) == 1 and _dtype(action) in ("int32", "int64")
+    return Discrete(n=outputs[DIST_INPUTS].shape[1]) if is_discrete else None

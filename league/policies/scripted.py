@@ -1,7 +1,8 @@
 """Scripted baselines: contestants whose strength is known and that need no training.
 
-`random` picks uniformly among the legal actions. `one_ply` wins at once if it can, else keeps the opponent
-from doing so, else is `random`; it plays connect four and tic-tac-toe.
+`random` picks uniformly among the legal actions, `first` always takes the first one. `mirror` plays what it observes,
+and so repeats its opponent's last move in rock, paper, scissors. `one_ply` wins at once if it can, else keeps the
+opponent from doing so, else is `random`; it plays connect four and tic-tac-toe.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import EnvironmentMismatch, IllegalMask, UnknownPolicy
-from league.policies.draws import Generators, choose, draw
+from league.policies.actions import bounds, to_environment
+from league.policies.draws import Generators, choose, draw, elements
 from league.policies.policy import Actions, Arrays, Policy
 from league.spaces import (
     ACTION_MASK,
@@ -43,12 +45,10 @@ class Random:
     """Uniform over the legal actions; over the whole action space where there is no mask."""
 
     def __init__(self, observation: Space, action: Space) -> None:
+        self._action = _playable("random", observation, action)
         self._masked = ACTION_MASK in inputs(observation)
-        if isinstance(action, DictSpace) or (self._masked and not isinstance(action, Discrete)):
-            raise EnvironmentMismatch(f"script:random cannot play with {action.type} actions here")
-        if isinstance(action, Box) and not all(np.isfinite(bound).all() for bound in _bounds(action)):
-            raise EnvironmentMismatch("script:random cannot play with actions that have no bounds")
-        self._action: Leaf = action
+        if isinstance(action, Box) and not all(np.isfinite(bound).all() for bound in bounds(action)):
+            raise EnvironmentMismatch(f"script:random cannot play with actions that have no bounds: {action!r}")
 
     def act(
         self,
@@ -59,10 +59,63 @@ class Random:
         rng: Generators | None = None,
     ) -> Actions:
         """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
-        if self._masked and isinstance(self._action, Discrete):
-            return Actions(_choose(observations[ACTION_MASK], rng) + self._action.start)
+        if self._masked:
+            masks = _masks(observations[ACTION_MASK], self._action)
+            uniform = draw(rng, len(masks[0]), (len(masks),) if self._action.shape else ()).reshape(-1, len(masks))
+            chosen = [choose(mask, uniform[:, i]) for i, mask in enumerate(masks)]
+            return Actions(_raw_to_environment(chosen, self._action))
         rows = len(next(iter(observations.values())))
         return Actions(_spread(draw(rng, rows, self._action.shape), self._action))
+
+
+class First:
+    """Always the first legal action: the least integer, the lowest number, or what is nearest to 0 where a number has
+    no lower bound."""
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        self._action = _playable("first", observation, action)
+        self._masked = ACTION_MASK in inputs(observation)
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,  # noqa: ARG002
+        explore: bool = False,  # noqa: ARG002
+        rng: Generators | None = None,  # noqa: ARG002
+    ) -> Actions:
+        """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
+        if self._masked:
+            masks = _masks(observations[ACTION_MASK], self._action)
+            return Actions(_raw_to_environment([(mask != 0).argmax(axis=1) for mask in masks], self._action))
+        rows = len(next(iter(observations.values())))
+        return Actions(np.repeat(_lowest(self._action)[np.newaxis], rows, axis=0))
+
+
+class Mirror:
+    """Plays what it observes: where an observation is one of n actions, or the value behind them for none as yet.
+
+    In PettingZoo's rock, paper, scissors that is the opponent's last move. Where there is none, the first action.
+    """
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        if not (isinstance(observation, Discrete) and isinstance(action, Discrete) and observation.n == action.n + 1):
+            raise EnvironmentMismatch(
+                "script:mirror plays where an observation is an action or none: Discrete(n + 1) for actions Discrete(n)"
+            )
+        self._observation, self._action = observation, action
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,  # noqa: ARG002
+        explore: bool = False,  # noqa: ARG002
+        rng: Generators | None = None,  # noqa: ARG002
+    ) -> Actions:
+        """Act on a batch; see `Policy.act`."""
+        seen = observations[OBSERVATION] - self._observation.start
+        return Actions(to_environment(np.where(seen < self._action.n, seen, 0), self._action))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +186,9 @@ class OnePly:
         for player in (1, 0):
             completing = legal & self._game.actions_on(self._completing(planes[:, :, player]), empty)
             best = np.where(completing.any(axis=1, keepdims=True), completing, best)
-        return Actions(_choose(best, rng))
+        if not legal.any(axis=1).all():
+            raise IllegalMask(NOTHING_ALLOWED)
+        return Actions(choose(best, draw(rng, len(best))))
 
     def _completing(self, own: NDArray) -> NDArray:
         """The squares of lines of which `own` (k, squares) lacks one: an empty one completes its line."""
@@ -141,7 +196,62 @@ class OnePly:
         return almost.astype(np.float32) @ self._lines > 0
 
 
-SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {"random": Random, "one_ply": OnePly}
+SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {
+    "random": Random,
+    "one_ply": OnePly,
+    "first": First,
+    "mirror": Mirror,
+}
+NOTHING_ALLOWED = "action_mask allows no action: expected at least one 1"
+
+
+def _playable(name: str, observation: Space, action: Space) -> Leaf:
+    """The action space, if it is one, and its mask fits where there is one."""
+    if isinstance(action, DictSpace):
+        raise EnvironmentMismatch(f"script:{name} cannot play with {action.type} actions")
+    mask = inputs(observation).get(ACTION_MASK)
+    if mask is not None and mask.shape != (_values(action),):
+        raise EnvironmentMismatch(
+            f"script:{name} cannot play with a mask of shape {list(mask.shape)} for actions {action!r}"
+        )
+    return action
+
+
+def _values(action: Leaf) -> int | None:
+    """How many values a mask has for an action space; None where it can have none."""
+    match action:
+        case Discrete(n=n):
+            return n
+        case MultiDiscrete(nvec=nvec):
+            return int(np.sum(nvec))
+    return None
+
+
+def _masks(mask: NDArray, action: Leaf) -> list[NDArray]:
+    """The mask (k, n) of each element of the action. Raises IllegalMask if one allows nothing."""
+    masks = elements(mask, action) if isinstance(action, MultiDiscrete) else [mask]
+    if not all(part.any(axis=1).all() for part in masks):
+        raise IllegalMask(NOTHING_ALLOWED)
+    return masks
+
+
+def _raw_to_environment(chosen: list[NDArray], action: Leaf) -> NDArray:
+    raw = np.stack(chosen, axis=1) if isinstance(action, MultiDiscrete) else chosen[0]
+    return to_environment(raw, action)
+
+
+def _lowest(action: Leaf) -> NDArray:
+    match action:
+        case Discrete(start=start) | MultiDiscrete(start=start):
+            lowest = np.asarray(start)
+        case MultiBinary(shape=shape):
+            lowest = np.zeros(shape)
+        case Box():
+            low, high = bounds(action)
+            lowest = np.where(np.isfinite(low), low, np.minimum(high, 0))
+        case _:
+            assert_never(action)
+    return lowest.astype(action.dtype)
 
 
 def _line_game(observation: Space, action: Space) -> LineGame:
@@ -151,12 +261,6 @@ def _line_game(observation: Space, action: Space) -> LineGame:
         if fits and ACTION_MASK in leaves and action == Discrete(n=game.actions):
             return game
     raise EnvironmentMismatch("script:one_ply plays connect four and tic-tac-toe only, and has other spaces here")
-
-
-def _choose(allowed: NDArray, rng: Generators | None) -> NDArray:
-    if not allowed.any(axis=1).all():
-        raise IllegalMask("action_mask allows no action: expected at least one 1")
-    return choose(allowed, rng)
 
 
 def _spread(uniform: NDArray, space: Leaf) -> NDArray:
@@ -169,15 +273,10 @@ def _spread(uniform: NDArray, space: Leaf) -> NDArray:
         case MultiBinary():
             values = np.floor(uniform * 2)
         case Box():
-            low, high = _bounds(space)
+            low, high = bounds(space)
             values = low + uniform * (high - low)
             if np.dtype(space.dtype).kind != "f":
                 values = np.floor(low + uniform * (high - low + 1))
         case _:
             assert_never(space)
     return values.astype(space.dtype)
-
-
-def _bounds(space: Box) -> tuple[NDArray, NDArray]:
-    """Lowest and highest values, (*shape) float64; an absent bound is NaN."""
-    return np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)

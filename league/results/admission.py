@@ -3,7 +3,8 @@
 import math
 
 from league.errors import LedgerRefusal
-from league.results.records import Game, Match, Schedule, rotation
+from league.results.records import GAMES_PER_BLOCK, Game, Match, Schedule
+from league.results.scoring import scores
 
 
 def admit(match: Match, schedule: Schedule) -> None:
@@ -21,25 +22,29 @@ def admit(match: Match, schedule: Schedule) -> None:
     for name, value in expected.items():
         if getattr(match, name) != value:
             raise _refusal(match, f"its {name} is {getattr(match, name)!r}, but {value!r} in its schedule")
-    if len(match.games) != len(schedule.sides):
-        raise _refusal(match, f"it has {len(match.games)} games, expected one for each of {len(schedule.sides)} sides")
+    if len(match.games) != GAMES_PER_BLOCK:
+        raise _refusal(match, f"it has {len(match.games)} games, expected {GAMES_PER_BLOCK}")
     for index, game in enumerate(match.games):
         _admit_game(match, schedule, index, game)
+    for index, expected_scores in enumerate(scores([game.returns for game in match.games], schedule.scoring)):
+        if match.games[index].scores != expected_scores:
+            given = match.games[index].scores
+            raise _refusal(match, f"game {index} has the scores {given}, but its returns say {expected_scores}")
 
 
 def _admit_game(match: Match, schedule: Schedule, index: int, game: Game) -> None:
-    if game.sides != rotation(len(schedule.sides), index):
-        raise _refusal(match, f"game {index} has its sides played by {game.sides}, not in rotation")
+    seating = schedule.seating_at(match.position, index)
+    if game.sides != seating:
+        raise _refusal(match, f"game {index} has its sides played by {game.sides}, expected {seating}")
     if game.seed != match.seed:
         raise _refusal(match, f"game {index} has the seed {game.seed}, not the block's")
-    if len(game.opening) != schedule.opening_plies or game.opening != match.games[0].opening:
-        raise _refusal(match, f"game {index} has another opening than the block's {schedule.opening_plies} moves")
-    contestants = len(match.contestants)
-    if len(game.returns) != contestants or not all(math.isfinite(value) for value in game.returns):
-        raise _refusal(match, f"game {index} needs a finite return of each contestant, not {game.returns}")
-    points = len(game.scores) == contestants and all(0 <= score <= 1 for score in game.scores)
-    if not points or not math.isclose(sum(game.scores), contestants / 2):
-        raise _refusal(match, f"game {index} needs scores that share its points, not {game.scores}")
+    # A step has an action of each agent that must act: one in turn-based games, several in simultaneous ones.
+    is_whole = len(game.opening) >= schedule.opening_plies and bool(game.opening) == bool(schedule.opening_plies)
+    if not is_whole or game.opening != match.games[0].opening:
+        raise _refusal(match, f"game {index} has another opening than the block's {schedule.opening_plies} steps")
+    finite = [value is not None and math.isfinite(value) for value in game.returns]
+    if finite != [contestant in seating for contestant in range(len(match.contestants))]:
+        raise _refusal(match, f"game {index} needs a finite return of each contestant that played, not {game.returns}")
 
 
 def _refusal(match: Match, reason: str) -> LedgerRefusal:

@@ -76,6 +76,17 @@ class Ledger:
             found = session.execute(query)
             return [schedules[of].match(position, load_games(moves)) for of, position, moves in found]
 
+    def match(self, match: str) -> Match:
+        """One match by its id. Raises NotFound."""
+        name, _, position = match.rpartition("/")
+        with self._database.read() as session:
+            schedule = _schedule(session, name)
+            query = select(tables.Match.moves).filter_by(schedule=name)
+            moves = session.scalar(query.filter_by(position=int(position))) if position.isdecimal() else None
+            if moves is None:
+                raise NotFound(f"schedule {name} has no match {position!r}")
+            return schedule.match(int(position), load_games(moves))
+
     def positions(self, schedule: str) -> set[int]:
         """Which positions of a schedule were played."""
         with self._database.read() as session:
@@ -126,13 +137,13 @@ def _in_order(query: Select[*Columns], league: str) -> Select[*Columns]:
 
 
 def _row(match: Match) -> dict[str, Any]:
-    contestants = range(len(match.contestants))
+    result = match.result()
     return {
         "schedule": match.schedule,
         "position": match.position,
-        "games": len(match.games),
-        "scores": dump_numbers([sum(game.scores[c] for game in match.games) for c in contestants]),
-        "returns": dump_numbers([sum(game.returns[c] for game in match.games) for c in contestants]),
+        "games": result.games,
+        "scores": dump_numbers(result.scores),
+        "returns": dump_numbers(result.returns),
         "moves": dump_games(match.games),
         "played_at": datetime.now(UTC),
     }

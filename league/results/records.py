@@ -1,17 +1,23 @@
 """What was asked to be played and what was played, as plain data.
 
-A *schedule* lists pairings in order. A *match* is one block of its games, in which the contestants rotate through the
-sides, from one seed and one opening. Position i of a schedule is match `"<schedule>/<i>"`, always.
+A *schedule* lists pairings of two contestants in order. A *match* is one block: two games from one seed and one
+opening, in which the two change places. Position i of a schedule is match `"<schedule>/<i>"`, always.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from league.seeds import derive
 
 Action = Any
-"""An action as JSON: an integer, or a list of numbers."""
+"""An action as JSON: an integer, or a list (of lists) of numbers, in which a float32 is the double of its value."""
+
+Scoring = Literal["game", "side"]
+"""Whom a contestant is compared with: its opponent in the same `game`, or its opponent on the same `side` in the other
+game of the block. See scoring.py."""
+
+GAMES_PER_BLOCK = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +41,8 @@ class Schedule:
     length: int
     """Number of matches at most."""
     opening_plies: int
+    """Random steps of the environment at the start of each game."""
+    scoring: Scoring = "game"
 
     def contestants_at(self, position: int) -> tuple[str, ...]:
         """Who plays match `position`."""
@@ -43,6 +51,18 @@ class Schedule:
     def seed_at(self, position: int) -> int:
         """The seed of match `position`."""
         return derive(self.seed, position)
+
+    def seat_at(self, position: int) -> int:
+        """The side that one contestant has to itself in each game of match `position`, and the other all others.
+
+        It goes round with the rounds of the schedule. With two sides both games of a block have it, whichever it is.
+        """
+        return position // len(self.pairings) % len(self.sides) if len(self.sides) > 2 else 0
+
+    def seating_at(self, position: int, game: int) -> tuple[int, ...]:
+        """Who controls each side in a game of match `position`: contestant 0 has the seat in game 0, 1 in game 1."""
+        seat = self.seat_at(position)
+        return tuple(game if side == seat else 1 - game for side in range(len(self.sides)))
 
     def match_id(self, position: int) -> str:
         """The id of match `position`."""
@@ -67,17 +87,33 @@ class Game:
     """One game of a block.
 
     sides[s] is the contestant (an index into the match's) that controlled side s.
-    opening and actions hold every action in the order in which the environment asked for them, so that stepping a
-    fresh environment from `seed` with them plays the same game again.
-    returns[c] is contestant c's mean return over the agents of its side; scores[c] is 1, ½ or 0.
+    opening and actions hold every action, step by step and within a step by the agents' order in the environment, so
+    that stepping a fresh environment from `seed` with them plays the same game again.
+    returns[c] is contestant c's return, the mean over the agents of a side and then over its sides; scores[c] is 1, ½
+    or 0. Both are None for a contestant that took no part: where there is one side, each plays a game alone.
     """
 
     sides: tuple[int, ...]
     seed: int
     opening: tuple[Action, ...]
     actions: tuple[Action, ...]
-    returns: tuple[float, ...]
+    returns: tuple[float | None, ...]
+    scores: tuple[float | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BlockResult:
+    """A match without its moves: what ratings and payoffs are made of.
+
+    games: how many each contestant took part in. scores and returns are sums over those.
+    """
+
+    schedule: str
+    position: int
+    contestants: tuple[str, ...]
+    games: int
     scores: tuple[float, ...]
+    returns: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,26 +130,25 @@ class Match:
     games: tuple[Game, ...]
 
     def score(self, contestant: int) -> float:
-        """Mean score of a contestant (by index) over the block's games, in [0, 1]."""
-        return sum(game.scores[contestant] for game in self.games) / len(self.games)
+        """Mean score of a contestant (by index) over its games, in [0, 1]."""
+        result = self.result()
+        return result.scores[contestant] / result.games
 
     def mean_return(self, contestant: int) -> float:
-        """Mean return of a contestant (by index) over the block's games."""
-        return sum(game.returns[contestant] for game in self.games) / len(self.games)
+        """Mean return of a contestant (by index) over its games."""
+        result = self.result()
+        return result.returns[contestant] / result.games
 
-
-def rotation(sides: int, game: int) -> tuple[int, ...]:
-    """Which contestant controls each side in game `game` of a block: cyclic, game 0 in the contestants' order."""
-    return tuple((side - game) % sides for side in range(sides))
-
-
-@dataclass(frozen=True, slots=True)
-class BlockResult:
-    """A match without its moves: what ratings and payoffs are made of. Values are sums over the block's games."""
-
-    schedule: str
-    position: int
-    contestants: tuple[str, ...]
-    games: int
-    scores: tuple[float, ...]
-    returns: tuple[float, ...]
+    def result(self) -> BlockResult:
+        """The match without its moves."""
+        contestants = range(len(self.contestants))
+        scores = [[game.scores[c] for game in self.games] for c in contestants]
+        returns = [[game.returns[c] for game in self.games] for c in contestants]
+        return BlockResult(
+            schedule=self.schedule,
+            position=self.position,
+            contestants=self.contestants,
+            games=sum(score is not None for score in scores[0]),
+            scores=tuple(sum(score for score in own if score is not None) for own in scores),
+            returns=tuple(sum(value for value in own if value is not None) for own in returns),
+        )

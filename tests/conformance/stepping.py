@@ -1,64 +1,135 @@
-"""The contract of batched stepping: n copies in lockstep give each agent what the PettingZoo loop gives it."""
+"""The contract of batched stepping: n copies in lockstep give each agent what its API's plain loop gives it.
+
+Environments are PettingZoo's AEC or Parallel, or RLlib's MultiAgentEnv. The plain loops are written as their own
+documentation writes them, and know nothing of the stepping.
+"""
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import gymnasium
 import numpy as np
-from pettingzoo import AECEnv
+from pettingzoo import AECEnv, ParallelEnv
 
+from league.environments.building import action_space, observation_space
 from league.environments.stepping import BatchedEnvironment, Episode, Turn
 from league.seeds import generator
 from league.spaces import ACTION_MASK, from_gymnasium, tensors
 
 Report = tuple[str, dict[str, Any], float, bool, bool]
 """(agent, observation, reward, terminated, truncated), in the order of an agent's own turns."""
+Reports = dict[str, list[Report]]
 
 
-def draw(seed: int, ply: int, n: int, mask: np.ndarray | None) -> int:
-    """A random legal action that depends on the episode and the move alone."""
-    legal = np.arange(n) if mask is None else np.flatnonzero(mask)
-    return int(generator(seed, ply).choice(legal))
+def draw(space: gymnasium.Space, seed: int, agent: int, turn: int, mask: np.ndarray | None) -> Any:
+    """A random legal action that depends on the episode, the agent and its turn alone."""
+    rng = generator(seed, agent, turn)
+    if isinstance(space, gymnasium.spaces.Discrete):
+        legal = np.arange(space.n) if mask is None else np.flatnonzero(mask)
+        return int(rng.choice(legal)) + int(space.start)
+    if isinstance(space, gymnasium.spaces.MultiDiscrete):
+        return rng.integers(space.start, space.start + space.nvec)
+    assert isinstance(space, gymnasium.spaces.Box), space
+    return rng.uniform(np.maximum(space.low, -2), np.minimum(space.high, 2)).astype(space.dtype)
 
 
-def plain_loop(env: AECEnv, seed: int) -> dict[str, list[Report]]:
-    """What PettingZoo's own loop reports to each agent over one episode."""
-    reports: dict[str, list[Report]] = defaultdict(list)
-    turns: dict[str, int] = defaultdict(int)
-    env.reset(seed=seed)
-    for agent in env.agent_iter():
-        value, reward, terminated, truncated, _ = env.last()
-        arrays = tensors(from_gymnasium(env.observation_space(agent)), value)
-        copied = {name: np.array(array) for name, array in arrays.items()}
-        reports[agent].append((agent, copied, reward, terminated, truncated))
-        action = None
-        if not (terminated or truncated):
-            key = env.possible_agents.index(agent) * 1000 + turns[agent]
-            action = draw(seed, key, int(env.action_space(agent).n), copied.get(ACTION_MASK))
-            turns[agent] += 1
-        env.step(action)
+def plain_loop(env: Any, seed: int) -> Reports:
+    """What the API's own loop reports to each agent over one episode."""
+    reports: Reports = defaultdict(list)
+    if isinstance(env, AECEnv):
+        _agent_iter(env, seed, reports)
+    elif isinstance(env, ParallelEnv):
+        _all_at_once(env, seed, reports)
+    else:
+        _multi_agent(env, seed, reports)
     return reports
 
 
+def _agent_iter(env: AECEnv, seed: int, reports: Reports) -> None:
+    env.reset(seed=seed)
+    for agent in env.agent_iter():
+        value, reward, terminated, truncated, _ = env.last()
+        _report(env, reports, agent, value, reward, terminated, truncated)
+        env.step(None if terminated or truncated else _answer(env, seed, agent, reports))
+
+
+def _all_at_once(env: ParallelEnv, seed: int, reports: Reports) -> None:
+    observations, _ = env.reset(seed=seed)
+    for agent, value in observations.items():
+        _report(env, reports, agent, value, 0.0, False, False)
+    while env.agents:
+        actions = {agent: _answer(env, seed, agent, reports) for agent in env.agents}
+        observations, rewards, terminated, truncated, _ = env.step(actions)
+        for agent, value in observations.items():
+            _report(env, reports, agent, value, rewards.get(agent, 0.0), terminated[agent], truncated[agent])
+
+
+def _multi_agent(env: Any, seed: int, reports: Reports) -> None:
+    observations, _ = env.reset(seed=seed)
+    owed: dict[str, float] = defaultdict(float)
+    living = set(observations)
+    for agent, value in observations.items():
+        _report(env, reports, agent, value, 0.0, False, False)
+    while True:
+        observations, rewards, terminated, truncated, _ = env.step(
+            {agent: _answer(env, seed, agent, reports) for agent in observations if agent in living}
+        )
+        for agent, reward in rewards.items():
+            owed[agent] += reward
+        living |= set(observations)
+        everybody = (terminated["__all__"], truncated["__all__"])
+        for agent in sorted(living):
+            own = (terminated.get(agent, False), truncated.get(agent, False))
+            flags = own if any(own) else everybody
+            if agent in observations:
+                _report(env, reports, agent, observations[agent], owed.pop(agent, 0.0), *flags)
+            elif any(flags):
+                last = reports[agent][-1][1]
+                reports[agent].append((agent, last, owed.pop(agent, 0.0), *flags))
+            if any(flags):
+                living.discard(agent)
+        if any(everybody):
+            return
+
+
+def _report(
+    env: Any, reports: Reports, agent: str, value: Any, reward: float, terminated: bool, truncated: bool
+) -> None:
+    arrays = tensors(from_gymnasium(observation_space(env, agent)), value)
+    copied = {name: np.array(array) for name, array in arrays.items()}
+    reports[agent].append((agent, copied, reward, bool(terminated), bool(truncated)))
+
+
+def _answer(env: Any, seed: int, agent: str, reports: Reports) -> Any:
+    mask = reports[agent][-1][1].get(ACTION_MASK)
+    return draw(action_space(env, agent), seed, env.possible_agents.index(agent), len(reports[agent]) - 1, mask)
+
+
 def lockstep(
-    make: Callable[[int], BatchedEnvironment], env: AECEnv, seeds: list[int], copies: int
-) -> dict[int, dict[str, list[Report]]]:
-    """What the batched environment reports to each agent of each episode; episodes queue for the copies."""
-    batched, queue = make(copies), list(seeds)
-    reports: dict[int, dict[str, list[Report]]] = {seed: defaultdict(list) for seed in seeds}
+    batched: BatchedEnvironment, spaces: Mapping[str, gymnasium.Space], seeds: list[int], steps: int | None = None
+) -> dict[int, Reports]:
+    """What the batched environment reports to each agent of each episode; episodes queue for the copies.
+
+    spaces: agent → how it acts. steps: calls of `step` after which to stop; None until all episodes are over.
+    """
+    queue = list(seeds)
+    reports: dict[int, Reports] = {seed: defaultdict(list) for seed in seeds}
     playing: dict[int, int] = {}
+    starting: dict[int, int | None] = {}
 
     def next_episode(copy: int) -> Episode | None:
         starting[copy] = queue.pop(0) if queue else None
         seed = starting[copy]
         return None if seed is None else Episode(seed, batched.agents)
 
-    starting: dict[int, int | None] = {}
     turn = batched.start(next_episode)
+    taken = 0
     while True:
         _read_endings(turn, batched, playing, reports)
         playing.update({copy: seed for copy, seed in starting.items() if seed is not None})
-        if not turn.batches:
+        starting.clear()
+        if not turn.batches or taken == steps:
             return reports
         actions = {}
         for group, batch in turn.batches.items():
@@ -68,15 +139,15 @@ def lockstep(
                 assert group == agent, "a row is in the batch of another group"
                 arrays = {name: array[row] for name, array in batch.observations.items()}
                 own = reports[playing[copy]][agent]
-                n = int(env.action_space(agent).n)
-                chosen.append(draw(playing[copy], index * 1000 + len(own), n, arrays.get(ACTION_MASK)))
+                chosen.append(draw(spaces[agent], playing[copy], index, len(own), arrays.get(ACTION_MASK)))
                 own.append((agent, arrays, batch.rewards[row], False, False))
             actions[group] = np.array(chosen)
         turn = batched.step(actions)
+        taken += 1
 
 
 def _read_endings(
-    turn: Turn, batched: BatchedEnvironment, playing: dict[int, int], reports: dict[int, dict[str, list[Report]]]
+    turn: Turn, batched: BatchedEnvironment, playing: dict[int, int], reports: dict[int, Reports]
 ) -> None:
     for ending in turn.endings:
         agent = batched.agents[ending.agent]
@@ -85,18 +156,24 @@ def _read_endings(
 
 
 def assert_stepping_conforms(
-    make: Callable[[int], BatchedEnvironment], env: AECEnv, seeds: list[int], copies: int
+    make: Callable[[int], BatchedEnvironment], stock: Callable[[], Any], seeds: list[int], copies: int
 ) -> None:
-    """Play `seeds` in `copies` copies at once and one by one in PettingZoo's loop, and compare every report."""
-    batched = lockstep(make, env, seeds, copies)
+    """Compare every report of `seeds`, played in `copies` copies, with the plain loop of a fresh `stock()` for each."""
+    env = stock()
+    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    batched = lockstep(make(copies), spaces, seeds)
     for seed in seeds:
-        alone = plain_loop(env, seed)
-        assert set(batched[seed]) == set(alone)
-        for agent, expected in alone.items():
-            actual = batched[seed][agent]
-            assert len(actual) == len(expected), f"{agent} has {len(actual)} reports, expected {len(expected)}"
-            for mine, theirs in zip(actual, expected, strict=True):
-                assert mine[2:] == theirs[2:]
-                for name, array in theirs[1].items():
-                    np.testing.assert_array_equal(mine[1][name], array)
-                    assert mine[1][name].dtype == array.dtype
+        assert_same_episode(batched[seed], plain_loop(stock(), seed))
+
+
+def assert_same_episode(actual: Reports, expected: Reports) -> None:
+    """Each agent has the same reports, in the same order, down to the dtype."""
+    assert set(actual) == set(expected)
+    for agent, theirs in expected.items():
+        own = actual[agent]
+        assert len(own) == len(theirs), f"{agent} has {len(own)} reports, expected {len(theirs)}"
+        for mine, other in zip(own, theirs, strict=True):
+            assert mine[2:] == other[2:]
+            for name, array in other[1].items():
+                np.testing.assert_array_equal(mine[1][name], array)
+                assert mine[1][name].dtype == array.dtype

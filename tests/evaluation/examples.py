@@ -1,22 +1,27 @@
-"""Checkpoint versions of tic-tac-toe whose strength is known: small graphs, put together by hand.
+"""Checkpoint versions that no training has made: small graphs, put together by hand.
 
-A graph sees, on each of the eight lines, whether its own side or the opponent has two marks there, and prefers the
-squares of such lines over a fixed order of squares. `wins` and `blocks` say which of the two it heeds.
+Those of tic-tac-toe have a known strength. A graph sees, on each of the eight lines, whether its own side or the
+opponent has two marks there, and prefers the squares of such lines over a fixed order of squares. `wins` and `blocks`
+say which of the two it heeds.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from onnx import TensorProto, helper, numpy_helper
+import onnx
+from numpy.typing import NDArray
+from onnx import NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
 
 from league.config import LeagueConfig
 from league.environments.building import interface
+from league.interface import AgentInterface
 from league.registry.manifest import Manifest, Parity, PolicyManifest, Tensor
 from league.registry.registry import Registry
-from league.registry.rows import VersionRow
+from league.registry.rows import LeagueRow, VersionRow
 from league.settings import Storage
+from league.spaces import OBSERVATION, Box, Discrete, inputs
 
 LEAGUE = "tictactoe"
 LINES = ((0, 1, 2), (3, 4, 5), (6, 7, 8), (0, 3, 6), (1, 4, 7), (2, 5, 8), (0, 4, 8), (2, 4, 6))
@@ -42,9 +47,82 @@ def registry(home: Path, **parts: object) -> Registry:
     return opened
 
 
-def publish(registry: Registry, graph: bytes) -> VersionRow:
-    number = len(registry.versions(LEAGUE))
-    return registry.publish(LEAGUE, _builder(registry, graph), source=f"hand/{number}", parent=None)
+def publish(registry: Registry, graph: bytes, league: str = LEAGUE) -> VersionRow:
+    """One graph for all policies of the league."""
+    number = len(registry.versions(league))
+    return registry.publish(league, _builder(registry.league(league), graph), source=f"hand/{number}", parent=None)
+
+
+def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: NDArray | None = None) -> bytes:
+    """A graph for observations that are one vector: a linear map to the inputs of the distribution.
+
+    chosen: its weights, (observations, inputs); else they are random, and there is a random bias.
+    memory: the graph counts its steps, in its state, and its preferences turn with them.
+    """
+    rng, width, outputs = np.random.default_rng(seed), inputs(spaces.observation)[OBSERVATION].shape[0], _logits(spaces)
+    weights = {
+        "weights": (rng.normal(size=(width, outputs)) if chosen is None else chosen).astype(np.float32),
+        "bias": (rng.normal(size=outputs) if chosen is None else np.zeros(outputs)).astype(np.float32),
+        "one": np.array(1, np.float32),
+        "rates": np.arange(1, outputs + 1, dtype=np.float32)[None],
+        "strength": np.array(20, np.float32),
+    }
+    taken, given = [_info(OBSERVATION, TensorProto.FLOAT, width)], []
+    nodes = [
+        helper.make_node("MatMul", [OBSERVATION, "weights"], ["seen"]),
+        helper.make_node("Add", ["seen", "bias"], ["steady"]),
+    ]
+    if memory:
+        taken.append(_info("state_in_0", TensorProto.FLOAT, 1))
+        given.append(_info("state_out_0", TensorProto.FLOAT, 1))
+        nodes += [
+            helper.make_node("Add", ["state_in_0", "one"], ["state_out_0"]),
+            helper.make_node("MatMul", ["state_in_0", "rates"], ["angles"]),
+            helper.make_node("Sin", ["angles"], ["turned"]),
+            helper.make_node("Mul", ["turned", "strength"], ["turning"]),
+            helper.make_node("Add", ["steady", "turning"], ["preferred"]),
+        ]
+    else:
+        nodes.append(helper.make_node("Identity", ["steady"], ["preferred"]))
+    if isinstance(spaces.action, Box):
+        low, high = float(spaces.action.low), float(spaces.action.high)
+        weights |= {"low": np.array(low, np.float32), "span": np.array(high - low, np.float32)}
+        nodes += [
+            helper.make_node("Sigmoid", ["preferred"], ["share"]),
+            helper.make_node("Mul", ["share", "span"], ["above"]),
+            helper.make_node("Add", ["above", "low"], ["action"]),
+            helper.make_node("Concat", ["preferred", "preferred"], ["action_dist_inputs"], axis=1),
+        ]
+        given = [_info("action", TensorProto.FLOAT, outputs), _info("action_dist_inputs", 1, 2 * outputs), *given]
+    else:
+        nodes += [
+            helper.make_node("Identity", ["preferred"], ["action_dist_inputs"]),
+            helper.make_node("ArgMax", ["preferred"], ["action"], axis=1, keepdims=0),
+        ]
+        given = [_info("action", TensorProto.INT64), _info("action_dist_inputs", 1, outputs), *given]
+    return _model(nodes, taken, given, weights)
+
+
+def chasing(spaces: AgentInterface) -> bytes:
+    """A graph for mpe2.simple: it steers to the landmark. Observed are velocity and the way there, (x, y) each."""
+    towards = np.zeros((4, 5))
+    for axis in (0, 1):
+        towards[2 + axis, [1 + 2 * axis, 2 + 2 * axis]] = -1.0, 1.0
+        towards[axis, [1 + 2 * axis, 2 + 2 * axis]] = 0.4, -0.4
+    return linear(spaces, chosen=towards)
+
+
+def _logits(spaces: AgentInterface) -> int:
+    match spaces.action:
+        case Discrete(n=n):
+            return n
+        case Box(shape=(m,)):
+            return m
+    raise AssertionError(f"no linear graph for {spaces.action}")
+
+
+def _info(name: str, dtype: int, *shape: int) -> ValueInfoProto:
+    return helper.make_tensor_value_info(name, dtype, ["batch", *shape])
 
 
 def graph(wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDGES_FIRST) -> bytes:
@@ -76,49 +154,44 @@ def graph(wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDG
         helper.make_node("Where", ["legal", "wanted", "illegal"], ["action_dist_inputs"]),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    body = helper.make_graph(
-        nodes,
-        "by_hand",
-        [
-            helper.make_tensor_value_info("observation", TensorProto.INT8, ["batch", 3, 3, 2]),
-            helper.make_tensor_value_info("action_mask", TensorProto.INT8, ["batch", 9]),
-        ],
-        [
-            helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
-            helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 9]),
-        ],
-        [numpy_helper.from_array(value, name) for name, value in weights.items()],
-    )
+    taken = [_info("observation", TensorProto.INT8, 3, 3, 2), _info("action_mask", TensorProto.INT8, 9)]
+    given = [_info("action", TensorProto.INT64), _info("action_dist_inputs", TensorProto.FLOAT, 9)]
+    return _model(nodes, taken, given, weights)
+
+
+def _model(
+    nodes: Sequence[NodeProto],
+    taken: Sequence[ValueInfoProto],
+    given: Sequence[ValueInfoProto],
+    weights: Mapping[str, NDArray],
+) -> bytes:
+    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    body = helper.make_graph(nodes, "by_hand", taken, given, tensors)
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     return bytes(model.SerializeToString())
 
 
-def _builder(registry: Registry, graph: bytes) -> Callable[[Path, int], Manifest]:
-    row = registry.league(LEAGUE)
-    spaces = row.interface.of_policy("shared")
-
+def _builder(row: LeagueRow, graph: bytes) -> Callable[[Path, int], Manifest]:
     def build(directory: Path, number: int) -> Manifest:
-        (directory / "shared.onnx").write_bytes(graph)
-        policy = PolicyManifest(
-            file="shared.onnx",
-            observation=spaces.observation,
-            action=spaces.action,
-            inputs=(
-                Tensor(name="observation", dtype="int8", shape=(None, 3, 3, 2)),
-                Tensor(name="action_mask", dtype="int8", shape=(None, 9)),
-            ),
-            outputs=(
-                Tensor(name="action", dtype="int64", shape=(None,)),
-                Tensor(name="action_dist_inputs", dtype="float32", shape=(None, 9)),
-            ),
-            parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
-        )
+        policies = {}
+        for name in row.interface.policy_ids:
+            (directory / f"{name}.onnx").write_bytes(graph)
+            spaces = row.interface.of_policy(name)
+            policies[name] = PolicyManifest(
+                file=f"{name}.onnx",
+                observation=spaces.observation,
+                action=spaces.action,
+                inputs=_tensors(graph, "input"),
+                outputs=_tensors(graph, "output"),
+                state=tuple(tensor for tensor in _tensors(graph, "input") if tensor.name.startswith("state_in_")),
+                parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
+            )
         return Manifest(
-            league=LEAGUE,
+            league=row.slug,
             version=number,
             created_at=datetime.now(UTC),
             interface=row.interface,
-            policies={"shared": policy},
+            policies=policies,
             environment=row.config.environment,
             environment_digest=row.environment_digest,
             algorithm="ppo",
@@ -129,3 +202,15 @@ def _builder(registry: Registry, graph: bytes) -> Callable[[Path, int], Manifest
         )
 
     return build
+
+
+def _tensors(graph: bytes, kind: str) -> tuple[Tensor, ...]:
+    body = onnx.load_model_from_string(graph).graph
+    return tuple(
+        Tensor(
+            name=node.name,
+            dtype=helper.tensor_dtype_to_np_dtype(node.type.tensor_type.elem_type).name,
+            shape=(None, *(axis.dim_value for axis in node.type.tensor_type.shape.dim[1:])),
+        )
+        for node in (body.input if kind == "input" else body.output)
+    )

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from evaluation.gate import Watch, decide, distinct_games, judge
 from evaluation.sequential import bounds, elo_estimate, expected_games, gsprt_llr
 from league.config import GateConfig
-from league.results.records import Game, Match, rotation
+from league.results.records import Game, Match
 
 GATE = GateConfig(elo0=0, elo1=60, max_blocks=400)
 block_scores = st.lists(st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]), max_size=120)
@@ -23,9 +23,7 @@ EQUALS = {"fair": (0.25, 0.0, 0.5, 0.0, 0.25), "first mover wins": (0.08, 0.06, 
 
 def match(position: int, points: Sequence[float], moves: Sequence[int] = (0,)) -> Match:
     """A block of two games with the challenger's points in each."""
-    games = tuple(
-        Game(rotation(2, i), 1, (position,), tuple(moves), (p, 1 - p), (p, 1 - p)) for i, p in enumerate(points)
-    )
+    games = tuple(Game((i, 1 - i), 1, (position,), tuple(moves), (p, 1 - p), (p, 1 - p)) for i, p in enumerate(points))
     return Match(f"s/{position}", "league", "s", position, ("league@2", "league@1"), 1, "digest", games)
 
 
@@ -63,7 +61,7 @@ def test_without_blocks_it_is_open() -> None:
 
 
 def test_single_games_are_trinomial() -> None:
-    decision = decide(GATE, [1.0, 0.5, 0.0, 1.0], games_per_block=1)
+    decision = decide(GATE, [1.0, 0.5, 0.0, 1.0], comparisons=1)
     assert decision.counts == (1, 1, 2)
     assert decision.llr == pytest.approx(gsprt_llr((1, 1, 2), 0, 60, "normalized"), abs=1e-9)
 

@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.match import plan, scores
+from evaluation.match import plan
 from evaluation.schedule import round_robin
 from league.environments.building import interface
 from tests.evaluation.examples import config
@@ -11,30 +13,33 @@ SCHEDULE = round_robin(config(), interface(config()), ["tictactoe@1", "tictactoe
 
 
 @given(st.integers(0, SCHEDULE.length - 1))
-def test_everybody_plays_every_side_once_from_one_seed(position: int) -> None:
+def test_both_play_every_side_once_from_one_seed(position: int) -> None:
     games = plan(SCHEDULE, position)
     assert [game.sides for game in games] == [(0, 1), (1, 0)]
     assert {game.seed for game in games} == {SCHEDULE.seed_at(position)}
     assert {game.contestants for game in games} == {SCHEDULE.contestants_at(position)}
 
 
+@given(st.integers(1, 7), st.integers(0, SCHEDULE.length - 1))
+def test_a_block_is_the_same_when_the_contestants_change_places(sides: int, position: int) -> None:
+    """Game 1 is game 0 with the contestants exchanged, so whatever a seat is worth both get it."""
+    schedule = replace(SCHEDULE, sides=tuple(f"side_{i}" for i in range(sides)))
+    first, second = plan(schedule, position)
+    assert second.sides == tuple(1 - contestant for contestant in first.sides)
+    assert first.sides.count(0) == 1
+    assert first.sides.index(0) == schedule.seat_at(position)
+
+
+@pytest.mark.parametrize("sides", [1, 3, 5])
+def test_the_seat_goes_round_with_the_rounds(sides: int) -> None:
+    schedule = replace(SCHEDULE, sides=tuple(f"side_{i}" for i in range(sides)))
+    rounds = [[schedule.seat_at(3 * turn + pairing) for pairing in range(3)] for turn in range(10)]
+    assert rounds == [[turn % sides] * 3 for turn in range(10)]
+
+
 def test_openings_are_the_blocks_and_draws_of_policies_the_games_own() -> None:
     first, second = plan(SCHEDULE, 0)
-    assert first.opening(0).random() == second.opening(0).random()
-    streams = [game.policy(side) for game in (first, second) for side in (0, 1)]
-    draws = {stream.random() for stream in [*streams, first.opening(0), first.opening(1)]}
-    assert len(draws) == 6
-
-
-@pytest.mark.parametrize(
-    ("returns", "expected"),
-    [
-        ((1.0, -1.0), (1.0, 0.0)),
-        ((0.0, 0.0), (0.5, 0.5)),
-        ((3.0, 5.0), (0.0, 1.0)),
-        ((1.0, 2.0, 3.0), (0.0, 0.5, 1.0)),
-        ((1.0, 1.0, 0.0), (0.75, 0.75, 0.0)),
-    ],
-)
-def test_scores_go_by_returns(returns: tuple[float, ...], expected: tuple[float, ...]) -> None:
-    assert scores(returns) == expected
+    assert first.opening(0, 1).random() == second.opening(0, 1).random()
+    streams = [game.policy(agent) for game in (first, second) for agent in (0, 1)]
+    streams += [first.opening(attempt, agent) for attempt in (0, 1) for agent in (0, 1)]
+    assert len({stream.random() for stream in streams}) == 8

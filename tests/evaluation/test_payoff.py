@@ -1,12 +1,12 @@
 from evaluation.payoff import tabulate
-from league.results.records import Game, Match, rotation
+from league.results.records import Game, Match
 
 SIDES = ("first", "second")
 
 
 def match(contestants: tuple[str, str], points: tuple[float, float]) -> Match:
     """A block with the first contestant's points in its two games."""
-    games = tuple(Game(rotation(2, i), 1, (), (), (p, -p), (p, 1 - p)) for i, p in enumerate(points))
+    games = tuple(Game((i, 1 - i), 1, (), (), (p, -p), (p, 1 - p)) for i, p in enumerate(points))
     return Match("s/0", "league", "s", 0, contestants, 1, "digest", games)
 
 

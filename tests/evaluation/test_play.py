@@ -7,8 +7,8 @@ import pytest
 from evaluation.play import Roster, play
 from evaluation.replay import replay
 from evaluation.schedule import round_robin
-from league.environments.aec import AECStepping
 from league.environments.building import interface
+from league.environments.lockstep import stepping
 from league.errors import EnvironmentMismatch, GameHung, IllegalAction
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
@@ -39,7 +39,7 @@ def schedule(blocks: int = 4, plies: int = 2, contestants: Sequence[str] = CONTE
 
 
 def played(schedule: Schedule, copies: int = 8, positions: Sequence[int] | None = None) -> list[Match]:
-    environment = AECStepping(CONFIG.environment, copies)
+    environment = stepping(CONFIG.environment, copies)
     return play(schedule, range(schedule.length) if positions is None else positions, environment, INTERFACE, roster())
 
 
@@ -105,8 +105,8 @@ def test_returns_belong_to_contestants_whatever_their_side() -> None:
 def test_recorded_games_replay() -> None:
     for match in played(schedule()):
         for index, game in enumerate(match.games):
-            moments = list(replay(CONFIG, INTERFACE, match, index))
-            assert [m.action for m in moments if m.action is not None] == [*game.opening, *game.actions]
+            moments = list(replay(stepping(CONFIG.environment, 1), CONFIG, INTERFACE, match, index))
+            assert [move.action for m in moments for move in m.moves] == [*game.opening, *game.actions]
 
 
 @pytest.mark.parametrize("change", ["returns", "shorter", "longer", "illegal", "environment"])
@@ -123,7 +123,7 @@ def test_a_record_that_does_not_replay_is_refused(change: str) -> None:
     digest = "another" if change == "environment" else match.environment_digest
     record = replace(match, games=(forged, match.games[1]), environment_digest=digest)
     with pytest.raises(EnvironmentMismatch):
-        list(replay(CONFIG, INTERFACE, record, 0))
+        list(replay(stepping(CONFIG.environment, 1), CONFIG, INTERFACE, record, 0))
 
 
 class Stubborn:
@@ -140,19 +140,6 @@ class Stubborn:
         return Actions(np.zeros(len(observations["action_mask"]), np.int64))
 
 
-class Recurrent(Stubborn):
-    def act(
-        self,
-        observations: Arrays,
-        *,
-        state: Arrays | None = None,
-        explore: bool = False,
-        rng: Sequence[np.random.Generator] | None = None,
-    ) -> Actions:
-        answer = super().act(observations, state=state, explore=explore, rng=rng)
-        return replace(answer, state={"state_in_0": np.zeros(1)})
-
-
 def with_stubborn(policy: Policy) -> Roster:
     return {**roster(), "tictactoe@9": dict.fromkeys(INTERFACE.agents, ("shared", policy))}
 
@@ -160,13 +147,7 @@ def with_stubborn(policy: Policy) -> Roster:
 def test_an_illegal_action_names_its_contestant() -> None:
     order = schedule(contestants=["script:one_ply", "tictactoe@9"])
     with pytest.raises(IllegalAction, match=r"tictactoe@9: .*illegal"):
-        play(order, [0, 1], AECStepping(CONFIG.environment, 4), INTERFACE, with_stubborn(Stubborn()))
-
-
-def test_a_recurrent_policy_is_refused() -> None:
-    order = schedule(contestants=["script:one_ply", "tictactoe@9"])
-    with pytest.raises(EnvironmentMismatch, match="tictactoe@9 has a recurrent policy"):
-        play(order, [0], AECStepping(CONFIG.environment, 2), INTERFACE, with_stubborn(Recurrent()))
+        play(order, [0, 1], stepping(CONFIG.environment, 4), INTERFACE, with_stubborn(Stubborn()))
 
 
 def test_a_game_that_does_not_end_is_a_fault() -> None:
@@ -174,7 +155,7 @@ def test_a_game_that_does_not_end_is_a_fault() -> None:
         play(
             schedule(contestants=["script:random", "script:one_ply"]),
             [0],
-            AECStepping(CONFIG.environment, 2),
+            stepping(CONFIG.environment, 2),
             INTERFACE,
             roster(),
             max_moves=4,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.schedule import gauntlet, round_robin, verdict
+from evaluation.schedule import gauntlet, round_robin, scoring, verdict
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import EnvironmentMismatch
@@ -82,7 +82,26 @@ def test_one_contestant_alone_has_no_schedule() -> None:
         round_robin(CONFIG, INTERFACE, ["tictactoe@1"], 3)
 
 
-def test_a_league_of_one_side_has_no_matches() -> None:
+def test_alike_sides_are_compared_in_the_game_and_others_by_side() -> None:
+    assert round_robin(CONFIG, INTERFACE, ["tictactoe@1", "script:random"], 3).scoring == "game"
     one: LeagueConfig = config(sides={"both": ["player_*"]})
-    with pytest.raises(EnvironmentMismatch, match="1 side"):
-        round_robin(one, interface(one), ["tictactoe@1", "script:random"], 3)
+    assert round_robin(one, interface(one), ["tictactoe@1", "script:random"], 3).scoring == "side"
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "sides", "expected"),
+    [
+        ("mpe2.simple_spread_v3", None, "game"),
+        ("mpe2.simple_spread_v3", {"team": ["*"]}, "side"),
+        ("mpe2.simple_push_v3", None, "side"),
+        ("mpe2.simple_adversary_v3", {"adversary": ["adversary_*"], "good": ["*"]}, "side"),
+        ("mpe2.simple_v3", None, "side"),
+    ],
+)
+def test_sides_are_alike_when_their_agents_have_the_same_spaces(
+    entry_point: str, sides: dict[str, list[str]] | None, expected: str
+) -> None:
+    has_roles = "push" in entry_point or "adversary" in entry_point
+    policies = {"adversary": ["adversary_*"], "good": ["agent_*"]} if has_roles else {"shared": ["*"]}
+    document = {"league": "mpe", "environment": {"entry_point": entry_point}, "policies": policies, "sides": sides}
+    assert scoring(interface(LeagueConfig.from_mapping(document))) == expected

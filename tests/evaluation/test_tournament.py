@@ -100,7 +100,7 @@ def test_a_schedule_of_another_environment_is_refused(registry: Registry) -> Non
 @settings(deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60), st.integers(1, 40))
 def test_chunks_are_aligned_and_cover_what_is_missing(played: int, length: int, copies: int) -> None:
-    chunks = chunks_of(length, played, copies, games=2)
+    chunks = chunks_of(length, played, copies)
     assert [position for chunk in chunks for position in chunk] == list(range(played, length))
     size = tournament.GAMES_PER_COPY * copies // 2
     assert {position // size for chunk in chunks for position in chunk[:1]} == {c.start // size for c in chunks}

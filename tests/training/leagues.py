@@ -5,6 +5,7 @@ from typing import Any
 from league.config import LeagueConfig
 
 COUNTING = "tests.league.environments.counting:counting"
+ENVIRONMENTS = "tests.training.environments"
 
 
 def counting(lives: list[int], truncated: list[int], **training: Any) -> LeagueConfig:
@@ -26,5 +27,29 @@ def tictactoe(**training: Any) -> LeagueConfig:
             "league": "tictactoe",
             "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
             "training": {"runners": 0, "copies": 4, "hidden": [16], "seed": 5} | training,
+        }
+    )
+
+
+def solvable(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
+    """One of `tests.training.environments`, with settings that solve it in a few updates."""
+    settings = {
+        "runners": 0,
+        "copies": 16,
+        "hidden": [32],
+        "seed": 5,
+        "train_batch_size": 1024,
+        "minibatch_size": 128,
+        "epochs": 6,
+        "lr": 0.003,
+        "gamma": 0.9,
+        "entropy": 0.001,
+    }
+    return LeagueConfig.from_mapping(
+        {
+            "league": name,
+            "environment": {"entry_point": f"{ENVIRONMENTS}:{name}", "kwargs": kwargs or {}},
+            "policies": policies or {"shared": ["*"]},
+            "training": settings | training,
         }
     )

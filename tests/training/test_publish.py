@@ -9,12 +9,13 @@ import torch
 
 from league.environments.building import interface
 from league.errors import ParityError
+from league.policies import load
 from league.policies.onnx import OnnxPolicy
 from league.registry.manifest import TRAINING
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.stack import installed
-from tests.training.leagues import tictactoe
+from tests.training.leagues import solvable, tictactoe
 from training import publish as publishing
 from training.publish import Checkpoint, git_commit, load_modules, publish
 from training.trial import build
@@ -75,6 +76,41 @@ def test_a_version_says_all_of_itself_and_acts_as_the_training_state(registry: R
     tensors = {name: torch.from_numpy(array) for name, array in rows.items()}
     expected = module.forward_inference({"obs": tensors})["action_dist_inputs"].argmax(-1)
     assert policy.act(rows).actions.tolist() == expected.tolist()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_a_policy_with_a_memory_is_loaded_with_its_state(tmp_path: Path) -> None:
+    league = solvable("remembering", recurrence={"width": 4}, train_batch_size=128)
+    described = interface(league)
+    algorithm = build(league, described)
+    try:
+        algorithm.save_to_path(str(tmp_path / "0"))
+    finally:
+        algorithm.stop()
+    registry = Registry.open(Storage.at(tmp_path / "home"))
+    registry.register(league, described)
+    try:
+        source = Checkpoint(tmp_path / "0", source="run/0", steps=0)
+        row = publish(source, registry=registry, config=league, interface=described, parent=None, git_commit=None)
+        assert [tensor.name for tensor in row.manifest.policies["shared"].state] == ["state_in_0", "state_in_1"]
+        policy = load(row.ref, registry=registry)
+        batch, state = {"observation": np.array([1, 0])}, None
+        seen = []
+        for _ in range(3):
+            answer = policy.act(batch, state=state, explore=True, rng=[np.random.default_rng(0)] * 2)
+            state = answer.state
+            assert answer.dist_inputs is not None
+            seen.append(answer.dist_inputs)
+        assert not np.array_equal(seen[0], seen[1])
+        module = load_modules(tmp_path / "0", league, described)["shared"]
+        again = {"obs": {"observation": torch.tensor([1, 0])}}
+        before = {key: torch.zeros(2, 4) for key in module.get_initial_state()}
+        for expected in seen:
+            found = module.forward_inference(again | {"state_in": before})
+            np.testing.assert_allclose(found["action_dist_inputs"], expected, atol=1e-6)
+            before = found["state_out"]
+    finally:
+        registry.close()
 
 
 def test_the_same_checkpoint_is_published_once(registry: Registry, trained: Path) -> None:

@@ -1,6 +1,8 @@
 """Whole runs: Ray Tune, RLlib's Algorithm with a remote runner, publishing, interruption."""
 
+import dataclasses
 import io
+import json
 import os
 import signal
 import subprocess
@@ -13,14 +15,15 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from league.errors import ConfigError, NotFound, ParityError, UnknownVersion
+from league.config import LeagueConfig
+from league.errors import ConfigError, LeagueError, NotFound, ParityError, UnknownVersion
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
 from league.settings import Storage
 from tests.training.leagues import tictactoe
 from training import publish as publishing
-from training.run import train
+from training.run import check_network, train
 
 SETTINGS = {"runners": 1, "train_batch_size": 256, "minibatch_size": 128, "epochs": 1, "checkpoint_every": 512}
 LEAGUE = tictactoe(steps=1024, **SETTINGS)
@@ -55,8 +58,21 @@ def test_a_run_publishes_its_checkpoints_and_further_training_names_its_parent(r
     (run,) = (registry.storage.home / "runs" / "tictactoe").iterdir()
     assert not list(run.rglob("checkpoints/*")), "a published checkpoint is in the version alone"
     tags = curves(run).Tags()["scalars"]
-    assert {"ray/tune/shared/return", "ray/tune/shared/length", "ray/tune/shared/entropy"} <= set(tags)
-    assert curves(run).Scalars("ray/tune/shared/entropy")[-1].step == 1024
+    of_policy = {
+        "return",
+        "length",
+        "entropy",
+        "policy_loss",
+        "value_loss",
+        "kl",
+        "explained_variance",
+        "gradient_norm",
+    }
+    assert {f"shared/{name}" for name in of_policy} <= set(tags)
+    assert {"agents/player_1/return", "agents/player_2/length", "run/return", "run/crashes"} <= set(tags)
+    assert {"run/steps_per_second", *(f"time/{name}" for name in ("sampling", "learning", "weights"))} <= set(tags)
+    assert curves(run).Scalars("shared/entropy")[-1].step == 1024
+    assert not any(tag.startswith("ray/") or "since_restore" in tag for tag in tags), "curves alone"
     with pytest.raises(NotFound, match="complete"):
         train(LEAGUE, registry=registry, resume=True)
 
@@ -73,6 +89,10 @@ def test_what_cannot_be_trained_is_refused_before_anything_starts(registry: Regi
         train(LEAGUE, registry=registry, parent=CheckpointRef("tictactoe", 1))
     with pytest.raises(ConfigError, match="kernel of 4"):
         train(tictactoe(convolutions=[{"filters": 4, "kernel": 4}]), registry=registry)
+    with pytest.raises(ConfigError, match=r"per_policy\.nobody"):
+        train(tictactoe(per_policy={"nobody": {"lr": 1}}), registry=registry)
+    with pytest.raises(UnknownVersion, match="no version 7"):
+        train(tictactoe(opponents=["@7"]), registry=registry)
     assert not (registry.storage.home / "runs").exists()
 
 
@@ -99,42 +119,91 @@ def test_a_failing_proof_ends_the_run_and_the_versions_before_stay(
     assert steps == sorted(set(steps))
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_a_version_is_trained_on_with_the_network_that_it_has(registry: Registry) -> None:
+    """Settings that were not there yet when the version was trained have their defaults."""
+    (version,) = train(tictactoe(steps=64, train_batch_size=64, minibatch_size=64), registry=registry)
+    for setting in ({"hidden": [8]}, {"recurrence": {"width": 4}}, {"normalize_observations": True}):
+        with pytest.raises(ConfigError, match=f"training.{next(iter(setting))}: tictactoe@1 was trained with"):
+            train(tictactoe(**setting), registry=registry, parent=CheckpointRef("tictactoe", 1))
+    old = {key: value for key, value in version.manifest.settings.items() if key not in ("recurrence", "opponents")}
+    manifest = version.manifest.model_copy(update={"settings": old})
+    check_network(dataclasses.replace(version, manifest=manifest), tictactoe())
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(
+    ("entry_point", "words"),
+    [
+        ("raising", ("league faulty", "ZeroDivisionError: division by zero", "faulty.py:13", "life-1/error.txt")),
+        ("unrewarding", ("faulty", "player_1", "nan")),
+    ],
+)
+def test_a_fault_of_the_environment_in_a_runner_is_told_in_a_sentence(
+    registry: Registry, entry_point: str, words: tuple[str, ...]
+) -> None:
+    league = LeagueConfig.from_mapping(
+        {
+            "league": "faulty",
+            "environment": {"entry_point": f"tests.training.faulty:{entry_point}"},
+            "policies": {"first": ["player_0"], "second": ["player_1"]},
+            "training": {"runners": 1, "copies": 2, "hidden": [8], "crashes": 1},
+        }
+    )
+    with pytest.raises(LeagueError) as raised:
+        train(league, registry=registry)
+    for word in words:
+        assert word in str(raised.value)
+    assert "\n" not in str(raised.value)
+    if entry_point == "raising":
+        (trace,) = registry.storage.home.rglob("error.txt")
+        assert "ZeroDivisionError" in trace.read_text()
+
+
 SCRIPT = """
 import sys
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.training.test_run import tictactoe, SETTINGS
+from tests.training.test_run import SLOW
 from training.run import train
-train(tictactoe(steps=10**9, **SETTINGS), registry=Registry.open(Storage.at(sys.argv[1])))
+train(SLOW, registry=Registry.open(Storage.at(sys.argv[1])))
 """
+SLOW = tictactoe(steps=1536, **SETTINGS | {"epochs": 16, "minibatch_size": 32})
+"""Long enough between two checkpoints to be killed there."""
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_a_killed_run_goes_on_without_losing_or_doubling_a_version(tmp_path: Path) -> None:
-    """kill -9 of the driver, in the middle of training and publishing."""
-    home = tmp_path / "home"
+def test_a_run_that_is_killed_and_goes_on_publishes_what_one_that_was_not_does(tmp_path: Path) -> None:
+    """kill -9 of the driver in the middle."""
+    home = tmp_path / "killed"
     driver = subprocess.Popen([sys.executable, "-c", SCRIPT, str(home)], stdout=subprocess.DEVNULL)
     try:
-        registry = Registry.open(Storage.at(home))
-        _wait_for_versions(registry, 2)
+        _wait_for_checkpoint(home)
     finally:
         os.kill(driver.pid, signal.SIGKILL)
         driver.wait()
-    before = registry.versions("tictactoe")
-    budget = before[-1].steps + 4096
-    versions = train(tictactoe(steps=budget, **SETTINGS), registry=registry, resume=True)
-    assert [version.sha256 for version in versions[: len(before)]] == [version.sha256 for version in before]
-    assert len({version.source for version in versions}) == len(versions)
-    steps = [version.steps for version in versions]
-    assert steps == sorted(set(steps))
-    assert steps[-1] >= budget
-    assert [version.parent for version in versions] == [None, *(version.number for version in versions[:-1])]
+    killed = Registry.open(Storage.at(home))
+    before = killed.versions("tictactoe")
+    assert len(before) < 3, "it was not killed in the middle"
+    resumed = train(SLOW, registry=killed, resume=True)
+
+    whole = train(SLOW, registry=Registry.open(Storage.at(tmp_path / "whole")))
+    assert [version.steps for version in whole] == [512, 1024, 1536]
+    assert [graphs(version) for version in resumed] == [graphs(version) for version in whole]
+    assert len({json.dumps(graphs(version)) for version in whole}) == 3, "it learns"
+    assert [version.sha256 for version in resumed[: len(before)]] == [version.sha256 for version in before]
+    assert [version.parent for version in resumed] == [None, *(version.number for version in resumed[:-1])]
 
 
-def _wait_for_versions(registry: Registry, count: int) -> None:
+def graphs(version: VersionRow) -> dict[str, str]:
+    """The digest of each ONNX file."""
+    return {name: digest for name, digest in version.manifest.files.items() if name.endswith(".onnx")}
+
+
+def _wait_for_checkpoint(home: Path) -> None:
     deadline = time.monotonic() + DEADLINE
     while time.monotonic() < deadline:
-        if any(row.slug == "tictactoe" for row in registry.leagues()) and len(registry.versions("tictactoe")) >= count:
+        if any(path.name == "512" for path in home.glob("runs/tictactoe/*/life-1/checkpoints/*")):
             return
-        time.sleep(0.1)
-    raise AssertionError(f"no {count} versions within {DEADLINE} s")
+        time.sleep(0.01)
+    raise AssertionError(f"no checkpoint within {DEADLINE} s")

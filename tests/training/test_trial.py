@@ -1,12 +1,15 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from league.environments.building import interface
+from league.settings import Storage
 from tests.league.environments.counting import Counting
-from tests.training.leagues import counting
-from training.trial import build
+from tests.training.leagues import counting, tictactoe
+from training.curves import names
+from training.trial import AFRESH, Plan, Start, Trial, build, read_progress
 
 LEAGUE = counting([4, 6], [1], train_batch_size=120, minibatch_size=60, epochs=1, runners=0)
 
@@ -45,15 +48,83 @@ def test_training_goes_on_exactly_where_its_checkpoint_was(tmp_path: Path, monke
     assert len(set(seeds)) == len(seeds)
 
 
-@pytest.mark.usefixtures("ray_session")
-def test_a_fault_of_the_environment_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: Counting, action: int | None) -> None:
-        raise ZeroDivisionError("the environment is broken")
+def trial(directory: Path, start: Start = AFRESH, **training: Any) -> Trial:
+    """A trial in this process, which checkpoints below `directory`."""
+    league = tictactoe(train_batch_size=128, minibatch_size=64, epochs=1, **training)
+    (directory / "checkpoints").mkdir(parents=True, exist_ok=True)
+    plan = Plan(start, directory / "checkpoints", directory / "end", Storage.at(directory))
+    interface_ = interface(league)
+    return Trial({"league": league.model_dump(by_alias=True), "interface": interface_.model_dump(), "plan": plan})
 
-    algorithm = build(LEAGUE, interface(LEAGUE))
-    monkeypatch.setattr(Counting, "step", broken)
-    try:
-        with pytest.raises(ZeroDivisionError, match="the environment is broken"):
-            algorithm.train()
-    finally:
-        algorithm.stop()
+
+def run(trial: Trial) -> list[dict[str, Any]]:
+    """All results of a trial until it is done."""
+    results = [trial.train()]
+    while not results[-1]["done"]:
+        results.append(trial.train())
+    return results
+
+
+def weights(trial: Trial) -> dict[str, torch.Tensor]:
+    return trial.algorithm.learner_group._learner.module["shared"].state_dict()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_checkpoints_come_at_their_cadence_with_the_curves_until_then(tmp_path: Path) -> None:
+    whole = trial(tmp_path, steps=600, checkpoint_every=256)
+    results = run(whole)
+    whole.stop()
+    assert [(result["steps"], "checkpoint" in result) for result in results] == [(256, True), (512, True), (640, True)]
+    assert [Path(result["checkpoint"]).name for result in results] == ["256", "512", "640"]
+    assert results[-1]["spent"]
+    assert read_progress(tmp_path / "checkpoints" / "512") == (512, pytest.approx(results[1]["seconds"]))
+    for result in results:
+        assert names(interface(whole.league)) <= result.keys()
+        assert result["time/sampling"] > 0
+        assert result["time/learning"] > 0
+        assert result["episodes"] > 0
+        assert result["crashes"] == 0
+        assert result["shared/return"] == 0, "what one player wins, the other loses"
+        assert result["agents/player_1/return"] == -result["agents/player_2/return"]
+    assert any(result["agents/player_1/return"] for result in results)
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_training_from_a_checkpoint_is_the_training_that_made_it(tmp_path: Path) -> None:
+    """To the last bit: weights, and what is played."""
+    settings = {"steps": 768, "checkpoint_every": 256, "opening_plies": 2}
+    whole = trial(tmp_path / "whole", **settings)
+    expected = run(whole)
+    steps, seconds = read_progress(tmp_path / "whole" / "checkpoints" / "256")
+    resumed = trial(
+        tmp_path / "resumed", Start(tmp_path / "whole" / "checkpoints" / "256", steps, 0, seconds), **settings
+    )
+    results = run(resumed)
+    for name, value in weights(whole).items():
+        assert torch.equal(weights(resumed)[name], value)
+    learned = ("shared/length", "shared/policy_loss", "agents/player_1/return", "shared/kl", "steps")
+    assert [[result[name] for name in learned] for result in results] == [
+        [result[name] for name in learned] for result in expected[1:]
+    ]
+    whole.stop()
+    resumed.stop()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_a_trial_that_is_asked_to_end_saves_where_it_is(tmp_path: Path) -> None:
+    asked = trial(tmp_path, steps=10**9, checkpoint_every=None)
+    result = asked.train()
+    assert "checkpoint" not in result
+    asked.plan.end.touch()
+    result = asked.train()
+    assert (result["done"], result["spent"]) == (True, False)
+    assert result["checkpoint"] == str(tmp_path / "checkpoints" / str(asked.steps))
+    asked.stop()
+
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again" / "end").touch()
+    at_once = trial(tmp_path / "again", Start(Path(result["checkpoint"]), asked.steps, 0, 1.0), steps=10**9)
+    result = at_once.train()
+    assert result["done"]
+    assert "checkpoint" not in result, "nothing new to save"
+    at_once.stop()

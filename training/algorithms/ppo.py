@@ -5,32 +5,94 @@ logits, which keeps the policy gradient right (Huang and Ontañón, 2020, arXiv 
 generalised advantage estimates (Schulman et al., 2016, arXiv 1506.02438).
 """
 
+from collections.abc import Collection
+from functools import partial
+
+import torch
 from ray.rllib.algorithms import ppo
-from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule, MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.env.env_runner import EnvRunner
+from ray.rllib.execution.rollout_ops import synchronous_parallel_sample
+from ray.rllib.utils.metrics import (
+    ENV_RUNNER_RESULTS,
+    ENV_RUNNER_SAMPLING_TIMER,
+    LEARNER_RESULTS,
+    LEARNER_UPDATE_TIMER,
+    SYNCH_WORKER_WEIGHTS_TIMER,
+    TIMERS,
+)
 
 from league.config import LeagueConfig, PPOConfig
+from league.errors import ConfigError
 from league.interface import Interface
+from league.policies.actions import dist_inputs_size
+from league.seeds import derive
 from league.settings import Storage
+from league.spaces import ACTION_MASK, inputs
+from training.algorithms import phases
+from training.learners.hyperparameters import hyperparameters
 from training.learners.ppo import PPOLearner
-from training.learners.train_batch import train_batch_connector
 from training.modules.actor_critic import ActorCritic
+from training.modules.shared_encoder import SharedEncoder
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, LockstepEnvRunner, module_spaces
 
 
 class PPO(ppo.PPO):
-    """RLlib's, but for a directory in the user's home that it makes for results, which are Tune's here."""
+    """RLlib's Algorithm, whose updates reach those policies that learn at the time."""
+
+    def training_step(self) -> None:
+        """Sample a batch, learn from it, and give the runners the weights that have changed."""
+        with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
+            episodes, results = synchronous_parallel_sample(
+                worker_set=self.env_runner_group,
+                max_env_steps=self.config.total_train_batch_size,
+                sample_timeout_s=self.config.sample_timeout_s,
+                _uses_new_env_runners=True,
+                _return_metrics=True,
+            )
+            self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
+        with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
+            learned = self.learner_group.update(
+                episodes=episodes,
+                policies=self._learning(),
+                num_epochs=self.config.num_epochs,
+                minibatch_size=self.config.minibatch_size,
+            )
+            self.metrics.aggregate(learned, key=LEARNER_RESULTS)
+        with self.metrics.log_time((TIMERS, SYNCH_WORKER_WEIGHTS_TIMER)):
+            if changed := list(learned[0]):
+                self.env_runner_group.sync_weights(
+                    from_worker_or_learner_group=self.learner_group, policies=changed, inference_only=True
+                )
+
+    def begin_anew(self, steps: int) -> None:
+        """Leave all episodes under way, and derive every random choice from here on from the seed and `steps`.
+
+        Called at each checkpoint, and where training goes on from one: both then go on alike.
+        """
+        # A runner beside remote ones only keeps weights.
+        is_local = self.env_runner_group.num_remote_env_runners() == 0
+        self.env_runner_group.foreach_env_runner(partial(_begin_anew, steps=steps), local_env_runner=is_local)
+        torch.manual_seed(derive(self.config.seed or 0, "learner", steps))
+
+    def _learning(self) -> Collection[str]:
+        settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
+        return phases.learning(settings, tuple(self.config.policies), self.iteration)
 
     def _setup_logdir(self) -> None:
-        pass
+        """RLlib makes a directory for results in the user's home, which are Tune's here."""
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> ppo.PPOConfig:
     """RLlib's configuration of a league's training: our module, runner and learner.
 
     storage: where the versions are that play as opponents; not needed without.
+    Raises ConfigError where settings name policies that there are not, or spaces do not fit the module.
     """
     settings = league.training
+    phases.check(settings, interface.policy_ids)
+    hyperparameters(settings, interface.policy_ids)
     config = ppo.PPOConfig(algo_class=PPO)
     config.environment(
         env_config={
@@ -40,7 +102,7 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
         }
     )
     config.multi_agent(
-        policies=set(interface.policy_ids),
+        policies=interface.policy_ids,  # in this order, by which seeded weights and minibatches are drawn
         policy_mapping_fn=lambda agent, *_, **__: interface.policies[agent],
     )
     config.rl_module(rl_module_spec=module_spec(settings, interface))
@@ -48,12 +110,15 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
         env_runner_cls=LockstepEnvRunner,
         num_env_runners=settings.runners,
         num_envs_per_env_runner=settings.copies,
+        num_gpus_per_env_runner=settings.runner_gpus,
         # The runners have no connector state that could be merged.
         merge_env_runner_states=False,
     )
+    # The learner works in the process of the algorithm.
     config.learners(
         learner_class=PPOLearner,
-        learner_connector=train_batch_connector(settings.gamma, settings.lambda_),
+        num_learners=0,
+        num_gpus_per_learner=settings.gpus,
         add_default_connectors_to_learner_pipeline=False,
     )
     config.training(
@@ -79,17 +144,46 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
 
 
 def module_spec(settings: PPOConfig, interface: Interface) -> MultiRLModuleSpec:
-    """The modules of all policies."""
+    """The modules of all policies. Raises ConfigError for spaces that they cannot have."""
+    model_config = {
+        "hidden": settings.hidden,
+        "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
+        "recurrence": settings.recurrence and settings.recurrence.width,
+        "normalize": settings.normalize_observations,
+    }
     specs = {}
     for policy in interface.policy_ids:
+        try:
+            dist_inputs_size(interface.of_policy(policy).action)
+        except ConfigError as error:
+            raise ConfigError(f"policies.{policy}: {error}") from error
         observation, action = module_spaces(interface, policy)
         specs[policy] = RLModuleSpec(
-            module_class=ActorCritic,
-            observation_space=observation,
-            action_space=action,
-            model_config={
-                "hidden": settings.hidden,
-                "convolutions": [(layer.filters, layer.kernel) for layer in settings.convolutions],
-            },
+            module_class=ActorCritic, observation_space=observation, action_space=action, model_config=model_config
         )
-    return MultiRLModuleSpec(rl_module_specs=specs)
+    if settings.shared_encoder:
+        _check_shared(interface)
+    return MultiRLModuleSpec(
+        multi_rl_module_class=SharedEncoder if settings.shared_encoder else MultiRLModule, rl_module_specs=specs
+    )
+
+
+def _check_shared(interface: Interface) -> None:
+    """One encoder reads what all policies observe, action masks apart."""
+    observed = {
+        policy: {
+            name: leaf for name, leaf in inputs(interface.of_policy(policy).observation).items() if name != ACTION_MASK
+        }
+        for policy in interface.policy_ids
+    }
+    first, *others = observed
+    for other in others:
+        if observed[other] != observed[first]:
+            raise ConfigError(
+                f"training.shared_encoder: policies {first} and {other} observe different spaces: leave it out, or pad"
+                " the observations with SuperSuit"
+            )
+
+
+def _begin_anew(runner: EnvRunner, steps: int) -> None:
+    runner.begin_anew(steps)

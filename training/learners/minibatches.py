@@ -1,46 +1,26 @@
 """Minibatches of several policies' train batches."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import torch
-from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
+
+from training.learners.train_batch import Minibatch, TrainBatch
 
 
-class Minibatches:
-    """Each row of each policy exactly once per epoch, in a random order that is new in each.
+def minibatches(batches: Mapping[str, TrainBatch], *, size: int, epochs: int) -> Iterator[dict[str, Minibatch]]:
+    """Each step of each policy exactly once per epoch, in a random order that is new in each; policy id → its steps.
 
-    All policies are cut into the same number of minibatches: as many as the largest needs at `minibatch_size`. RLlib's
-    MiniBatchCyclicIterator gives each policy equally large minibatches instead, and so a policy with few rows many
-    times the epochs that were asked for.
+    All policies are cut into the same number of minibatches: as many as the largest needs at `size` steps. RLlib's
+    MiniBatchCyclicIterator gives each policy equally large minibatches instead, and so a policy with few steps many
+    times the epochs that were asked for. Of policies with a memory, whole sequences are drawn.
     """
-
-    def __init__(self, batch: MultiAgentBatch, *, minibatch_size: int, num_epochs: int) -> None:
-        self._batches = batch.policy_batches
-        self._env_steps = batch.env_steps()
-        self._epochs = num_epochs
-        largest = max(len(rows) for rows in self._batches.values())
-        self._count = -(-largest // minibatch_size)
-
-    def __iter__(self) -> Iterator[MultiAgentBatch]:
-        for _ in range(self._epochs):
-            orders = {
-                policy: torch.randperm(len(rows)).tensor_split(self._count) for policy, rows in self._batches.items()
-            }
-            for i in range(self._count):
-                yield MultiAgentBatch(
-                    {
-                        policy: _take(self._batches[policy], order[i])
-                        for policy, order in orders.items()
-                        if len(order[i])
-                    },
-                    env_steps=self._env_steps,
-                )
+    count = -(-max(len(batch) for batch in batches.values()) // size)
+    for _ in range(epochs):
+        orders = {policy: _order(batch).tensor_split(count) for policy, batch in batches.items()}
+        for i in range(count):
+            yield {policy: batches[policy].take(order[i]) for policy, order in orders.items() if len(order[i])}
 
 
-def _take(rows: SampleBatch, order: torch.Tensor) -> SampleBatch:
-    return SampleBatch(
-        {
-            column: {name: part[order] for name, part in value.items()} if isinstance(value, dict) else value[order]
-            for column, value in rows.items()
-        }
-    )
+def _order(batch: TrainBatch) -> torch.Tensor:
+    # Drawn on the CPU: the same order on every device.
+    return torch.randperm(batch.units).to(batch.acted.device)

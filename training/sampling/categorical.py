@@ -12,12 +12,12 @@ def log_softmax(logits: NDArray) -> NDArray:
     return shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
 
 
-def sample(log_probabilities: NDArray, rng: np.random.Generator) -> NDArray:
-    """One index per row, (k,) int64, by the Gumbel-max trick: argmax(log p + Gumbel noise) is distributed as p
-    (Maddison, Tarlow and Minka, 2014, "A* sampling")."""
-    noise = rng.standard_exponential(log_probabilities.shape, dtype=np.float32)
+def sample(logits: NDArray, rng: np.random.Generator) -> NDArray:
+    """One index per row of (k, n) float32 logits, (k,) int64, by the Gumbel-max trick: argmax(logits + Gumbel noise) is
+    distributed as softmax(logits) (Maddison, Tarlow and Minka, 2014, "A* sampling")."""
+    noise = rng.standard_exponential(logits.shape, dtype=np.float32)
     # One number in some millions is exactly 0, whose infinite Gumbel noise would choose even what is masked.
-    return (log_probabilities - np.log(np.maximum(noise, SMALLEST))).argmax(axis=-1)
+    return (logits - np.log(np.maximum(noise, SMALLEST))).argmax(axis=-1)
 
 
 def entropy(log_probabilities: NDArray) -> NDArray:

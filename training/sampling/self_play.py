@@ -1,115 +1,164 @@
-"""The league's environment played by its own policies, move by move, into transitions."""
+"""The league's environment played by its own policies and their opponents, step by step, into transitions."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
-from league.environments.stepping import Batch, BatchedEnvironment, Episode, Turn
+from league.config import PPOConfig
+from league.environments.stepping import Batch, BatchedEnvironment, Episode, Group, Turn
 from league.interface import Interface
-from league.spaces import ACTION_MASK, Discrete
-from training.modules.actor_critic import MASKED
-from training.sampling import categorical
+from league.policies.actions import to_environment
+from league.settings import Storage
+from league.spaces import ACTION_MASK
+from training.sampling.distributions import distribution
+from training.sampling.memories import Memories, State
 from training.sampling.openings import Openings, RandomMover
+from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import PlayMetrics
 from training.sampling.reset_seeds import ResetSeeds
+from training.sampling.seats import Opposing, Seats
 from training.sampling.transitions import Transitions
 
-Logits = Callable[[str, dict[str, NDArray]], NDArray]
-"""Policy id and observations, ONNX input name → (k, …), → masked logits (k, n) float32."""
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """Rows of a policy that must act: ONNX input name → (k, …), and the states of a policy with a memory."""
+
+    observations: dict[str, NDArray]
+    state: State | None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Inputs of the rows' distributions, (k, d) float32, and the states after."""
+
+    dist_inputs: NDArray
+    state: State | None
+
+
+Think = Callable[[Mapping[str, Ask]], Mapping[str, Answer]]
+"""All policies that must act, in one call: policy id → what is asked of it."""
 
 
 class SelfPlay:
-    """All copies of one runner. Episodes go on from one `cut` to the next."""
+    """All copies of one runner. Episodes go on from one `cut` to the next. `begin` comes first."""
 
     def __init__(
         self,
         stepping: BatchedEnvironment,
         interface: Interface,
-        seeds: ResetSeeds,
-        opening_plies: int,
-        rng: np.random.Generator,
+        settings: PPOConfig,
+        initial_states: Mapping[str, Mapping[str, NDArray]],
+        storage: Storage | None = None,
     ) -> None:
-        self.stepping = stepping
-        self._interface = interface
-        self._seeds = seeds
-        self._rng = rng
+        """initial_states: policy id → its state before an episode; empty for a policy without a memory.
+
+        Raises ConfigError for opponents that there can be none of, and what loading them raises.
+        """
+        self._stepping = stepping
         self._policies = tuple(interface.policies[agent] for agent in stepping.agents)
-        self._first_action = {policy: _actions(interface, policy).start for policy in interface.policy_ids}
-        self._openings = Openings(opening_plies, self._policies, stepping.copies, rng)
-        self._begun = [itertools.count() for _ in range(stepping.copies)]
+        self._actions = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
+        self._distributions = {policy: distribution(space) for policy, space in self._actions.items()}
+        self._initial_states = {policy: state for policy, state in initial_states.items() if state}
+        self._seats = Seats(interface, settings.opponents, stepping.agents)
+        self._opponents = Opponents(settings.opponents, interface, storage)
+        self._openings = Openings(settings.opening_plies, self._policies, stepping.copies)
+        self.metrics = PlayMetrics(stepping.agents, self._policies, self._distributions, stepping.copies)
+
+    def begin(self, seeds: ResetSeeds, rng: np.random.Generator) -> None:
+        """As `restart`; what comes is decided by `seeds` and `rng` alone."""
+        self._seeds, self._rng = seeds, rng
+        self._begun = [itertools.count() for _ in range(self._stepping.copies)]
         self._chunk_ids = (f"{seeds.runner}-{seeds.steps}-{i}" for i in itertools.count())
-        self.metrics = PlayMetrics(stepping.agents, self._policies)
         self.restart()
 
     def restart(self) -> None:
         """Leave the episodes that are under way, and begin new ones in all copies."""
-        agents = self.stepping.agents
-        self._transitions = {policy: Transitions(policy, agents) for policy in self._interface.policy_ids}
-        self.metrics.forget_unfinished()
-        self._turn = self.stepping.start(self._next_episode)
-        self._read(self._turn)
+        agents, copies = self._stepping.agents, self._stepping.copies
+        self._transitions = {policy: Transitions(policy, agents, copies) for policy in self._actions}
+        self._memories = {policy: Memories(initial) for policy, initial in self._initial_states.items()}
+        for copy in range(copies):
+            self.metrics.forget(copy)
+            self._opponents.forget(copy)
+        self._read(self._stepping.start(self._next_episode))
 
-    def step(self, logits: Logits, explore: bool) -> None:
-        """One move in each copy: drawn from the distributions if `explore`, else the most probable."""
-        actions = {
-            group: self._open(group.policy, batch)
-            if isinstance(group, RandomMover)
-            else self._act(group, batch, logits, explore)
-            for group, batch in self._turn.batches.items()
+    def step(self, think: Think | None, explore: bool) -> None:
+        """One step in each copy. think: None acts at random. explore: draw actions, instead of the most probable."""
+        batches = self._turn.batches
+        asks = {
+            group: Ask(batch.observations, self._memories[group].before(batch) if group in self._memories else None)
+            for group, batch in batches.items()
+            if isinstance(group, str)
         }
-        self._turn = self.stepping.step(actions)
-        self._read(self._turn)
-
-    @property
-    def has_transitions(self) -> bool:
-        """Whether a cut would bring any."""
-        return any(transitions.has_closed for transitions in self._transitions.values())
+        answers = think(asks) if think and asks else {}
+        actions: dict[Group, NDArray] = {}
+        for group, batch in batches.items():
+            if isinstance(group, RandomMover):
+                actions[group] = to_environment(self._random(group.policy, batch)[0], self._actions[group.policy])
+            elif isinstance(group, Opposing):
+                actions[group] = self._opponents.act(group, batch, self._rng)
+            else:
+                actions[group] = self._act(group, batch, asks[group], answers.get(group), explore)
+            self.metrics.add_moves(len(batch.copies))
+        for copy, seats in self._openings.step():
+            self._stepping.assign(copy, seats)
+        self.metrics.add_step()
+        self._read(self._stepping.step(actions))
 
     def cut(self) -> list[SingleAgentEpisode]:
         """The transitions that were closed since the last cut."""
-        return [episode for transitions in self._transitions.values() for episode in transitions.cut(self._chunk_ids)]
-
-    def uniform(self, policy: str, observations: dict[str, NDArray]) -> NDArray:
-        """Logits of random legal moves."""
-        rows = len(next(iter(observations.values())))
-        if ACTION_MASK in observations:
-            return np.where(observations[ACTION_MASK] != 0, 0.0, MASKED).astype(np.float32)
-        return np.zeros((rows, _actions(self._interface, policy).n), np.float32)
+        return [chunk for transitions in self._transitions.values() for chunk in transitions.cut(self._chunk_ids)]
 
     def _next_episode(self, copy: int) -> Episode:
-        return Episode(self._seeds(copy, next(self._begun[copy])), self._openings.begin(copy))
+        seats = self._seats.draw(self._rng)
+        return Episode(self._seeds(copy, next(self._begun[copy])), self._openings.begin(copy, seats, self._rng))
 
     def _read(self, turn: Turn) -> None:
+        """Take what has ended, then what goes on or begins."""
+        self._turn = turn
+        for copy in turn.crashed:
+            for transitions in self._transitions.values():
+                transitions.lose(copy)
+            self.metrics.add_crash(copy)
+            self._forget(copy)
         for ending in turn.endings:
-            transitions = self._transitions[self._policies[ending.agent]]
-            self.metrics.add_agent(ending.copy, transitions.end(ending))
+            slot = ending.copy * len(self._policies) + ending.agent
+            self._transitions[self._policies[ending.agent]].end(slot, ending)
+            self.metrics.add_agent(ending)
         for copy in turn.finished:
             self.metrics.add_episode(copy)
+            self._forget(copy)
         for group, batch in turn.batches.items():
-            if not isinstance(group, RandomMover):
-                self._transitions[group].observe(batch)
+            slots = np.array(batch.copies) * len(self._policies) + np.array(batch.agents)
+            rewards = np.array(batch.rewards, dtype=np.float64)
+            self.metrics.add_rows(slots, rewards, are_own=isinstance(group, str))
+            if isinstance(group, str):
+                self._transitions[group].observe(slots, rewards, batch.observations)
 
-    def _act(self, policy: str, batch: Batch, logits: Logits, explore: bool) -> NDArray:
-        dist_inputs = logits(policy, batch.observations)
-        log_p = categorical.log_softmax(dist_inputs)
-        chosen = categorical.sample(log_p, self._rng) if explore else log_p.argmax(axis=-1)
-        self._transitions[policy].act(chosen, log_p[np.arange(len(chosen)), chosen], dist_inputs)
-        self.metrics.add_play(policy, log_p)
-        return chosen + self._first_action[policy]
+    def _forget(self, copy: int) -> None:
+        for memories in self._memories.values():
+            memories.forget(copy)
+        self._opponents.forget(copy)
 
-    def _open(self, policy: str, batch: Batch) -> NDArray:
-        """Random moves of openings; the policies take over where one is over."""
-        for copy in self._openings.move(batch.copies):
-            self.stepping.assign(copy, self._policies)
-        self.metrics.add_opening(len(batch.copies))
-        log_p = categorical.log_softmax(self.uniform(policy, batch.observations))
-        return categorical.sample(log_p, self._rng) + self._first_action[policy]
+    def _act(self, policy: str, batch: Batch, ask: Ask, answer: Answer | None, explore: bool) -> NDArray:
+        drawing = self._distributions[policy]
+        if answer is None:
+            raw, dist_inputs = self._random(policy, batch)
+            log_p = drawing.log_p(dist_inputs, raw)
+        else:
+            dist_inputs = answer.dist_inputs
+            raw, log_p = drawing.sample(dist_inputs, self._rng) if explore else drawing.mode(dist_inputs)
+            if answer.state is not None:
+                self._memories[policy].keep(batch, answer.state)
+        self._transitions[policy].act(raw, log_p, dist_inputs, ask.state)
+        self.metrics.add_play(policy, dist_inputs)
+        return to_environment(raw, self._actions[policy])
 
-
-def _actions(interface: Interface, policy: str) -> Discrete:
-    space = interface.of_policy(policy).action
-    assert isinstance(space, Discrete), f"policy {policy} has actions {space}, expected Discrete"
-    return space
+    def _random(self, policy: str, batch: Batch) -> tuple[NDArray, NDArray]:
+        """Random legal raw actions, and the inputs that stand for them."""
+        mask = batch.observations.get(ACTION_MASK)
+        return self._distributions[policy].uniform(mask, len(batch.copies), self._rng)

@@ -5,9 +5,9 @@ import pytest
 from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
 from league.config import EnvironmentConfig
-from league.environments.aec import AECStepping
 from league.environments.building import build
-from league.environments.stepping import Episode, Turn
+from league.environments.lockstep import stepping
+from league.environments.stepping import BatchedEnvironment, Episode, Turn
 from league.errors import IllegalAction
 from tests.conformance.stepping import assert_stepping_conforms
 
@@ -32,11 +32,11 @@ ENVIRONMENTS = {
 def test_lockstep_reports_what_the_plain_loop_reports(name: str, copies: int) -> None:
     config = ENVIRONMENTS[name]
     assert_stepping_conforms(
-        lambda n: AECStepping(config, n), build(config), seeds=list(range(100, 112)), copies=copies
+        lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), copies=copies
     )
 
 
-def play_out(env: AECStepping, turn: Turn) -> list[Turn]:
+def play_out(env: BatchedEnvironment, turn: Turn) -> list[Turn]:
     turns = [turn]
     while turn.batches:
         turn = env.step({group: np.zeros(len(batch.copies), int) for group, batch in turn.batches.items()})
@@ -45,7 +45,7 @@ def play_out(env: AECStepping, turn: Turn) -> list[Turn]:
 
 
 def test_a_truncated_agent_is_never_a_terminated_one_and_keeps_its_last_observation() -> None:
-    env = AECStepping(counting(lives=[2, 3], truncated=[1]), copies=1)
+    env = stepping(counting(lives=[2, 3], truncated=[1]), copies=1)
     episodes = iter([Episode(5, "ab")])
     endings = [ending for turn in play_out(env, env.start(lambda _: next(episodes, None))) for ending in turn.endings]
     flags = {ending.agent: (ending.terminated, ending.truncated) for ending in endings}
@@ -55,7 +55,7 @@ def test_a_truncated_agent_is_never_a_terminated_one_and_keeps_its_last_observat
 
 
 def test_rewards_between_two_turns_of_an_agent_are_summed() -> None:
-    env = AECStepping(counting(lives=[3, 3]), copies=1)
+    env = stepping(counting(lives=[3, 3]), copies=1)
     episodes = iter([Episode(0, "ab")])
     turns = play_out(env, env.start(lambda _: next(episodes, None)))
     rewards = [(group, batch.rewards[0]) for turn in turns for group, batch in turn.batches.items()]
@@ -64,7 +64,7 @@ def test_rewards_between_two_turns_of_an_agent_are_summed() -> None:
 
 
 def test_each_reset_has_the_seed_of_its_episode() -> None:
-    env = AECStepping(counting(lives=[1, 1]), copies=2)
+    env = stepping(counting(lives=[1, 1]), copies=2)
     seeds = iter(range(10, 16))
     seen: dict[int, list[int]] = {0: [], 1: []}
 
@@ -87,7 +87,7 @@ def test_each_reset_has_the_seed_of_its_episode() -> None:
 
 
 def test_groups_can_change_within_an_episode() -> None:
-    env = AECStepping(counting(lives=[2, 2]), copies=1)
+    env = stepping(counting(lives=[2, 2]), copies=1)
     episodes = iter([Episode(0, ("opening", "opening"))])
     turn = env.start(lambda _: next(episodes, None))
     assert list(turn.batches) == ["opening"]
@@ -97,7 +97,7 @@ def test_groups_can_change_within_an_episode() -> None:
 
 
 def test_agents_of_one_group_in_all_copies_share_a_batch() -> None:
-    env = AECStepping(ENVIRONMENTS["connect_four"], copies=5)
+    env = stepping(ENVIRONMENTS["connect_four"], copies=5)
     turn = env.start(lambda copy: Episode(copy, ("shared", "shared")))
     batch = turn.batches["shared"]
     assert batch.copies == [0, 1, 2, 3, 4]
@@ -107,7 +107,7 @@ def test_agents_of_one_group_in_all_copies_share_a_batch() -> None:
 
 @pytest.mark.parametrize("action", [9, -1])
 def test_an_illegal_action_is_refused_before_any_copy_moves(action: int) -> None:
-    env = AECStepping(ENVIRONMENTS["tictactoe"], copies=2)
+    env = stepping(ENVIRONMENTS["tictactoe"], copies=2)
     turn = env.start(lambda _: Episode(0, ("x", "o")))
     with pytest.raises(IllegalAction, match=rf"action {action} of player_1 is illegal"):
         env.step({"x": np.array([0, action])})
@@ -122,5 +122,5 @@ def test_the_checking_wrappers_are_left_out_and_others_stay() -> None:
     wrapped = EnvironmentConfig.model_validate(
         {"entry_point": COUNTING, "wrappers": [{"frame_stack_v1": {"stack_size": 2}}]}
     )
-    env = AECStepping(wrapped, copies=1)
+    env = stepping(wrapped, copies=1)
     assert env.start(lambda _: Episode(0, "ab")).batches["a"].observations["observation"].shape == (1, 6)

@@ -5,8 +5,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from league.errors import InvalidInput
+from league.errors import ConfigError, InvalidInput
 from league.policies.draws import choose, draw, sample
+from league.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 
 class Fixed:
@@ -28,17 +29,17 @@ LOWEST, HIGHEST = 0.0, 1 - 2**-53
 
 def test_the_least_and_the_greatest_number_choose_what_is_allowed() -> None:
     allowed = np.array([[0, 0, 1, 1, 0]] * 4, np.int8)
-    assert choose(allowed, fixed(LOWEST, 0.4999, 0.5, HIGHEST)).tolist() == [2, 2, 3, 3]
+    assert choose(allowed, np.array([LOWEST, 0.4999, 0.5, HIGHEST])).tolist() == [2, 2, 3, 3]
 
 
 def test_the_least_and_the_greatest_number_sample_what_is_possible() -> None:
     logits = np.array([[-1e9, 0.0, np.log(3.0), -1e9]] * 4, np.float32)
-    assert sample(logits, fixed(LOWEST, 0.2499, 0.2501, HIGHEST)).tolist() == [1, 1, 2, 2]
+    assert sample(logits, Discrete(n=4), fixed(LOWEST, 0.2499, 0.2501, HIGHEST)).tolist() == [1, 1, 2, 2]
 
 
 def test_huge_and_infinite_logits_are_sampled() -> None:
     logits = np.array([[1e30, -np.inf, 1e30], [-np.inf, -3e38, -np.inf]], np.float32)
-    assert sample(logits, fixed(HIGHEST, LOWEST)).tolist() == [2, 1]
+    assert sample(logits, Discrete(n=3), fixed(HIGHEST, LOWEST)).tolist() == [2, 1]
 
 
 def test_a_row_draws_from_its_own_generator() -> None:
@@ -47,3 +48,28 @@ def test_a_row_draws_from_its_own_generator() -> None:
     assert draw([], 0, (2,)).shape == (0, 2)
     with pytest.raises(InvalidInput, match="3 rows needs rng, one generator per row: got 2"):
         draw(fixed(0.25, 0.75), 3)
+
+
+def test_each_element_of_an_action_has_a_distribution_of_its_own() -> None:
+    logits = np.array([[0.0, -1e9, -1e9, 0.0, 0.0]] * 3, np.float32)
+    space = MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,))
+    assert sample(logits, space, fixed(LOWEST, 0.4999, 0.5)).tolist() == [[0, 1], [0, 1], [0, 2]]
+
+
+def test_numbers_are_normal_with_their_means_and_deviations() -> None:
+    rows = 20_000
+    inputs = np.tile(np.array([[3.0, -1.0, np.log(0.5), np.log(2.0)]], np.float32), (rows, 1))
+    rng = [np.random.default_rng((7, row)) for row in range(rows)]
+    raw = sample(inputs, Box(dtype="float32", shape=(2,), low=0, high=1), rng)
+    assert (raw.shape, raw.dtype) == ((rows, 2), np.float32)
+    np.testing.assert_allclose(raw.mean(0), [3.0, -1.0], atol=5 * 2 / rows**0.5)
+    np.testing.assert_allclose(raw.std(0), [0.5, 2.0], rtol=5 / (2 * rows) ** 0.5)
+    assert abs(np.corrcoef(raw.T)[0, 1]) < 5 / rows**0.5
+    assert (sample(inputs[:5], Box(dtype="float32", shape=(2,), low=0, high=1), rng[:5]) != raw[:5]).all(), "drawn on"
+    again = [np.random.default_rng((7, row)) for row in range(3, 5)]
+    assert (sample(inputs[3:5], Box(dtype="float32", shape=(2,), low=0, high=1), again) == raw[3:5]).all()
+
+
+def test_a_space_without_a_distribution_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no policy has actions"):
+        sample(np.zeros((1, 4), np.float32), MultiBinary(shape=(2,)), fixed(0.5))

@@ -12,6 +12,7 @@ import league.policies
 from league.errors import (
     ArtifactCorrupt,
     EnvironmentMismatch,
+    InvalidInput,
     InvalidReference,
     UnknownAlias,
     UnknownPolicy,
@@ -88,6 +89,9 @@ def test_a_script_is_a_contestant(registry: Registry) -> None:
     rng = [np.random.default_rng(row) for row in range(18)]
     assert players["player_1"] == players["player_2"]
     assert set(players["player_1"][1].act(BATCH, rng=rng).actions.tolist()) <= set(range(9))
+    assert list(contestant("script:first", None, interface())) == ["player_1", "player_2"]
+    with pytest.raises(InvalidInput, match="tictactoe@1 is a version: without a registry"):
+        contestant("tictactoe@1", None, interface())
     with pytest.raises(UnknownPolicy, match="no script 'minimax'"):
         contestant("script:minimax", registry, interface())
 

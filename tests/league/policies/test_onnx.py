@@ -1,6 +1,7 @@
 """A graph acts greedily or by its distribution, row by row, and says what is wrong with what it is given."""
 
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -118,12 +119,41 @@ def test_recurrent_state_goes_in_and_comes_out() -> None:
     assert explored.dist_inputs is not None
 
 
-def test_a_vector_of_actions_is_played_but_not_explored() -> None:
+def test_a_vector_of_actions_is_explored_only_where_its_space_is_known() -> None:
     policy = OnnxPolicy(continuous())
     value = np.array([[0.25, -1.5]], np.float32)
     assert (policy.act({"observation": value}).actions == value).all()
-    with pytest.raises(EnvironmentMismatch, match="cannot explore"):
+    with pytest.raises(EnvironmentMismatch, match="cannot explore without a manifest"):
         policy.act({"observation": value}, explore=True, rng=generators(1))
+
+
+def test_vectors_are_explored_inside_their_bounds_row_by_row() -> None:
+    """The graph's means and logarithms of deviations are both its observation, here 0.2 and -0.5."""
+    rows = 4000
+    space = Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0])
+    policy = OnnxPolicy(
+        continuous(),
+        manifest(
+            observation=Box(dtype="float32", shape=(2,), low=None, high=None),
+            action=space,
+            inputs=(Tensor(name="observation", dtype="float32", shape=(None, 2)),),
+            outputs=(
+                Tensor(name="action", dtype="float32", shape=(None, 2)),
+                Tensor(name="action_dist_inputs", dtype="float32", shape=(None, 4)),
+            ),
+        ),
+    )
+    batch = {"observation": np.tile(np.array([0.2, -0.5], np.float32), (rows, 1))}
+    answer = policy.act(batch, explore=True, rng=generators(rows))
+    assert (answer.actions >= [-1, 0]).all()
+    assert (answer.actions <= [1, 10]).all()
+    assert answer.dist_inputs is not None
+    assert answer.dist_inputs[0].tolist() == pytest.approx([0.2, -0.5, 0.2, -0.5])
+    # A normal number with mean μ and deviation σ is cut off at 1 with probability 1 − Φ((1 − μ) / σ).
+    cut = [1 - NormalDist(mean, np.exp(mean)).cdf(1) for mean in (0.2, -0.5)]
+    np.testing.assert_allclose((answer.actions == [1, 10]).mean(0), cut, atol=0.04)
+    alone = policy.act({"observation": batch["observation"][7:8]}, explore=True, rng=generators(8)[7:])
+    assert (alone.actions[0] == answer.actions[7]).all()
 
 
 @pytest.mark.parametrize(

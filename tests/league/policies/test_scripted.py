@@ -8,12 +8,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.classic.connect_four.connect_four import raw_env as connect_four
+from pettingzoo.classic.rps.rps import raw_env as rps
 from pettingzoo.classic.tictactoe.tictactoe import raw_env as tictactoe
 
 from league.errors import EnvironmentMismatch, IllegalMask, InvalidInput, UnknownPolicy
 from league.policies.policy import Policy
 from league.policies.scripted import script
-from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space, from_gymnasium, tensors
+from league.spaces import (
+    Box,
+    DictSpace,
+    Discrete,
+    MultiBinary,
+    MultiDiscrete,
+    Space,
+    from_gymnasium,
+    tensors,
+    to_gymnasium,
+)
 
 GAMES = {"connect_four": connect_four, "tictactoe": tictactoe}
 DRAWS = 150
@@ -148,8 +159,64 @@ def test_random_fills_a_continuous_space() -> None:
     assert np.allclose(actions.mean(axis=0), [0, 5], atol=0.25)
 
 
+PAIR = MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,))
+
+
+def test_random_heeds_the_mask_of_each_element() -> None:
+    rows = 9_000
+    policy = script("random", masked(5)[0], PAIR)
+    mask = np.tile(np.array([0, 1, 1, 0, 1], np.int8), (rows, 1))
+    actions = policy.act({"observation": mask, "action_mask": mask}, rng=generators(rows)).actions
+    assert (actions[:, 0] == 1).all()
+    assert set(actions[:, 1].tolist()) == {5, 7}
+    assert abs((actions[:, 1] == 5).mean() - 0.5) < 5 * 0.5 / rows**0.5
+    mask[3, 2:] = 0
+    with pytest.raises(IllegalMask, match="allows no action"):
+        policy.act({"observation": mask, "action_mask": mask}, rng=generators(rows))
+
+
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        (Discrete(n=3, start=2), 2),
+        (PAIR, [0, 5]),
+        (MultiBinary(shape=(2,)), [0, 0]),
+        (Box(dtype="float32", shape=(4,), low=[-2, 1, None, None], high=[5, 5, 5, -5]), [-2, 1, 0, -5]),
+    ],
+)
+def test_first_takes_the_lowest_of_everything(action: Space, expected: Any) -> None:
+    policy = script("first", Discrete(n=4), action)
+    actions = policy.act({"observation": np.zeros(3, np.int64)}).actions
+    assert actions.tolist() == [expected] * 3
+    assert all(to_gymnasium(action).contains(row) for row in actions)
+
+
+def test_first_takes_the_first_legal_action() -> None:
+    mask = np.array([[0, 1, 1, 0, 1], [1, 0, 0, 1, 1]], np.int8)
+    batch = {"observation": mask, "action_mask": mask}
+    assert script("first", *masked(5, start=10)).act(batch).actions.tolist() == [11, 10]
+    assert script("first", masked(5)[0], PAIR).act(batch).actions.tolist() == [[1, 5], [0, 6]]
+    with pytest.raises(IllegalMask, match="allows no action"):
+        script("first", *masked(5)).act(batch | {"action_mask": mask * 0})
+
+
+def test_mirror_repeats_the_opponent_s_last_move() -> None:
+    """In the real game: it begins with rock, and then plays what the other one played a round before."""
+    env = rps()
+    env.reset(seed=0)
+    agent = env.possible_agents[1]
+    policy = script("mirror", *spaces(env))
+    moves, answers = [2, 1, 1, 0, 2], []
+    for move in moves:
+        env.step(move)
+        seen = np.array([env.observe(agent)])
+        answers.append(int(policy.act({"observation": seen}).actions[0]))
+        env.step(answers[-1])
+    assert answers == [0, *moves[:-1]]
+
+
 def test_unknown_scripts_are_named_with_the_known_ones() -> None:
-    with pytest.raises(UnknownPolicy, match="no script 'minimax'; known: random, one_ply"):
+    with pytest.raises(UnknownPolicy, match="no script 'minimax'; known: random, one_ply, first, mirror"):
         script("minimax", *masked(3))
 
 
@@ -159,7 +226,12 @@ def test_unknown_scripts_are_named_with_the_known_ones() -> None:
         ("one_ply", *masked(7)),
         ("one_ply", Box(dtype="int8", shape=(6, 7, 2), low=0, high=1), Discrete(n=7)),
         ("one_ply", spaces(tictactoe())[0], Discrete(n=8)),
-        ("random", masked(4)[0], MultiDiscrete(nvec=[2, 2], start=[0, 0], shape=(2,))),
+        ("random", masked(5)[0], MultiDiscrete(nvec=[2, 2], start=[0, 0], shape=(2,))),
+        ("random", masked(4)[0], Box(dtype="float32", shape=(4,), low=0, high=1)),
+        ("first", masked(4)[0], Discrete(n=5)),
+        ("first", Discrete(n=3), DictSpace(spaces={"move": Discrete(n=2)})),
+        ("mirror", Discrete(n=3), Discrete(n=3)),
+        ("mirror", Box(dtype="int8", shape=(4,), low=0, high=1), Discrete(n=3)),
         ("random", Discrete(n=3), Box(dtype="float32", shape=(1,), low=None, high=1)),
         ("random", Discrete(n=3), DictSpace(spaces={"move": Discrete(n=2)})),
     ],

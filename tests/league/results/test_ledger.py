@@ -14,7 +14,7 @@ from league.errors import LedgerRefusal, NotFound, UnknownLeague
 from league.registry.registry import Registry
 from league.results.documents import dump_games, dump_schedule, load_games, load_schedule
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Game, Match, Schedule, rotation
+from league.results.records import BlockResult, Game, Match, Schedule
 from league.settings import Storage
 from tests.league.registry.examples import LEAGUE, config, registered
 
@@ -36,7 +36,7 @@ def game(schedule: Schedule, position: int, index: int) -> Game:
     """A game that contestant 0 wins as first and draws as second, its moves different in each game."""
     won = index == 0
     return Game(
-        sides=rotation(2, index),
+        sides=(index, 1 - index),
         seed=schedule.seed_at(position),
         opening=(position, 1),
         actions=(3, index, position),
@@ -128,6 +128,38 @@ def test_results_are_the_sums_of_the_blocks(ledger: Ledger) -> None:
         ledger.results("chess")
 
 
+def alone(schedule: Schedule, position: int, *returns: float) -> Match:
+    """A block in which each contestant plays a game by itself."""
+    first, second = returns
+    score = 1.0 if first > second else 0.0
+    games = (
+        Game((0,), schedule.seed_at(position), (), (1,), (first, None), (score, None)),
+        Game((1,), schedule.seed_at(position), (), (2,), (None, second), (None, 1 - score)),
+    )
+    return schedule.match(position, games)
+
+
+def test_where_each_plays_alone_a_block_is_one_comparison(ledger: Ledger) -> None:
+    schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
+    ledger.open(schedule)
+    ledger.extend([alone(schedule, 0, 3.5, 2.0), alone(schedule, 1, 3.5, 4.0)])
+    won, lost = ledger.matches(league=LEAGUE)
+    assert (won, lost) == (alone(schedule, 0, 3.5, 2.0), alone(schedule, 1, 3.5, 4.0))
+    assert (won.score(0), won.score(1), lost.score(0)) == (1.0, 0.0, 0.0)
+    assert (won.mean_return(0), won.mean_return(1)) == (3.5, 2.0)
+    assert ledger.results(LEAGUE) == [won.result(), lost.result()]
+    assert won.result() == BlockResult(schedule.id, 0, won.contestants, 1, (1.0, 0.0), (3.5, 2.0))
+
+
+def test_who_did_not_play_has_no_return(ledger: Ledger) -> None:
+    schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
+    ledger.open(schedule)
+    match = alone(schedule, 0, 3.5, 2.0)
+    both = replace(match.games[0], returns=(3.5, 2.0), scores=(1.0, 0.0))
+    with pytest.raises(LedgerRefusal, match="finite return of each contestant that played"):
+        ledger.append(replace(match, games=(both, match.games[1])))
+
+
 def _of_game(change: Callable[[Game], Game]) -> Callable[[Match], Match]:
     return lambda match: replace(match, games=(match.games[0], change(match.games[1])))
 
@@ -150,21 +182,30 @@ REFUSED: dict[str, tuple[Callable[[Match], Match], str]] = {
         lambda match: replace(match, environment_digest="0" * 64),
         "its environment_digest is",
     ),
-    "no games": (lambda match: replace(match, games=()), "has 0 games, expected one for each of 2 sides"),
+    "no games": (lambda match: replace(match, games=()), "has 0 games, expected 2"),
     "odd games": (lambda match: replace(match, games=match.games[:1]), "has 1 games"),
     "too many games": (lambda match: replace(match, games=match.games * 2), "has 4 games"),
-    "sides not rotated": (_of_game(lambda game: replace(game, sides=(0, 1))), "game 1 .* not in rotation"),
+    "sides not rotated": (
+        _of_game(lambda game: replace(game, sides=(0, 1))),
+        "game 1 has its sides played by .0, 1., expected .1, 0.",
+    ),
     "a game of another seed": (_of_game(lambda game: replace(game, seed=5)), "game 1 has the seed 5"),
     "another opening": (_of_game(lambda game: replace(game, opening=(0, 1))), "game 1 has another opening"),
     "a short opening": (_of_game(lambda game: replace(game, opening=(1,))), "game 1 has another opening"),
+    "short openings": (
+        lambda match: replace(match, games=tuple(replace(game, opening=(1,)) for game in match.games)),
+        "game 0 has another opening than the block's 2 steps",
+    ),
     "an infinite return": (
         _of_game(lambda game: replace(game, returns=(math.inf, 0.0))),
         "game 1 needs a finite return",
     ),
     "a return too few": (_of_game(lambda game: replace(game, returns=(1.0,))), "game 1 needs a finite"),
-    "both win": (_of_game(lambda game: replace(game, scores=(1.0, 1.0))), "game 1 needs scores"),
-    "a score out of range": (_of_game(lambda game: replace(game, scores=(2.0, -1.0))), "game 1 needs scores"),
-    "no number": (_of_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 needs scores"),
+    "a return of nobody": (_of_game(lambda game: replace(game, returns=(None, 0.25))), "game 1 needs a finite"),
+    "the other one wins": (_of_game(lambda game: replace(game, scores=(1.0, 0.0))), r"returns say \(0\.5, 0\.5\)"),
+    "both win": (_of_game(lambda game: replace(game, scores=(1.0, 1.0))), "game 1 has the scores .* its returns say"),
+    "a score out of range": (_of_game(lambda game: replace(game, scores=(2.0, -1.0))), "game 1 has the scores"),
+    "no number": (_of_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 has the scores"),
 }
 
 
@@ -186,11 +227,13 @@ def test_a_match_of_no_schedule_is_refused(ledger: Ledger) -> None:
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
+boxes = st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=3)
 actions = st.one_of(
     st.integers(-(2**63), 2**63 - 1),
     st.lists(st.integers(-(2**63), 2**63 - 1), max_size=3),
     st.lists(numbers, max_size=3),
-    st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=3),
+    boxes,
+    st.lists(boxes, max_size=2),
 )
 
 
@@ -199,12 +242,12 @@ def blocks(draw: Any) -> tuple[Game, ...]:
     seed, opening = draw(st.integers(0, 2**63 - 1)), tuple(draw(st.lists(actions, max_size=3)))
     return tuple(
         Game(
-            sides=rotation(2, index),
+            sides=(index, 1 - index),
             seed=seed,
             opening=opening,
             actions=tuple(draw(st.lists(actions, max_size=5))),
-            returns=tuple(draw(st.lists(numbers, min_size=2, max_size=2))),
-            scores=(0.5, 0.5),
+            returns=tuple(draw(st.lists(st.none() | numbers, min_size=2, max_size=2))),
+            scores=(0.5, None),
         )
         for index in range(2)
     )

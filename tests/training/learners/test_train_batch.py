@@ -1,53 +1,77 @@
-"""The bootstrap of each way in which a chunk can end, with values that are known."""
+"""The bootstrap of each way in which a chunk can end, with values that are known; and what becomes of a memory."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
-from ray.rllib.evaluation.postprocessing import Postprocessing
-from torch import nn
 
-from training.learners.train_batch import TrainBatch
+from training.learners import train_batch as train_batches
+from training.learners.advantages import generalized_advantages
+from training.learners.train_batch import Chunks, TrainBatch, train_batch
+from training.modules.actor_critic import ActorCritic
 
-GAMMA = 0.5
+GAMMA, LAMBDA = 0.5, 0.9
 
 
-class Identity(nn.Module):
+def network(space: spaces.Space, **config: Any) -> ActorCritic:
+    torch.manual_seed(0)
+    return ActorCritic(
+        observation_space=spaces.Dict(observation=space),
+        action_space=spaces.Discrete(2),
+        model_config={"hidden": [4]} | config,
+    )
+
+
+class Identity(ActorCritic):
     """The value of an observation is the observation."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.unused = nn.Parameter(torch.zeros(1))
-
-    def compute_values(self, batch: dict[str, Any]) -> torch.Tensor:
-        return batch[Columns.OBS]["observation"].float()
+    def value_step(self, batch: dict[str, Any]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        return batch[Columns.OBS]["observation"][:, 0].float(), {}
 
 
-def chunk(observations: list[float], rewards: list[float], policy: str = "a", **end: bool) -> SingleAgentEpisode:
+@pytest.fixture
+def identity() -> Identity:
+    return Identity(
+        observation_space=spaces.Dict(observation=spaces.Box(-99, 99, (1,))),
+        action_space=spaces.Discrete(2),
+        model_config={"hidden": [4]},
+    )
+
+
+def chunk(
+    observations: list[Any], rewards: list[float], states: NDArray | None = None, **end: bool
+) -> SingleAgentEpisode:
     n = len(rewards)
+    dtype = np.float32 if isinstance(observations[0], float) else np.int64
+    seen = np.array(observations, dtype)
+    outputs = {
+        Columns.ACTION_LOGP: InfiniteLookbackBuffer(np.zeros(n, np.float32)),
+        Columns.ACTION_DIST_INPUTS: InfiniteLookbackBuffer(np.zeros((n, 2), np.float32)),
+    }
+    if states is not None:
+        outputs[Columns.STATE_IN] = InfiniteLookbackBuffer({"h": states, "c": -states})
     return SingleAgentEpisode(
-        module_id=policy,
+        module_id="a",
         agent_id="x",
         len_lookback_buffer=0,
-        observations=InfiniteLookbackBuffer({"observation": np.array(observations, np.float32)}),
+        observations=InfiniteLookbackBuffer({"observation": seen[:, None] if dtype == np.float32 else seen}),
         infos=InfiniteLookbackBuffer([{}] * (n + 1)),
         actions=InfiniteLookbackBuffer(np.arange(n)),
         rewards=InfiniteLookbackBuffer(np.array(rewards, np.float32)),
-        extra_model_outputs={
-            Columns.ACTION_LOGP: InfiniteLookbackBuffer(np.zeros(n, np.float32)),
-            Columns.ACTION_DIST_INPUTS: InfiniteLookbackBuffer(np.zeros((n, 2), np.float32)),
-        },
+        extra_model_outputs=outputs,
         **end,
     )
 
 
-def batch(*chunks: SingleAgentEpisode, lambda_: float = 0.0) -> dict[str, dict[str, Any]]:
-    connector = TrainBatch(gamma=GAMMA, lambda_=lambda_)
-    return connector(rl_module={"a": Identity(), "b": Identity()}, episodes=list(chunks))
+def taken(batch: TrainBatch) -> list[float]:
+    """The observations of the steps."""
+    return batch.observations["observation"][batch.acted].flatten().tolist()
 
 
 @pytest.mark.parametrize(
@@ -55,25 +79,96 @@ def batch(*chunks: SingleAgentEpisode, lambda_: float = 0.0) -> dict[str, dict[s
     [({"terminated": True}, 1.0), ({"truncated": True}, 1.0 + GAMMA * 8.0), ({}, 1.0 + GAMMA * 8.0)],
     ids=["terminated", "truncated", "cut"],
 )
-def test_the_last_value_counts_unless_the_agent_terminated(end: dict[str, bool], target: float) -> None:
+def test_the_last_value_counts_unless_the_agent_terminated(
+    identity: Identity, end: dict[str, bool], target: float
+) -> None:
     """One-step targets, λ = 0; chunks stand one behind another and do not leak."""
-    found = batch(chunk([2.0, 4.0, 8.0], [0.0, 1.0], **end), chunk([16.0, 32.0], [3.0]))["a"]
-    targets = found[Postprocessing.VALUE_TARGETS].tolist()
-    assert targets == [GAMMA * 4.0, target, 3.0 + GAMMA * 32.0]
-    assert found[Columns.OBS]["observation"].tolist() == [2.0, 4.0, 16.0]
-    assert found[Columns.ACTIONS].tolist() == [0, 1, 0]
+    chunks = [chunk([2.0, 4.0, 8.0], [0.0, 1.0], **end), chunk([16.0, 32.0], [3.0])]
+    found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0)
+    assert found.targets.tolist() == [GAMMA * 4.0, target, 3.0 + GAMMA * 32.0]
+    assert taken(found) == [2.0, 4.0, 16.0]
+    assert found.actions.tolist() == [0, 1, 0]
 
 
-def test_advantages_are_standardised_per_policy() -> None:
-    found = batch(
-        chunk([0.0, 1.0, 2.0, 3.0], [1.0, -1.0, 5.0], terminated=True),
-        chunk([0.0, 1.0, 2.0], [100.0, 0.0], policy="b", truncated=True),
-        lambda_=0.9,
+def test_what_is_bootstrapped_can_be_decided_otherwise(identity: Identity) -> None:
+    """As RLlib does it: what was truncated counts as terminated."""
+
+    def unless_over(chunks: Chunks) -> NDArray:
+        return np.array([not chunk.is_done for chunk in chunks])
+
+    chunks = [chunk([2.0, 4.0], [1.0], truncated=True), chunk([2.0, 4.0], [1.0])]
+    found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0, bootstraps=unless_over)
+    assert found.targets.tolist() == [1.0, 1.0 + GAMMA * 4.0]
+
+
+def test_advantages_are_standardised_and_targets_are_not(identity: Identity) -> None:
+    chunks = [chunk([0.0, 1.0, 2.0, 3.0], [1.0, -1.0, 5.0], terminated=True)]
+    found = train_batch(identity, chunks, gamma=GAMMA, lambda_=LAMBDA)
+    advantages = generalized_advantages(
+        np.array([1.0, -1.0, 5.0]), np.arange(3.0), np.array([1.0, 2.0, 0.0]), np.array([0, 0, 1]), GAMMA, LAMBDA
     )
-    for policy in ("a", "b"):
-        advantages = found[policy][Postprocessing.ADVANTAGES].numpy()
-        np.testing.assert_allclose([advantages.mean(), advantages.std()], [0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(found.targets, advantages + np.arange(3), rtol=1e-6)
+    np.testing.assert_allclose(found.advantages, (advantages - advantages.mean()) / advantages.std(), rtol=1e-5)
+    targets = found.targets.numpy()
+    assert found.explained_variance == pytest.approx(1 - np.var(targets - np.arange(3)) / np.var(targets))
 
 
-def test_policies_without_a_transition_are_left_out() -> None:
-    assert list(batch(chunk([1.0, 2.0], [0.0]), chunk([1.0], [], policy="b"))) == ["a"]
+def test_statistics_are_updated_before_values_are_computed() -> None:
+    net = network(spaces.Box(-np.inf, np.inf, (1,)), normalize=True)
+    chunks = [chunk([1000.0, 1002.0, 1004.0], [0.0, 0.0])]
+    found = train_batch(net, chunks, gamma=1.0, lambda_=1.0)
+    normalization = net.encoder.features.parts[0][0]
+    assert (float(normalization.count), float(normalization.mean)) == (3, 1002)
+    last = net.compute_values({Columns.OBS: {"observation": torch.tensor([[1004.0]])}})
+    np.testing.assert_allclose(found.targets, last.detach().repeat(2), rtol=1e-5)
+
+
+@pytest.mark.parametrize("at_once", [2, 3, 100])
+def test_a_memory_values_each_step_from_its_state_and_the_last_from_what_follows(
+    at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against the module, step by step: with γ = 1, λ = 0 and no reward, a target is the value of the next step."""
+    monkeypatch.setattr(train_batches, "VALUED_AT_ONCE", at_once)
+    net = network(spaces.Discrete(5), recurrence=3)
+    states = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    chunks = [chunk([0, 1, 2, 3], [0.0] * 3, states[:3], truncated=True), chunk([4, 2, 1], [0.0] * 2, states[3:])]
+    found = train_batch(net, chunks, gamma=1.0, lambda_=0.0, sequence=2)
+
+    def value(observation: int, state: dict[str, torch.Tensor]) -> tuple[float, dict[str, torch.Tensor]]:
+        batch = {Columns.OBS: {"observation": torch.tensor([observation])}, Columns.STATE_IN: state}
+        with torch.no_grad():
+            answer, after = net.value_step(batch)
+        return answer.item(), after
+
+    def before(step: int) -> dict[str, torch.Tensor]:
+        return {"h": torch.from_numpy(states[step : step + 1]), "c": torch.from_numpy(-states[step : step + 1])}
+
+    expected = [value(1, before(1))[0], value(2, before(2))[0], value(3, value(2, before(2))[1])[0]]
+    expected += [value(2, before(4))[0], value(1, value(2, before(4))[1])[0]]
+    assert found.targets.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_chunks_are_cut_into_sequences_with_their_own_first_states() -> None:
+    net = network(spaces.Discrete(9), recurrence=1)
+    states = np.arange(8, dtype=np.float32)[:, None]
+    chunks = [chunk(list(range(6)), [0.0] * 5, states[:5]), chunk([6, 7, 8, 0], [0.0] * 3, states[5:])]
+    found = train_batch(net, chunks, gamma=1.0, lambda_=1.0, sequence=3)
+    assert found.sequences is not None
+    assert found.sequences.starts.tolist() == [0, 3, 5]
+    assert found.sequences.lengths.tolist() == [3, 2, 3]
+    assert found.units == 3
+    minibatch = found.take(torch.tensor([2, 1]))
+    assert minibatch.inputs[Columns.OBS]["observation"].tolist() == [6, 7, 8, 3, 4]
+    assert minibatch.inputs[Columns.SEQ_LENS].tolist() == [3, 2]
+    assert minibatch.inputs[Columns.STATE_IN]["h"].tolist() == [[5.0], [3.0]]
+    assert minibatch.actions.tolist() == [0, 1, 2, 3, 4]
+    assert len(minibatch.targets) == len(minibatch.advantages) == len(minibatch.log_p) == 5
+
+
+def test_steps_are_taken_in_any_order_without_a_memory(identity: Identity) -> None:
+    found = train_batch(identity, [chunk([2.0, 4.0, 8.0], [0.0, 1.0]), chunk([16.0, 32.0], [3.0])], gamma=1, lambda_=1)
+    minibatch = found.take(torch.tensor([2, 0]))
+    assert found.units == len(found) == 3
+    assert minibatch.inputs[Columns.OBS]["observation"].tolist() == [[16.0], [2.0]]
+    assert minibatch.targets.tolist() == found.targets[[2, 0]].tolist()
+    assert set(minibatch.inputs) == {Columns.OBS}

@@ -26,9 +26,10 @@ from tests.conformance.stepping import plain_loop
 from tests.league.environments.counting import Counting
 from tests.training.leagues import counting, tictactoe
 from training.algorithms.ppo import algorithm_config
-from training.learners.train_batch import TrainBatch
+from training.learners.train_batch import train_batch
 from training.sampling.env_runner import LockstepEnvRunner
 from training.sampling.play_metrics import ENTROPY
+from training.trial import build
 
 LIVES = [4, 6]
 CASES = ([], [0], [1], [0, 1])
@@ -214,17 +215,55 @@ def test_rllibs_own_learner_takes_the_episodes_and_agrees_on_value_targets(trunc
         add_default_connectors_to_learner_pipeline=True,
     )
     learner = config.build_learner(spaces=runner.get_spaces())
-    ours = TrainBatch(gamma=league.training.gamma, lambda_=league.training.lambda_)(
-        rl_module=learner.module, episodes=episodes
-    )
+    ours = {
+        policy: train_batch(
+            learner.module[policy],
+            [episode for episode in episodes if episode.module_id == policy],
+            gamma=league.training.gamma,
+            lambda_=league.training.lambda_,
+        )
+        for policy in interface(league).policy_ids
+    }
     theirs = learner._learner_connector(
         rl_module=learner.module, batch={}, episodes=episodes, shared_data={}, metrics=learner.metrics
     )
-    for policy in ours:
+    for policy, batch in ours.items():
         kept = theirs[policy][Columns.LOSS_MASK]
-        for column in (Columns.ACTIONS, Columns.ACTION_LOGP, Postprocessing.VALUE_TARGETS):
+        for column, mine in (
+            (Columns.ACTIONS, batch.actions),
+            (Columns.ACTION_LOGP, batch.log_p),
+            (Postprocessing.VALUE_TARGETS, batch.targets),
+        ):
             expected = theirs[policy][column][kept].numpy()
-            np.testing.assert_allclose(ours[policy][column].numpy(), expected, rtol=1e-3, atol=1e-3)
+            np.testing.assert_allclose(mine.numpy(), expected, rtol=1e-3, atol=1e-3)
     # RLlib's pipeline lengthens the episodes that it is given.
     fresh = runner.sample(num_timesteps=50)
     assert learner.update(episodes=fresh, num_epochs=1, minibatch_size=32, timesteps={})
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_remote_runners_share_no_seed_and_are_in_step_with_the_learner() -> None:
+    league = tictactoe(runners=2, copies=2, train_batch_size=64, minibatch_size=32, epochs=1)
+    algorithm = build(league, interface(league), runner_cpus=0.5)
+    try:
+        for _ in range(2):
+            algorithm.train()
+        learner = algorithm.learner_group._learner
+        expected = learner.module["shared"].get_state()
+        states = algorithm.env_runner_group.foreach_env_runner(
+            lambda runner: (runner.get_state(), runner._play._seeds), local_env_runner=False
+        )
+        for state, _ in states:
+            assert state[WEIGHTS_SEQ_NO] == learner._weights_seq_no
+            for name, array in state[COMPONENT_RL_MODULE]["shared"].items():
+                np.testing.assert_array_equal(array, expected[name])
+        used = [{seeds(copy, episode) for copy in range(2) for episode in range(50)} for _, seeds in states]
+        assert len(used[0]) == len(used[1]) == 100
+        assert not used[0] & used[1]
+        algorithm.begin_anew(128)
+        begun = algorithm.env_runner_group.foreach_env_runner(
+            lambda runner: runner._play._seeds.steps, local_env_runner=False
+        )
+        assert begun == [128, 128]
+    finally:
+        algorithm.stop()

@@ -24,26 +24,25 @@ def test_no_two_resets_share_a_seed(seed: int, runners: int, copies: int, episod
     assert all(0 <= number < SEEDS for number in seeds)
 
 
-@given(sizes, sizes, st.integers(1, 10), st.integers(1, 10), st.integers(0, 30))
+@given(sizes, sizes, st.integers(0, 1000), st.lists(st.lists(sizes, min_size=1, max_size=8), min_size=2, max_size=5))
 @settings(deadline=None)
-def test_a_life_after_an_interruption_uses_none_of_the_seeds_before(
-    runners: int, copies: int, before: int, after: int, more_moves: int
+def test_what_begins_anew_uses_none_of_the_seeds_before(
+    runners: int, copies: int, steps: int, lives: list[list[int]]
 ) -> None:
-    """Each episode took at least one move, and all copies move together."""
-    steps = runners * copies * before + more_moves
-    assert not set(used(3, runners, copies, before)) & set(used(3, runners, copies, after, steps=steps))
+    """A life is a list of samples: so many actions of each copy at least. Every copy of every runner may have used as
+    many seeds as it can: one at the beginning, and one after each step, in the sample that ends a step late."""
+    before: set[int] = set()
+    for life in lives:
+        turns = sum(share + 1 for share in life)
+        new = used(3, runners, copies, turns + 1, steps)
+        assert not before & set(new)
+        before |= set(new)
+        # What all runners count: at least the share of each.
+        steps += sum(share * copies * runners for share in life)
 
 
-def test_one_runner_that_starts_again_does_not_meet_the_others() -> None:
-    """The others go on with the numbers that they had when it began."""
-    others = {
-        ResetSeeds.of_run(0, runner=runner, runners=3, copies=2, steps=0)(copy, episode)
-        for runner in (0, 2)
-        for copy in range(2)
-        for episode in range(200)
-    }
-    again = ResetSeeds.of_run(0, runner=1, runners=3, copies=2, steps=101)
-    assert not others & {again(copy, episode) for copy in range(2) for episode in range(200)}
+def test_beginning_anew_at_the_same_step_is_the_same_again() -> None:
+    assert used(1, 2, 3, 4, steps=77) == used(1, 2, 3, 4, steps=77)
 
 
 def test_runs_with_other_seeds_begin_elsewhere() -> None:

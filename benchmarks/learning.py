@@ -1,0 +1,202 @@
+"""Do the shipped configurations learn? Each part trains one by the clock and measures what came of it.
+
+Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball. Where several seeds or opponents are trained,
+two learn at once, each in a process of its own on one core. All seeds are printed, none is left out. Returns are per
+agent and episode, of policies that act greedily in fresh episodes, unless it says otherwise.
+"""
+
+import argparse
+import math
+import multiprocessing
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread
+from benchmarks.truncation import as_rllib
+from examples import traffic
+from league.config import LeagueConfig
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+SEEDS = range(5)
+SPREAD_STEPS, SPREAD_BETTER_BY = 1_000_000, 4.0
+"""As many actions for each seed, so that the ablation is compared with as much experience; about two of the ten minutes
+that the target allows."""
+PISTON_SECONDS, PISTON_STEPS = 2700.0, 2_000_000
+NEAR_OPTIMUM = 0.95
+"""Share of the way from random play to the optimum."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One training: which configuration with which settings, and how long, by whichever limit comes first."""
+
+    name: str
+    settings: dict[str, object]
+    seconds: float = math.inf
+    steps: float = math.inf
+    truncation_as_rllib: bool = False
+
+
+def work(job: Job) -> Learned:
+    """Learn on this process's one core."""
+    one_thread()
+    league = LeagueConfig.load(CONFIGS / f"{job.name}.yaml").with_training(**job.settings, runners=0)
+    with local_ray(cpus=1):
+        prepare = as_rllib if job.truncation_as_rllib else None
+        return learn(league, seconds=job.seconds, steps=job.steps, episodes=400, prepare=prepare)
+
+
+def work_all(jobs: Sequence[Job]) -> list[Learned]:
+    """Two at a time, the results in the order of the jobs."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
+        return list(pool.map(work, jobs))
+
+
+def rps(scale: float) -> bool:
+    """The best response to each fixed opponent is known: to win every round, or nothing against a random one."""
+    rounds = 15.0
+    best = {"script:first": rounds, "script:mirror": rounds, "script:random": 0.0}
+    met = True
+    jobs = [Job("rps", {"opponents": [ref]}, 30 * scale) for ref in best]
+    for (ref, value), learned in zip(best.items(), work_all(jobs), strict=True):
+        low, high = interval(learned.greedy)
+        met &= low <= value <= high or learned.greedy.mean() >= value
+        print(
+            f"against {ref}: return {learned.greedy.mean():.2f} per episode of {rounds:g} rounds"
+            f" (95 % interval {low:.2f} … {high:.2f}), best response {value:g}"
+        )
+    return told("best-response value against each opponent", "reached", met)
+
+
+def cars_and_lights(scale: float) -> bool:
+    """Three seeds against the optimum, which the environment's own solver computes."""
+    league = LeagueConfig.load(CONFIGS / "cars_and_lights.yaml")
+    best = traffic.optimum(**league.environment.kwargs)
+    jobs = [Job("cars_and_lights", {"seed": seed}, 120 * scale) for seed in range(3)]
+    met = True
+    for seed, learned in zip(range(3), work_all(jobs), strict=True):
+        own, other = learned.greedy.mean(), learned.random.mean()
+        share = (own - other) / (best - other)
+        met &= bool(share >= NEAR_OPTIMUM)
+        print(
+            f"seed {seed}: {learned.curve[-1].steps:,} actions; return {own:.3f}, random {other:.3f},"
+            f" optimum {best:.3f}: {share:.1%} of the way"
+        )
+    return told("way from random to the optimum", f"{NEAR_OPTIMUM:.0%}", met)
+
+
+def shared_encoder(scale: float) -> bool:
+    """Five seeds with a shared encoder, five with separate networks."""
+    settings = {"shared": {"shared_encoder": True}, "separate": {"shared_encoder": False}}
+    jobs = [Job("shared_encoder", own | {"seed": s}, 90 * scale) for own in settings.values() for s in SEEDS]
+    learned = work_all(jobs)
+    means = {}
+    for label, part in zip(settings, (learned[:5], learned[5:]), strict=True):
+        means[label] = np.array([each.greedy.mean() for each in part])
+        shown = ", ".join(f"{value:.2f}" for value in means[label])
+        steps = np.mean([each.curve[-1].steps for each in part])
+        print(
+            f"{label:>8}: {part[0].parameters:,} parameters; returns of seeds 0 … 4: {shown};"
+            f" mean {means[label].mean():.2f}; {steps:,.0f} actions each"
+        )
+    low, high = stats.t.interval(0.95, len(SEEDS) - 1, means["separate"].mean(), stats.sem(means["separate"]))
+    print(f"  95 % interval of the separate networks' mean: {low:.2f} … {high:.2f}")
+    return told("mean with a shared encoder", "within that interval or above", bool(means["shared"].mean() >= low))
+
+
+def simple_spread(scale: float) -> bool:
+    """Five seeds, and the same five with truncation taken for termination, as RLlib does."""
+    jobs = [
+        Job("simple_spread", {"seed": seed}, steps=SPREAD_STEPS * scale, truncation_as_rllib=ablated)
+        for ablated in (False, True)
+        for seed in SEEDS
+    ]
+    learned = work_all(jobs)
+    met = True
+    print(
+        f"{'truncation':>12} {'seed':>5} {'actions':>11} {'seconds':>8} {'return':>8} {'random':>8} {'better by':>10}"
+    )
+    for job, each in zip(jobs, learned, strict=True):
+        last, better = each.curve[-1], each.greedy.mean() - each.random.mean()
+        label = "as RLlib" if job.truncation_as_rllib else "bootstraps"
+        print(
+            f"{label:>12} {job.settings['seed']:>5} {last.steps:>11,} {last.seconds:>8.0f} {each.greedy.mean():>8.2f}"
+            f" {each.random.mean():>8.2f} {better:>10.2f}"
+        )
+        met &= job.truncation_as_rllib or bool(better >= SPREAD_BETTER_BY)
+    for label, part in (("bootstraps", learned[:5]), ("as RLlib", learned[5:])):
+        finals = np.array([each.greedy.mean() for each in part])
+        print(f"  truncation {label}: {finals.mean():.2f} ± {finals.std(ddof=1):.2f} over the seeds")
+    return told("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
+
+
+def pistonball(scale: float) -> bool:
+    """45 minutes on both cores: a runner beside the learner."""
+    league = LeagueConfig.load(CONFIGS / "pistonball.yaml")
+    with local_ray(cpus=3):
+        learned = learn(league, seconds=PISTON_SECONDS * scale, episodes=8)
+    finals = last_episodes(learned.curve, 0.1)
+    # The pistons of an episode share most of their luck: an episode counts once.
+    random = interval(learned.random.reshape(-1, 20).mean(axis=1))
+    low, high = interval(finals)
+    last = learned.curve[-1]
+    print(
+        f"seed {league.training.seed}: {last.steps:,} actions in {last.seconds:,.0f} s, {learned.rate:,.0f} actions/s"
+    )
+    print(f"  {PISTON_STEPS:,} actions take {PISTON_STEPS / learned.rate / 3600:.2f} hours at this rate")
+    print(
+        f"  return in training, last tenth of the episodes: {finals.mean():.2f}, 95 % interval {low:.2f} … {high:.2f}"
+    )
+    print(f"  random: {learned.random.mean():.2f}, 95 % interval {random[0]:.2f} … {random[1]:.2f}")
+    print(f"  greedy: {learned.greedy.mean():.2f} over {len(learned.greedy) // 20} episodes")
+    for point in learned.curve[:: max(1, len(learned.curve) // 20)]:
+        print(f"    {point.steps:>9,} actions: {next(iter(point.returns.values()), float('nan')):8.2f}")
+    return told("its interval above random's", "yes", low > random[1])
+
+
+def last_episodes(curve: Sequence[Point], share: float) -> NDArray:
+    """Mean returns of the updates in which the last `share` of all episodes ended."""
+    ended = [point for point in curve if point.episodes]
+    counts = np.cumsum([point.episodes for point in ended])
+    chosen = [point for point, count in zip(ended, counts, strict=True) if count > counts[-1] * (1 - share)]
+    return np.array([next(iter(point.returns.values())) for point in chosen])
+
+
+def told(what: str, target: str, met: bool) -> bool:
+    """Print whether a target is met."""
+    print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
+    return met
+
+
+PARTS: dict[str, Callable[[float], bool]] = {
+    part.__name__: part for part in (rps, cars_and_lights, shared_encoder, simple_spread, pistonball)
+}
+
+
+def main() -> int:
+    """Run the parts that were asked for; 1 if a target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
+    parser.add_argument("--quick", action="store_true", help="a thirtieth of the time, for a look")
+    options = parser.parse_args()
+    if unknown := [part for part in options.parts if part not in PARTS]:
+        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
+    missed = []
+    for name in options.parts or PARTS:
+        print(f"\n-- {name} --", flush=True)
+        if not PARTS[name](1 / 30 if options.quick else 1.0):
+            missed.append(name)
+    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
+    return bool(missed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

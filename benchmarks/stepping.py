@@ -1,0 +1,179 @@
+"""Bare stepping, without a network: our lockstep copies against the stock environments, all with random legal actions.
+
+The stock environment is PettingZoo's `env()` or `parallel_env()` as users get it, in PettingZoo's own loop; its resets
+take no seed, which spares it some work, while each of ours has one. For pistonball it is SuperSuit's stack on the bare
+parallel environment, without the checking wrappers. Rates are environment steps per second (moves, in a game of turns)
+on one core; the two take turns within a round, and a rate is the median over the rounds.
+"""
+
+import argparse
+import itertools
+import logging
+import os
+import random
+import statistics
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+import numpy as np
+import supersuit
+from mpe2 import simple_spread_v3
+from pettingzoo.butterfly.pistonball import pistonball
+from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
+from pettingzoo.utils.conversions import aec_to_parallel_wrapper
+
+from league.config import EnvironmentConfig
+from league.environments.lockstep import stepping
+from league.environments.stepping import Batch, Episode
+from league.spaces import ACTION_MASK
+
+DRAWN = {"render_mode": "rgb_array"}
+"""Without it, pistonball draws nothing, and all its observations are the same."""
+STACK = [
+    {"color_reduction_v0": {"mode": "B"}},
+    {"resize_v1": {"x_size": 84, "y_size": 84}},
+    {"frame_stack_v1": {"stack_size": 4}},
+]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One environment. stock: steps the stock environment for ever, yielding at each step."""
+
+    config: EnvironmentConfig
+    copies: int
+    stock: Callable[[], Iterator[None]]
+    target: float
+
+
+def main() -> int:
+    """Print rates and ratios; 1 if a ratio is below its target."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="shorter measurements, for a look")
+    quick = parser.parse_args().quick
+    logging.disable(logging.WARNING)
+    warnings.simplefilter("ignore")
+    failed = 0
+    print(f"{'':>28} {'ours':>9} {'stock':>9}   steps/s")
+    for name, case in CASES.items():
+        ours, stock = measure(case, rounds=3 if quick else 9, seconds=0.4 if quick else 1.0)
+        ratio = ours / stock
+        failed |= ratio < case.target
+        note = "" if ratio >= case.target else "  BELOW TARGET"
+        print(f"{name:>28} {ours:>9,.0f} {stock:>9,.0f}   {ratio:.2f}x (target {case.target:g}x){note}", flush=True)
+    return int(failed)
+
+
+def measure(case: Case, rounds: int, seconds: float) -> tuple[float, float]:
+    """Steps per second, ours and the stock environment's."""
+    ours, stock = lockstep(case.config, case.copies), case.stock()
+    rates: tuple[list[float], list[float]] = ([], [])
+    for _ in range(rounds + 1):
+        for found, steps, each in zip(rates, (ours, stock), (case.copies, 1), strict=True):
+            found.append(each * rate(steps, seconds))
+    return statistics.median(rates[0][1:]), statistics.median(rates[1][1:])  # the first round warms up
+
+
+def rate(steps: Iterator[None], seconds: float) -> float:
+    """Items of an iterator per second."""
+    taken, began = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - began) < seconds:
+        next(steps)
+        taken += 1
+    return taken / elapsed
+
+
+def lockstep(config: EnvironmentConfig, copies: int) -> Iterator[None]:
+    """All copies, one step in each at a time."""
+    env, seeds, rng = stepping(config, copies), itertools.count(), np.random.default_rng(0)
+    turn = env.start(lambda _: Episode(next(seeds), ("all",) * len(env.agents)))
+    space = DRAWS[config.entry_point]
+    while True:
+        turn = env.step({group: space(batch, rng) for group, batch in turn.batches.items()})
+        yield
+
+
+def masked(batch: Batch, rng: np.random.Generator) -> Any:
+    """A legal action for each row."""
+    mask = batch.observations[ACTION_MASK]
+    return (rng.random(mask.shape) * (mask != 0)).argmax(axis=1)
+
+
+def turns(env: Any) -> Iterator[None]:
+    """PettingZoo's loop over a game with masks."""
+    while True:
+        env.reset()
+        for _ in env.agent_iter():
+            observation, _, terminated, truncated, _ = env.last()
+            if terminated or truncated:
+                env.step(None)
+                continue
+            env.step(random.choice(np.flatnonzero(observation[ACTION_MASK]).tolist()))
+            yield
+
+
+def together(env: Any, act: Callable[[], Any]) -> Iterator[None]:
+    """PettingZoo's loop over an environment in which all act at once."""
+    while True:
+        env.reset()
+        while env.agents:
+            env.step({agent: act() for agent in env.agents})
+            yield
+
+
+def stock_pistonball() -> Iterator[None]:
+    """SuperSuit's stack on the bare parallel environment."""
+    env = aec_to_parallel_wrapper(pistonball.raw_env(**DRAWN))
+    for wrapper in STACK:
+        for name, arguments in wrapper.items():
+            env = getattr(supersuit, name)(env, **arguments)
+    rng = np.random.default_rng(0)
+    return together(env, lambda: rng.uniform(-1, 1, 1).astype(np.float32))
+
+
+DRAWS: dict[str, Callable[[Batch, np.random.Generator], Any]] = {
+    "mpe2.simple_spread_v3": lambda batch, rng: rng.integers(5, size=len(batch.copies)),
+    "pettingzoo.classic.connect_four_v3": masked,
+    "pettingzoo.classic.leduc_holdem_v4": masked,
+    "pettingzoo.butterfly.pistonball_v6": lambda batch, rng: rng.uniform(-1, 1, (len(batch.copies), 1)).astype(
+        np.float32
+    ),
+}
+CASES = {
+    "simple_spread": Case(
+        EnvironmentConfig(entry_point="mpe2.simple_spread_v3"),
+        32,
+        lambda: together(simple_spread_v3.parallel_env(), lambda: random.randrange(5)),
+        1.2,
+    ),
+    "connect_four": Case(
+        EnvironmentConfig(entry_point="pettingzoo.classic.connect_four_v3"),
+        32,
+        lambda: turns(connect_four_v3.env()),
+        1.5,
+    ),
+    "leduc_holdem": Case(
+        EnvironmentConfig(entry_point="pettingzoo.classic.leduc_holdem_v4"),
+        32,
+        lambda: turns(leduc_holdem_v4.env()),
+        1.2,
+    ),
+    "pistonball with its wrappers": Case(
+        EnvironmentConfig.model_validate(
+            {"entry_point": "pettingzoo.butterfly.pistonball_v6", "kwargs": DRAWN, "wrappers": STACK}
+        ),
+        4,
+        stock_pistonball,
+        1.5,
+    ),
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,90 @@
+"""What is to be shown: a game between versions and scripts, or one that the ledger has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from evaluation.contestants import pinned
+from evaluation.exhibition import Moment, exhibit
+from evaluation.play import sides_of
+from evaluation.replay import replay
+from league.config import LeagueConfig
+from league.environments.stepping import BatchedEnvironment
+from league.errors import InvalidReference
+from league.interface import Interface
+from league.policies.loading import contestant
+from league.refs import CheckpointRef, parse_ref
+from league.registry.registry import Registry
+from league.results.ledger import Ledger
+
+
+@dataclass(frozen=True, slots=True)
+class Show:
+    """A game that can be played before somebody's eyes.
+
+    cast: agent → reference of who plays it. play: environment of one copy → the game, step by step.
+    """
+
+    title: str
+    config: LeagueConfig
+    interface: Interface
+    cast: Mapping[str, str]
+    play: Callable[[BatchedEnvironment], Iterator[Moment]]
+
+
+def between(refs: Sequence[str], registry: Registry, side: str | None = None, seed: int = 0) -> Show:
+    """A game of `refs`: the first plays `side` (by default the league's first), the others the other sides in order.
+
+    The last one plays all sides that are left; one alone plays against itself.
+    Raises InvalidReference without a version among them, for more of them than sides, and for a side that there is
+    not, and what loading them raises.
+    """
+    versions = [ref for ref in map(parse_ref, refs) if isinstance(ref, CheckpointRef)]
+    if not versions:
+        raise InvalidReference(
+            "name at least one version, such as connect_four@champion: it says which league is shown"
+        )
+    row = registry.league(versions[0].league)
+    names = [pinned(ref, row.slug, registry) for ref in refs]
+    players = {ref: contestant(ref, registry, row.interface) for ref in names}
+    cast = _cast(names, row.interface, side)
+    policies = {agent: players[ref][agent][1] for agent, ref in cast.items()}
+    return Show(
+        title=f"{row.slug} · seed {seed}",
+        config=row.config,
+        interface=row.interface,
+        cast=cast,
+        play=lambda environment: exhibit(environment, policies, seed),
+    )
+
+
+def recorded(match: str, game: int, registry: Registry) -> Show:
+    """Game number `game` of a match of the ledger, exactly as it was played.
+
+    Raises NotFound, and InvalidReference if the match has no such game.
+    """
+    record = Ledger(registry).match(match)
+    if not 0 <= game < len(record.games):
+        raise InvalidReference(f"match {match} has games 0 to {len(record.games) - 1}, not {game}")
+    row = registry.league(record.league)
+    agents = list(row.interface.agents)
+    seats = zip(agents, sides_of(agents, row.interface), strict=True)
+    return Show(
+        title=f"{match} · game {game}",
+        config=row.config,
+        interface=row.interface,
+        cast={agent: record.contestants[record.games[game].sides[side]] for agent, side in seats},
+        play=lambda environment: replay(environment, row.config, row.interface, record, game),
+    )
+
+
+def _cast(refs: Sequence[str], interface: Interface, first: str | None) -> dict[str, str]:
+    sides = list(interface.sides)
+    if first is not None and first not in sides:
+        raise InvalidReference(f"there is no side {first!r}; known: {', '.join(sides)}")
+    if len(refs) > len(sides):
+        raise InvalidReference(f"{len(refs)} were named for {len(sides)} side(s): {', '.join(sides)}")
+    sides.sort(key=lambda side: side != first)
+    player = {side: refs[min(place, len(refs) - 1)] for place, side in enumerate(sides)}
+    return {agent: player[side] for side, agents in interface.sides.items() for agent in agents}

@@ -1,0 +1,29 @@
+"""Who did better: from the returns of a block's two games to 1, ½ or 0 for each contestant in each.
+
+Where the sides are alike, opponents are compared within each game: the usual win, draw and loss. Where they are not, an
+adversary's return says nothing beside that of the agents it works against, and where there is one side only, nobody is
+in the same game. There a contestant is compared with the other one on the same side in the other game, which has the
+same seed and opening: both have had the same task.
+
+Either way the scores of a block sum to half their number, and change places when the contestants do; so policies that
+play alike score ½ on average, whatever a seat is worth.
+"""
+
+from collections.abc import Sequence
+
+from league.results.records import Scoring
+
+Values = tuple[float | None, ...]
+
+
+def scores(returns: Sequence[Values], scoring: Scoring) -> list[Values]:
+    """returns[g][c]: what contestant c got in game g of its block, None if it took no part; scores likewise."""
+    return [tuple(_score(returns, game, c, scoring) for c in range(len(returns[game]))) for game in range(len(returns))]
+
+
+def _score(returns: Sequence[Values], game: int, contestant: int, scoring: Scoring) -> float | None:
+    mine = returns[game][contestant]
+    other = returns[game if scoring == "game" else 1 - game][1 - contestant]
+    if mine is None or other is None:
+        return None
+    return 1.0 if mine > other else 0.5 if mine == other else 0.0

@@ -1,0 +1,43 @@
+import numpy as np
+import pytest
+from scipy.stats import ttest_1samp
+
+from evaluation.paired import paired_difference, student
+from league.results.records import Game, Match
+
+GAPS = (1.0, 2.5, -0.5, 3.0, 0.25)
+
+
+def match(position: int, gap: float, alone: bool) -> Match:
+    """A block in which contestant 0 gets `gap` more, on a seed that is worth `position`."""
+    mine, other = position + gap, float(position)
+    if alone:
+        games = (Game((0,), 1, (), (), (mine, None), (1.0, None)), Game((1,), 1, (), (), (None, other), (None, 0.0)))
+    else:
+        games = tuple(Game((i, 1 - i), 1, (), (), (mine, other), (1.0, 0.0)) for i in range(2))
+    return Match(f"s/{position}", "league", "s", position, ("a", "b"), 1, "digest", games)
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_differences_are_paired_by_block(alone: bool) -> None:
+    matches = [match(position, gap, alone) for position, gap in enumerate(GAPS)]
+    interval = ttest_1samp(GAPS, 0).confidence_interval()
+    gap = paired_difference(matches, "a")
+    assert gap is not None
+    assert (gap.mean, gap.low, gap.high) == pytest.approx((np.mean(GAPS), interval.low, interval.high))
+    other = paired_difference(matches, "b")
+    assert other is not None
+    assert (other.mean, other.low, other.high) == pytest.approx((-gap.mean, -interval.high, -interval.low))
+
+
+def test_one_block_has_no_interval_and_none_no_difference() -> None:
+    assert paired_difference([], "a") is None
+    alone = student([2.0])
+    assert (alone.mean, alone.low, alone.high) == (2.0, None, None)
+
+
+def test_intervals_cover() -> None:
+    """5,000 series of 8 blocks: 95 % of the intervals hold the mean, three binomial standard errors allowed."""
+    values = np.random.default_rng(1).normal(3.0, 2.0, size=(5000, 8))
+    covered = sum(low <= 3.0 <= high for low, high in ((s.low, s.high) for s in map(student, values)) if low and high)
+    assert covered / 5000 == pytest.approx(0.95, abs=3 * np.sqrt(0.05 * 0.95 / 5000))

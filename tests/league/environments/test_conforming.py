@@ -1,0 +1,48 @@
+"""Lockstep is the plain loop of each API, for stock environments whose own code has had no hand of ours on it."""
+
+import importlib
+from typing import Any
+
+import pytest
+
+from examples.traffic import crossing
+from league.config import EnvironmentConfig
+from league.environments.lockstep import stepping
+from tests.conformance.stepping import assert_stepping_conforms
+from tests.league.environments.simultaneous import meeting, rllib_meeting
+
+PARALLEL: dict[str, dict[str, Any]] = {
+    "mpe2.simple_spread_v3": {},
+    "mpe2.simple_world_comm_v3": {"continuous_actions": True},
+    "pettingzoo.classic.rps_v2": {"max_cycles": 6},
+    "pettingzoo.butterfly.knights_archers_zombies_v11": {"max_cycles": 120, "spawn_delay": 2},
+    "pettingzoo.sisl.multiwalker_v9": {"max_cycles": 40},
+}
+AEC: dict[str, dict[str, Any]] = {
+    "pettingzoo.classic.leduc_holdem_v4": {},
+    "pettingzoo.classic.texas_holdem_no_limit_v6": {"num_players": 3},
+    "pettingzoo.classic.tictactoe_v3": {},
+}
+OWN: dict[str, tuple[Any, dict[str, Any]]] = {
+    "tests.league.environments.simultaneous:meeting": (
+        meeting,
+        {"arrives": [0, 2, 1, 0], "leaves": [4, 5, 2, 3], "truncated": [1, 2]},
+    ),
+    "tests.league.environments.simultaneous:rllib_meeting": (rllib_meeting, {"ends": 4}),
+    "examples.traffic:crossing": (crossing, {}),
+}
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize("entry_point", [*PARALLEL, *AEC, *OWN])
+def test_lockstep_is_the_plain_loop(entry_point: str, copies: int) -> None:
+    if entry_point in OWN:
+        make, kwargs = OWN[entry_point]
+    elif entry_point in PARALLEL:
+        make, kwargs = importlib.import_module(entry_point).parallel_env, PARALLEL[entry_point]
+    else:
+        make, kwargs = importlib.import_module(entry_point).env, AEC[entry_point]
+    config = EnvironmentConfig(entry_point=entry_point, kwargs=kwargs)
+    assert_stepping_conforms(
+        lambda n: stepping(config, n), lambda: make(**kwargs), seeds=[11, 12, 13, 14], copies=copies
+    )

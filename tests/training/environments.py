@@ -1,0 +1,137 @@
+"""Environments that a right learner solves in seconds, one for each thing that a policy may need."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+ROUNDS = 4
+
+
+class Guessing(ParallelEnv):
+    """Each agent sees a task, and is paid by how well its action answers it; after ROUNDS tasks all are truncated.
+
+    action: the action space. tell: (task, action) → reward of agent 0; the others are paid the opposite if `opposed`.
+    """
+
+    def __init__(
+        self,
+        observation: gymnasium.Space,
+        action: gymnasium.Space,
+        tell: Callable[[Any, Any], float],
+        agents: int = 1,
+        opposed: bool = False,
+    ) -> None:
+        self.possible_agents = [f"player_{i}" for i in range(agents)]
+        self._observation, self._action = observation, action
+        self._tell, self._opposed = tell, opposed
+
+    def observation_space(self, agent: str) -> gymnasium.Space:
+        return self._observation
+
+    def action_space(self, agent: str) -> gymnasium.Space:
+        return self._action
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents = self.possible_agents[:]
+        self._observation.seed(seed)
+        self._round = 0
+        return self._tasks(), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        rewards = {agent: self._tell(self._task[agent], action) for agent, action in actions.items()}
+        if self._opposed:
+            rewards |= {agent: -reward for agent, reward in rewards.items() if agent != "player_0"}
+        self._round += 1
+        over = self._round == ROUNDS
+        agents, self.agents = self.agents, [] if over else self.agents
+        ends = dict.fromkeys(agents, over)
+        return self._tasks(agents), rewards, dict.fromkeys(agents, False), ends, {agent: {} for agent in agents}
+
+    def _tasks(self, agents: list[str] | None = None) -> dict[str, Any]:
+        self._task = {agent: self._observation.sample() for agent in agents or self.agents}
+        return dict(self._task)
+
+
+def discrete(agents: int = 1, opposed: bool = False) -> ParallelEnv:
+    """Name the number that is shown. Best return per agent: ROUNDS; with `opposed` the others name any other one: 0."""
+    return Guessing(
+        spaces.Discrete(3), spaces.Discrete(3, start=1), lambda task, action: float(action == task + 1), agents, opposed
+    )
+
+
+def several(agents: int = 1) -> ParallelEnv:
+    """Name two numbers that are shown, the second the other way round. Best return: ROUNDS."""
+    return Guessing(
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiDiscrete([2, 3]),
+        lambda task, action: 0.5 * (action[0] == task[0]) + 0.5 * (action[1] == 2 - task[1]),
+        agents,
+    )
+
+
+def numbers() -> ParallelEnv:
+    """Give back two numbers on another scale. Best return: 0; that of the middle of the action space is below -1."""
+    scale, shift = np.array([4.0, 10.0]), np.array([0.0, 5.0])
+    return Guessing(
+        spaces.Box(-0.5, 0.5, (2,), np.float64),
+        spaces.Box(np.array([-2, 0], np.float32), np.array([2, 10], np.float32)),
+        lambda task, action: -float(np.abs((action - shift) / scale - task).mean()),
+    )
+
+
+def far_numbers(agents: int = 1) -> ParallelEnv:
+    """Is the number above a million? They are a few ones apart from it. Best return: ROUNDS."""
+    return Guessing(
+        spaces.Box(999_996, 1_000_004, (1,), np.float32),
+        spaces.Discrete(2),
+        lambda task, action: float(action == int(task[0] > 1_000_000)),
+        agents,
+    )
+
+
+def bits() -> ParallelEnv:
+    """Actions that no policy can have."""
+    return Guessing(spaces.Discrete(2), spaces.MultiBinary(2), lambda *_: 0.0)
+
+
+class Remembering(ParallelEnv):
+    """A bit is shown once; two steps later, of which nothing is to be seen, it is to be named. Best return: 1, and 0
+    without a memory: what is wrong costs as much."""
+
+    LENGTH, NOTHING = 3, 2
+
+    def __init__(self) -> None:
+        self.possible_agents = ["player_0"]
+
+    def observation_space(self, agent: str) -> gymnasium.Space:
+        return spaces.Discrete(3)
+
+    def action_space(self, agent: str) -> gymnasium.Space:
+        return spaces.Discrete(2)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents = self.possible_agents[:]
+        self._bit = int(np.random.default_rng(seed).integers(2))
+        self._steps = 0
+        return {"player_0": self._bit}, {"player_0": {}}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        self._steps += 1
+        over = self._steps == self.LENGTH
+        reward = (1.0 if actions["player_0"] == self._bit else -1.0) if over else 0.0
+        self.agents = [] if over else self.agents
+        return (
+            {"player_0": self.NOTHING},
+            {"player_0": reward},
+            {"player_0": over},
+            {"player_0": False},
+            {"player_0": {}},
+        )
+
+
+def remembering() -> ParallelEnv:
+    return Remembering()

@@ -1,0 +1,196 @@
+"""The learner, alone: on episodes that a runner in this process has sampled."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from ray.rllib.core.learner.training_data import TrainingData
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.utils.metrics import ALL_MODULES
+
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.errors import ConfigError
+from tests.training.leagues import solvable
+from training.algorithms.ppo import algorithm_config
+from training.learners import ppo
+from training.learners.ppo import PPOLearner
+from training.learners.train_batch import train_batch
+from training.sampling.env_runner import LockstepEnvRunner
+
+TWO: dict[str, Any] = {"kwargs": {"agents": 2}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
+UPDATE = {"num_epochs": 2, "minibatch_size": 64}
+
+pytestmark = pytest.mark.usefixtures("ray_session")
+
+
+def learner_of(league: LeagueConfig) -> PPOLearner:
+    config = algorithm_config(league, interface(league))
+    learner = PPOLearner(config=config, module_spec=config.rl_module_spec)
+    learner.build()
+    return learner
+
+
+def played(league: LeagueConfig, steps: int = 256) -> list[SingleAgentEpisode]:
+    runner = LockstepEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
+    try:
+        return runner.sample(num_timesteps=steps)
+    finally:
+        runner.stop()
+
+
+def learn(learner: PPOLearner, episodes: list[SingleAgentEpisode], **options: Any) -> dict[str, Any]:
+    return learner.update(training_data=TrainingData(episodes=episodes), **(UPDATE | options))
+
+
+def weights(learner: PPOLearner) -> dict[str, dict[str, np.ndarray]]:
+    return {policy: module.get_state() for policy, module in learner.module.items()}
+
+
+def equal(first: Any, second: Any) -> bool:
+    """Of nested states."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(equal(value, second[key]) for key, value in first.items())
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(equal, first, second))
+    return bool(np.array_equal(first, second))
+
+
+@pytest.fixture(scope="module")
+def two() -> tuple[LeagueConfig, list[SingleAgentEpisode]]:
+    league = solvable("discrete", **TWO)
+    return league, played(league)
+
+
+def test_an_update_changes_every_policy_and_says_how(two: tuple) -> None:
+    learner = learner_of(two[0])
+    before = weights(learner)
+    metrics = learn(learner, two[1])
+    after = weights(learner)
+    for policy in ("a", "b"):
+        assert not equal(before[policy], after[policy])
+        logged = {name: float(stats.peek()) for name, stats in metrics[policy].items()}
+        assert {*ppo.STATISTICS, ppo.EXPLAINED_VARIANCE, ppo.KL} <= logged.keys()
+        assert all(np.isfinite(value) for value in logged.values())
+        assert 0 < logged["kl"] < 0.5
+        assert logged["gradient_norm"] > 0
+        assert 0 < logged["entropy"] <= np.log(3)
+
+
+@pytest.mark.parametrize("training", [{}, {"normalize_observations": True}], ids=["plain", "normalised"])
+def test_a_policy_that_rests_keeps_weights_and_optimiser(training: dict[str, Any]) -> None:
+    league = solvable("far_numbers", kwargs={"agents": 2}, policies=TWO["policies"], **training)
+    learner, episodes = learner_of(league), played(league)
+    learn(learner, episodes)
+    before, optimizers = weights(learner), learner._get_optimizer_state()
+    metrics = learn(learner, episodes, policies=("b",))
+    after, moved = weights(learner), learner._get_optimizer_state()
+    assert equal(before["a"], after["a"])
+    assert equal(optimizers["a_default_optimizer"], moved["a_default_optimizer"])
+    assert not equal(before["b"], after["b"])
+    assert not equal(optimizers["b_default_optimizer"], moved["b_default_optimizer"])
+    assert set(metrics) == {"b"}
+    assert learn(learner, episodes, policies=()) == {}
+    assert equal(after, weights(learner))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("discrete", TWO | {"shared_encoder": True}),
+        ("far_numbers", {"normalize_observations": True}),
+        ("remembering", {"recurrence": {"width": 8, "sequence": 2}}),
+        ("numbers", {}),
+    ],
+    ids=["shared", "normalised", "recurrent", "continuous"],
+)
+def test_learning_goes_on_from_disk_as_it_would_have(name: str, options: dict[str, Any], tmp_path: Path) -> None:
+    league = solvable(name, **options)
+    first, second = played(league), played(league.with_training(seed=9))
+    learner = learner_of(league)
+    learn(learner, first)
+    learner.save_to_path(tmp_path / "state")
+    torch.manual_seed(1)
+    learn(learner, second)
+
+    restored = learner_of(league.with_training(seed=8))
+    restored.restore_from_path(tmp_path / "state")
+    torch.manual_seed(1)
+    learn(restored, second)
+    assert equal(weights(learner), weights(restored))
+    assert equal(learner._get_optimizer_state(), restored._get_optimizer_state())
+
+
+def test_each_policy_learns_by_its_own_settings(two: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = {"b": {"lr": 0.5, "gamma": 0.1, "lambda": 0.2, "clip": 0.4, "entropy": 0.6}}
+    league = two[0].with_training(per_policy=own)
+    learner = learner_of(league)
+    used: dict[str, Any] = {}
+
+    def batch(module: Any, chunks: Any, **options: Any) -> Any:
+        used[chunks[0].module_id] = (options["gamma"], options["lambda_"])
+        return train_batch(module, chunks, **options)
+
+    def loss(steps: Any, *arguments: Any, **options: Any) -> Any:
+        used[f"loss {arguments[2] is learner.module['b'].distribution}"] = (options["clip"], options["entropy"])
+        return original(steps, *arguments, **options)
+
+    original = ppo.ppo_loss
+    monkeypatch.setattr(ppo, "train_batch", batch)
+    monkeypatch.setattr(ppo, "ppo_loss", loss)
+    learn(learner, two[1])
+    settings = league.training
+    assert used["a"] == (settings.gamma, settings.lambda_)
+    assert used["b"] == (0.1, 0.2)
+    assert used["loss False"] == (settings.clip, settings.entropy)
+    assert used["loss True"] == (0.4, 0.6)
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in learner._named_optimizers.items()}
+    assert rates == {"a_default_optimizer": settings.lr, "b_default_optimizer": 0.5}
+
+
+def test_a_shared_encoder_has_one_optimiser_that_each_policys_loss_moves(two: tuple) -> None:
+    league = two[0].with_training(shared_encoder=True)
+    learner = learner_of(league)
+    names = list(learner._named_optimizers)
+    assert names == ["a_default_optimizer", "b_default_optimizer", f"{ALL_MODULES}_default_optimizer"]
+    parameters = [set(map(id, optimizer.param_groups[0]["params"])) for optimizer in learner._named_optimizers.values()]
+    assert sum(map(len, parameters)) == len(set.union(*parameters))
+    assert parameters[2] == set(map(id, learner.module.encoder.parameters()))
+    before = learner.module.encoder.hidden[0].weight.detach().clone()
+    learn(learner, [episode for episode in two[1] if episode.module_id == "b"])
+    assert not torch.equal(before, learner.module.encoder.hidden[0].weight)
+
+
+def test_a_gradient_that_is_not_finite_is_dropped(two: tuple, caplog: pytest.LogCaptureFixture) -> None:
+    learner = learner_of(two[0])
+    with torch.no_grad():
+        learner.module["a"].value_head.bias.fill_(1e30)
+    before = weights(learner)
+    learn(learner, two[1])
+    after = weights(learner)
+    assert equal(before["a"], after["a"])
+    assert not equal(before["b"], after["b"])
+    assert "Dropped a gradient of a that is not finite" in caplog.text
+
+
+def test_a_gpu_that_there_is_not_is_refused(two: tuple) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(ConfigError, match=r"training\.gpus: 0\.5 asked for the learner, but torch sees no GPU"):
+        learner_of(two[0].with_training(gpus=0.5))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_learns_as_the_processor_does(two: tuple) -> None:
+    torch.manual_seed(0)
+    learners = [learner_of(two[0].with_training(gpus=gpus)) for gpus in (0, 1)]
+    for policy, module in learners[1].module.items():
+        module.set_state(learners[0].module[policy].get_state())
+    for learner in learners:
+        torch.manual_seed(1)
+        learn(learner, two[1])
+    for policy, state in weights(learners[0]).items():
+        for name, value in state.items():
+            np.testing.assert_allclose(weights(learners[1])[policy][name], value, atol=1e-4)

@@ -1,0 +1,153 @@
+"""A league's environment for a plain RLlib script: `register(league)`, then `PPOConfig().environment(league.league)`.
+
+RLlib's own wrappers of PettingZoo report a wrong end where some agents terminate as the others are truncated, drop the
+infos of a reset, know only the agents of its first moment, and cannot render.
+"""
+
+import secrets
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pettingzoo import AECEnv
+from ray.rllib.env.multi_agent_env import MultiAgentEnv
+from ray.tune.registry import register_env
+
+from league.config import LeagueConfig
+from league.environments.building import build, interface
+from league.environments.lockstep import Lockstep
+from league.environments.stepping import Episode, Turn
+from league.errors import EnvironmentMismatch
+from league.spaces import Space, paths, to_gymnasium
+from training.sampling.reset_seeds import ResetSeeds
+
+Agents = dict[str, Any]
+"""agent → something of it."""
+
+
+def register(league: LeagueConfig) -> None:
+    """Make the league's environment known to RLlib and Tune under the league's name.
+
+    `env_config` takes `render_mode` (`rgb_array`), without which there is nothing to render.
+    """
+    register_env(league.league, lambda context: LeagueEnv(league, context.get("render_mode")))
+
+
+class LeagueEnv(MultiAgentEnv):
+    """One copy of a league's environment, whatever its API, wrappers included.
+
+    Observations and actions are the environment's own, masks included. An agent has an observation when it must act,
+    with what it got since its last one, and when it leaves. The episode is over when `__all__` is set in one of the two
+    dictionaries of flags. Agents that are truncated then have no flag but that one: RLlib 2.60 takes them for
+    terminated where each has its own.
+    """
+
+    metadata: dict[str, Any]
+
+    def __init__(self, league: LeagueConfig, render_mode: str | None = None) -> None:
+        """Raises what building the environment raises."""
+        super().__init__()
+        described = interface(league)
+        self.metadata, self.render_mode = {}, render_mode
+        self.possible_agents = list(described.agents)
+        self.agents: list[str] = []
+        self._observed = {agent: spaces.observation for agent, spaces in described.agents.items()}
+        self.observation_spaces = {agent: to_gymnasium(space) for agent, space in self._observed.items()}
+        self.action_spaces = {agent: to_gymnasium(spaces.action) for agent, spaces in described.agents.items()}
+        self.observation_space = gymnasium.spaces.Dict(self.observation_spaces)
+        self.action_space = gymnasium.spaces.Dict(self.action_spaces)
+        self._infos = Infos(build(league.environment, render_mode))
+        self._stepping = Lockstep(lambda: self._infos.env, 1)
+        self._coming: list[Episode] = []
+        self._seeds: ResetSeeds | None = None
+        self._episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Agents, Agents]:  # noqa: ARG002
+        """Begin an episode: by `seed`, else by one of its own that follows from the last seed given, or from chance."""
+        if seed is not None or self._seeds is None:
+            first = secrets.randbits(64) if seed is None else seed
+            self._seeds = ResetSeeds.of_run(first, runner=0, runners=1, copies=1, steps=0)
+            self._episodes = 0
+        number = self._seeds(0, self._episodes) if seed is None else seed
+        self._episodes += 1
+        self._coming = [Episode(number, self.possible_agents)]
+        turn = self._stepping.start(lambda _: self._coming.pop() if self._coming else None)
+        if not turn.batches:
+            raise EnvironmentMismatch("the environment has reset to an episode in which nobody acts")
+        observations, _, infos = self._rows(turn)
+        return observations, infos
+
+    def step(self, action_dict: Mapping[str, Any]) -> tuple[Agents, Agents, Agents, Agents, Agents]:
+        """Act for each agent that had an observation. Raises IllegalAction."""
+        turn = self._stepping.step({agent: np.asarray(action_dict[agent])[np.newaxis] for agent in self.agents})
+        observations, rewards, infos = self._rows(turn)
+        terminated, truncated = dict.fromkeys(observations, False), dict.fromkeys(observations, False)
+        is_over = not turn.batches
+        for ending in turn.endings:
+            agent = self.possible_agents[ending.agent]
+            observations[agent] = _value(self._observed[agent], ending.observation)
+            rewards[agent] = ending.reward
+            infos[agent] = self._infos.of(agent)
+            terminated[agent] = ending.terminated
+            truncated[agent] = ending.truncated and not is_over
+        is_cut = is_over and any(not ending.terminated for ending in turn.endings)
+        terminated["__all__"], truncated["__all__"] = is_over and not is_cut, is_cut
+        return observations, rewards, terminated, truncated, infos
+
+    def render(self) -> Any:
+        """(height, width, 3) uint8. Raises EnvironmentMismatch without `render_mode`."""
+        return self._stepping.render(0)
+
+    def close(self) -> None:
+        """Release the environment."""
+        self._stepping.close()
+
+    def _rows(self, turn: Turn) -> tuple[Agents, Agents, Agents]:
+        """Observations, rewards and infos of the agents that must act, in the order of `possible_agents`."""
+        self.agents = [agent for agent in self.possible_agents if agent in turn.batches]
+        rows = {agent: turn.batches[agent] for agent in self.agents}
+        return (
+            {
+                agent: _value(self._observed[agent], {name: array[0] for name, array in batch.observations.items()})
+                for agent, batch in rows.items()
+            },
+            {agent: batch.rewards[0] for agent, batch in rows.items()},
+            {agent: self._infos.of(agent) for agent in rows},
+        )
+
+
+class Infos:
+    """What an environment last said beside its observations: an AECEnv keeps it, others only answer it."""
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self._last: Mapping[str, Any] = {}
+        if not isinstance(env, AECEnv):
+            env.reset, env.step = self._kept(env.reset), self._kept(env.step)
+
+    def of(self, agent: str) -> dict[str, Any]:
+        """Nothing of an agent that an AECEnv has led out."""
+        infos = self.env.infos if isinstance(self.env, AECEnv) else self._last
+        return dict(infos.get(agent, {}))
+
+    def _kept(self, call: Any) -> Any:
+        def keeping(*args: Any, **kwargs: Any) -> Any:
+            answer = call(*args, **kwargs)
+            self._last = answer[-1]
+            return answer
+
+        return keeping
+
+
+def _value(space: Space, arrays: Mapping[str, Any]) -> Any:
+    """An observation in the environment's own form."""
+    value: Any = {}
+    for name, path in paths(space).items():
+        if not path:
+            return arrays[name]
+        part = value
+        for key in path[:-1]:
+            part = part.setdefault(key, {})
+        part[path[-1]] = arrays[name]
+    return value
