@@ -12,7 +12,8 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 def test_the_commands_are_those_of_the_mission() -> None:
     assert set(COMMANDS) == {
-        "doctor", "train", "versions", "evaluate", "promote", "rollback", "history", "nightly", "serve", "act", "demo",
+        "doctor", "check-env", "train", "sweep", "versions", "evaluate", "promote", "rollback", "history", "nightly",
+        "replay", "serve", "act", "demo",
     }  # fmt: skip
 
 

@@ -220,8 +220,12 @@ def test_a_discrete_observation_stays_in_its_range(unchanging: TestClient) -> No
     assert "observation.sense is a list" in error["message"]
 
 
-def test_a_continuous_policy_cannot_explore(unchanging: TestClient) -> None:
-    refused(unchanging, {"observation": [0, 0], "explore": True}, model="vector")
+def test_a_continuous_policy_explores_reproducibly(unchanging: TestClient) -> None:
+    def explored(seed: int) -> list[float]:
+        body = {"observation": [0, 0], "explore": True, "seed": seed}
+        return unchanging.post("/v1/policies/vector/action", json=body).json()["action"]
+
+    assert explored(5) == explored(5) != explored(6)
 
 
 @pytest.mark.parametrize(
