@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: setup demo test check fix bench clean
+.PHONY: setup demo test check fix bench protocol clean
 .DEFAULT_GOAL := setup
 
 setup: $(INSTALLED)
@@ -32,6 +32,12 @@ fix: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks $(BENCH)
+
+# The messages of gRPC, in a descriptor pool of their own: a process may hold others of the same names (tritonclient's).
+PROTOCOL := serve_app/inference_protocol
+protocol: setup
+	$(BIN)/python -m grpc_tools.protoc -I $(PROTOCOL) --python_out=$(PROTOCOL) --pyi_out=$(PROTOCOL) open_inference.proto
+	sed -i 's/_descriptor_pool.Default()/_descriptor_pool.DescriptorPool()/' $(PROTOCOL)/open_inference_pb2.py
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

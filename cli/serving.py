@@ -16,13 +16,22 @@ from league.settings import Storage
 def serve(
     host: Annotated[str | None, typer.Option(help="Listen here. Default: what deploy.yaml says, 127.0.0.1.")] = None,
     port: Annotated[int | None, typer.Option(help="Listen here. Default: what deploy.yaml says, 8000.")] = None,
+    grpc_port: Annotated[
+        int | None, typer.Option(help="gRPC listens here. Default: what deploy.yaml says, 8001.")
+    ] = None,
     replicas: Annotated[int | None, typer.Option(help="How many processes answer. Default: deploy.yaml's.")] = None,
     address: Annotated[str | None, typer.Option(help="A running Ray cluster. Default: a local Ray.")] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Ask nobody for an API key, even where other machines reach the server.")
+    ] = False,
 ) -> None:
     """Serve every league's champion (and any version by number) as an action endpoint, until Ctrl-C.
 
     `POST /v1/policies/{league}/action` takes an observation and answers with an action. Promotions and rollbacks reach
     every replica within a second, without a restart and without a failed request.
+
+    Who may call is told by API keys (`league keys`). On the loopback interface they are asked for as soon as there is
+    one; to listen to other machines (`--host 0.0.0.0`) there must be one.
     """
     from serve_app.launch import serve_forever
 
@@ -33,12 +42,15 @@ def serve(
         storage,
         host=host,
         port=port,
+        grpc_port=grpc_port,
         replicas=replicas,
+        insecure=insecure,
         address=address,
         on_ready=lambda url: say(
             f"Serving the leagues of {storage.home} on {url}\n"
             f"  {url}/v1/leagues                          what is served\n"
             f"  {url}/v1/policies/LEAGUE/action           POST an observation, get an action\n"
+            f"  {url}/v2/models/LEAGUE                    the Open Inference Protocol, over gRPC too\n"
             "Try: league act connect_four@champion          Stop: Ctrl-C"
         ),
     )

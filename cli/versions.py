@@ -10,6 +10,7 @@ import typer
 from cli.output import elo, emit, say, table
 from league.errors import ConfigError, InvalidReference
 from league.refs import CHAMPION, CheckpointRef, check_alias, check_slug
+from league.registry.following import await_followers
 from league.registry.registry import Registry
 from league.registry.rows import AliasEvent, VersionRow
 
@@ -17,6 +18,8 @@ LeagueName = Annotated[str, typer.Argument(metavar="LEAGUE", help="The league's 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of a table.")]
 Reason = Annotated[str, typer.Option(help="Why; kept in the history.")]
 Actor = Annotated[str | None, typer.Option(help="Who; kept in the history. Default: you.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Return when every live replica serves it; exit 1 if one does not.")]
+Timeout = Annotated[float, typer.Option(min=0, help="Seconds that --wait waits.")]
 
 
 def versions(league: LeagueName, as_json: AsJson = False) -> None:
@@ -76,12 +79,14 @@ def promote(
     ] = None,
     reason: Reason = "promoted by hand",
     actor: Actor = None,
+    wait: Wait = False,
+    timeout: Timeout = 30.0,
     as_json: AsJson = False,
 ) -> None:
     """Make a version the champion (or move another alias to it).
 
-    Every serving replica follows within a second. Without --expected the move is against what the alias is now, so of
-    two promotions at the same moment one wins and the other is told.
+    Every serving replica follows within a second; --wait returns when all have said so. Without --expected the move is
+    against what the alias is now, so of two promotions at the same moment one wins and the other is told.
     """
     registry = Registry.open()
     version = registry.resolve(CheckpointRef.parse(ref))
@@ -94,7 +99,7 @@ def promote(
         actor=actor or getpass.getuser(),
         reason=reason,
     )
-    _moved(event, as_json)
+    _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
 
 
 def _expected(text: str) -> int | None:
@@ -106,21 +111,35 @@ def _expected(text: str) -> int | None:
 
 
 def rollback(
-    league: LeagueName, reason: Reason = "rolled back by hand", actor: Actor = None, as_json: AsJson = False
+    league: LeagueName,
+    reason: Reason = "rolled back by hand",
+    actor: Actor = None,
+    wait: Wait = False,
+    timeout: Timeout = 30.0,
+    as_json: AsJson = False,
 ) -> None:
     """Return to the champion before the present one."""
-    event = Registry.open().rollback(check_slug("league", league), actor=actor or getpass.getuser(), reason=reason)
-    _moved(event, as_json)
+    registry = Registry.open()
+    event = registry.rollback(check_slug("league", league), actor=actor or getpass.getuser(), reason=reason)
+    _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
 
 
-def _moved(event: AliasEvent, as_json: bool) -> None:
+def _followers(registry: Registry, event: AliasEvent, timeout: float) -> list[str]:
+    return await_followers(registry, event.league, event.alias, event.version, timeout)
+
+
+def _moved(event: AliasEvent, as_json: bool, replicas: list[str] | None) -> None:
+    """Say what has moved, and who follows if that was waited for."""
     if as_json:
-        emit(asdict(event))
-    elif event.previous == event.version:
+        emit(asdict(event) | ({} if replicas is None else {"replicas": replicas}))
+        return
+    if event.previous == event.version:
         say(f"{event.league}@{event.alias} is version {event.version} already.")
     else:
         before = "nothing" if event.previous is None else f"version {event.previous}"
         say(f"{event.league}@{event.alias} is now version {event.version} (before: {before}).")
+    if replicas is not None:
+        say(f"All {len(replicas)} replicas serve it.")
 
 
 def history(

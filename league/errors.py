@@ -13,12 +13,15 @@ LeagueError
 │   ├── UnknownLeague
 │   ├── UnknownVersion
 │   ├── UnknownAlias
-│   └── UnknownPolicy
+│   ├── UnknownPolicy
+│   └── UnknownKey
 ├── Conflict                  the world has moved on
 │   ├── AliasMoved              a compare-and-set lost
 │   ├── InterfaceChanged        other spaces or policy ids than the league's versions have
 │   ├── LedgerRefusal           a result that breaks its schedule
 │   ├── NothingToRollBack
+│   ├── NameTaken
+│   ├── KeyReused               an Idempotency-Key that stands for another call
 │   └── AlreadyRunning          a second one of what may run once
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
@@ -116,6 +119,12 @@ class UnknownPolicy(NotFound):
     code = "unknown_policy"
 
 
+class UnknownKey(NotFound):
+    """There is no API key of that name."""
+
+    code = "unknown_key"
+
+
 class Conflict(LeagueError):
     """The state is not the one that the caller acted on."""
 
@@ -144,6 +153,18 @@ class NothingToRollBack(Conflict):
     """The alias has no earlier version to return to."""
 
     code = "nothing_to_roll_back"
+
+
+class NameTaken(Conflict):
+    """A name that is to be used once was used."""
+
+    code = "name_taken"
+
+
+class KeyReused(Conflict):
+    """An Idempotency-Key that was used for another call."""
+
+    code = "idempotency_key_reused"
 
 
 class AlreadyRunning(Conflict):

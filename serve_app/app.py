@@ -10,15 +10,25 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
 
+import ray
 from ray import serve
 from ray.serve import Application
 from starlette.applications import Starlette
+from starlette.middleware import Middleware
 from starlette.routing import Route
 
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.alias_watcher import AliasWatcher
+from serve_app.doors import Doors, Guarded
 from serve_app.error_handlers import ErrorHandlers
+from serve_app.exposure import serves_other_machines
+from serve_app.inference_protocol.catalogue import Catalogue
+from serve_app.inference_protocol.grpc_handlers import offer
+from serve_app.inference_protocol.grpc_service import InferenceService
+from serve_app.inference_protocol.inference import Inference
+from serve_app.inference_protocol.rest import RestRoutes
+from serve_app.keyring import Keyring, KeyWatcher
 from serve_app.live import Live
 from serve_app.loading import load
 from serve_app.middleware import shorten
@@ -26,8 +36,11 @@ from serve_app.models import Models
 from serve_app.routes.action import ActionRoute
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
+from serve_app.routes.promotion import PromotionRoutes
 from serve_app.settings import ServeSettings
 from serve_app.versions import Versions
+
+LOOPBACK = "127.0.0.1"
 
 
 def build_app(args: ServeSettings) -> Application:
@@ -36,16 +49,24 @@ def build_app(args: ServeSettings) -> Application:
     return deployment.bind(args)
 
 
+def _node_address() -> str:
+    """The address by which Ray, and so HAProxy, knows this node."""
+    here = ray.get_runtime_context().get_node_id()
+    return str(next(node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] == here))
+
+
 class PolicyServer:
     """One replica. Where its leagues live, LEAGUE_HOME and its siblings say."""
 
     def __init__(self, settings: ServeSettings) -> None:
         replica = serve.get_replica_context().replica_id.unique_id
-        self._server = Server(Registry.open(Storage.from_environment()), settings, replica)
+        registry = Registry.open(Storage.from_environment())
+        self._server = Server(registry, settings, replica, machine=_node_address(), is_exposed=serves_other_machines())
 
     def __serve_build_asgi_app__(self) -> Starlette:
         application = self._server.application()
         shorten(application)
+        offer(self._server.inference_service)
         return application
 
     def check_health(self) -> None:
@@ -55,9 +76,19 @@ class PolicyServer:
 
 
 class Server:
-    """The parts of a replica, put together. Knows nothing of Ray."""
+    """The parts of a replica, put together. Knows nothing of Ray.
 
-    def __init__(self, registry: Registry, settings: ServeSettings, replica: str) -> None:
+    `machine` is the address of its node; `is_exposed`: whether other machines reach it.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        settings: ServeSettings,
+        replica: str,
+        machine: str = LOOPBACK,
+        is_exposed: bool = False,
+    ) -> None:
         self.registry = registry
         self.settings = settings
         self.replica = replica
@@ -67,21 +98,35 @@ class Server:
         self.live = Live(self.versions)
         self.models = Models(registry, self.live, self.versions)
         self.watcher = AliasWatcher(registry, self.live, replica, settings)
+        self.keyring = Keyring()
+        self.key_watcher = KeyWatcher(registry, self.keyring, settings)
+        self.doors = Doors(self.keyring, settings, is_exposed)
         self.action = ActionRoute(self.models, settings, replica)
+        self.inference = Inference(self.models, settings)
+        self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
+        self.inference_service = InferenceService(
+            self.inference, self.catalogue, self.watcher, self.doors, settings, machine
+        )
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
         leagues = LeagueRoutes(self.models)
+        promotion = PromotionRoutes(self.models, self.settings)
         health = HealthRoutes(self.watcher, self.replica)
+        open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
             routes=[
                 Route("/v1/policies/{model}/action", self.action, methods=["POST"]),
+                *open_inference.routes(),
                 Route("/v1/leagues", leagues.leagues),
                 Route("/v1/leagues/{league}", leagues.league),
                 Route("/v1/leagues/{league}/versions", leagues.versions),
+                Route("/v1/leagues/{league}/aliases/{alias}", promotion.move, methods=["POST"]),
+                Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
             ],
+            middleware=[Middleware(Guarded, self.doors, self.settings)],
             exception_handlers=ErrorHandlers(self.settings.retry).table(),
             lifespan=self._running,
         )
@@ -89,7 +134,7 @@ class Server:
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:
         try:
-            async with self.watcher.watching():
+            async with self.key_watcher.watching(), self.watcher.watching():
                 yield
         finally:
             self.models.close()

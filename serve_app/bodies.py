@@ -10,21 +10,30 @@ from serve_app.observations import kind
 
 JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")
 """What may stand for JSON. The last is what curl says when it is told nothing."""
+IS_READ = "league.body_is_read"
+"""In the scope of a request whose body has arrived: what takes too long then is not the client's fault."""
 
 
 async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
-    """The body, of at most `limit` bytes. Raises BodyTooLarge, as soon as that is known, or UnsupportedMediaType."""
+    """A body that is not said to be something else than JSON. Raises BodyTooLarge or UnsupportedMediaType."""
+    for name, value in scope["headers"]:
+        if name == b"content-type":
+            _check_type(value)
+    return await read_bytes(scope, receive, limit)
+
+
+async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
+    """The body, of at most `limit` bytes. Raises BodyTooLarge, as soon as that is known."""
     for name, value in scope["headers"]:
         if name == b"content-length" and int(value) > limit:
             raise _too_large(limit)
-        if name == b"content-type":
-            _check_type(value)
     message = await receive()
     body: bytes = message.get("body", b"")
     if message.get("more_body", False):
         body = await _rest(body, receive, limit)
     if len(body) > limit:
         raise _too_large(limit)
+    scope[IS_READ] = True
     return body
 
 

@@ -1,10 +1,12 @@
 """Errors become HTTP answers here, once: a status, a stable `code`, and a sentence.
 
-InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415) · NotFound 404 · Conflict 409
+InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415) · Unauthenticated 401 · Forbidden 403 · NotFound 404
+BodyTooSlow 408 · Conflict 409 · Overloaded, RateLimited 429 with Retry-After · DeadlineExceeded 504
 NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · anything else 500
 """
 
 import logging
+from math import ceil
 from typing import Any
 
 import orjson
@@ -49,39 +51,95 @@ class Overloaded(LeagueError):
     code = "overloaded"
 
 
+class Unauthenticated(LeagueError):
+    """No API key where one is needed, or one that opens nothing."""
+
+    code = "unauthenticated"
+
+
+class Forbidden(LeagueError):
+    """An API key that is not for this."""
+
+    code = "forbidden"
+
+
+class RateLimited(LeagueError):
+    """An API key that calls more often than it may; `wait` is in seconds."""
+
+    code = "rate_limited"
+
+    def __init__(self, message: str, wait: float = 1.0) -> None:
+        super().__init__(message)
+        self.wait = wait
+
+
+class BodyTooSlow(LeagueError):
+    """A body that has not arrived in time."""
+
+    code = "body_too_slow"
+
+
+class DeadlineExceeded(LeagueError):
+    """A request that was not answered in the time that it had."""
+
+    code = "deadline_exceeded"
+
+
 STATUSES: dict[type[LeagueError], int] = {
     BodyTooLarge: 413,
     UnsupportedMediaType: 415,
     InvalidInput: 400,
+    Unauthenticated: 401,
+    Forbidden: 403,
     NotFound: 404,
+    BodyTooSlow: 408,
     Conflict: 409,
     Overloaded: 429,
+    RateLimited: 429,
     NotReady: 503,
     ArtifactCorrupt: 503,
     StorageError: 503,
+    DeadlineExceeded: 504,
     LeagueError: 500,
 }
 """The nearest class of an error's ancestors counts."""
 CODES = {404: "unknown_path", 405: "method_not_allowed"}
 
 
+def status_of(error: LeagueError) -> int:
+    """The HTTP status of an error."""
+    return next(STATUSES[ancestor] for ancestor in type(error).__mro__ if ancestor in STATUSES)
+
+
 class ErrorHandlers:
     """Starlette's exception handlers; a 503 asks to come back after `retry` seconds, a 429 after one."""
 
     def __init__(self, retry: float) -> None:
-        self._headers = {429: {"retry-after": "1"}, 503: {"retry-after": str(max(1, round(retry)))}}
+        self._headers = {
+            401: {"www-authenticate": "Bearer"},
+            408: {"connection": "close"},  # what still comes of the body is not read
+            429: {"retry-after": "1"},
+            503: {"retry-after": str(max(1, round(retry)))},
+        }
 
     def table(self) -> dict[Any, Any]:
         """Exception class → handler."""
         return {LeagueError: self.league_error, HTTPException: self.http_error, Exception: self.fault}
 
-    async def league_error(self, _: Request, error: Exception) -> Response:
+    async def league_error(self, request: Request, error: Exception) -> Response:
         """A fault that a person is told."""
         assert isinstance(error, LeagueError)
-        status = next(STATUSES[ancestor] for ancestor in type(error).__mro__ if ancestor in STATUSES)
+        return self.response(request.scope["path"], error)
+
+    def response(self, path: str, error: LeagueError) -> Response:
+        """The answer to a request for `path`."""
+        status = status_of(error)
         if status >= 500:
             logger.error("%s: %s", error.code, error)
-        return answer(status, error.code, str(error), self._headers.get(status))
+        headers = self._headers.get(status)
+        if isinstance(error, RateLimited):
+            headers = {"retry-after": str(max(1, ceil(error.wait)))}
+        return answer(path, status, error.code, str(error), headers)
 
     async def http_error(self, request: Request, error: Exception) -> Response:
         """What Starlette's router refuses."""
@@ -90,15 +148,17 @@ class ErrorHandlers:
             404: f"there is nothing at {request.url.path[:200]}",
             405: f"{request.method} is not allowed at {request.url.path[:200]}",
         }.get(error.status_code, error.detail)
-        return answer(error.status_code, CODES.get(error.status_code, "http_error"), message, error.headers)
+        code = CODES.get(error.status_code, "http_error")
+        return answer(request.scope["path"], error.status_code, code, message, error.headers)
 
-    async def fault(self, _: Request, error: Exception) -> Response:
+    async def fault(self, request: Request, error: Exception) -> Response:
         """A bug. Its traceback is for the log, not for a stranger."""
         logger.error("a request failed", exc_info=error)
-        return answer(500, "internal_error", "the server failed; its log says why")
+        return answer(request.scope["path"], 500, "internal_error", "the server failed; its log says why")
 
 
-def answer(status: int, code: str, message: str, headers: Any = None) -> Response:
-    """An error as JSON."""
-    body = orjson.dumps({"code": code, "message": message})
+def answer(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:
+    """An error as JSON, in the form of the protocol that the path belongs to."""
+    is_open_inference = path.startswith("/v2")
+    body = orjson.dumps({"error": message} if is_open_inference else {"code": code, "message": message})
     return Response(body, status, headers, media_type="application/json")

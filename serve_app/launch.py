@@ -17,17 +17,21 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
 import httpx
 import yaml
+from pydantic import ValidationError
 
 from league import errors
 from league.errors import AlreadyRunning, ConfigError, LeagueError, NotReady
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app import haproxy
+from serve_app.exposure import is_exposed
+from serve_app.settings import ServeSettings
 
 DEPLOY_YAML = Path(__file__).resolve().parent.parent / "deploy.yaml"
 START = 180.0
@@ -41,27 +45,31 @@ def serve_forever(
     *,
     host: str | None = None,
     port: int | None = None,
+    grpc_port: int | None = None,
     replicas: int | None = None,
+    insecure: bool = False,
     address: str | None = None,
     deploy: Path = DEPLOY_YAML,
     on_ready: Callable[[str], None] | None = None,
 ) -> None:
     """Serve the leagues of `storage` until SIGINT or SIGTERM, then shut everything down.
 
-    `host`, `port` and `replicas` override what `deploy` says. `address` is a running Ray cluster to serve on, whose
-    nodes have the environment that deploy.yaml lists, as this process has; by default a Ray of its own is started on
-    the loopback interface. `on_ready` is called once with the base URL (`http://127.0.0.1:8000`) when every replica
-    answers. Nothing is printed here.
+    `host`, `port`, `grpc_port` and `replicas` override what `deploy` says. `address` is a running Ray cluster to serve
+    on, whose nodes have the environment that deploy.yaml lists, as this process has; by default a Ray of its own is
+    started on the loopback interface. `insecure` lets requests do without an API key, whoever can reach the server.
+    `on_ready` is called once with the base URL (`http://127.0.0.1:8000`) when every replica answers. Nothing is printed
+    here.
 
     Must be called in the main thread of a process that has not imported ray.
 
-    Raises ConfigError (deploy.yaml; a cluster that cannot reach the storage), AlreadyRunning (the port is taken),
-    StorageError (the home cannot be used), NotReady (HAProxy is missing, or the replicas did not start).
+    Raises ConfigError (deploy.yaml; a cluster that cannot reach the storage; other machines could call without a key),
+    AlreadyRunning (a port is taken), StorageError (the home cannot be used), NotReady (HAProxy is missing, or the
+    replicas did not start).
     """
     if "ray" in sys.modules:
         raise RuntimeError("serve_forever must set Ray's environment before ray is imported")
-    document = _document(deploy, host, port, replicas)
-    Registry.open(storage).close()  # once here, rather than by all replicas at the same time
+    document = _document(deploy, host, port, grpc_port, replicas, insecure)
+    _refuse_strangers(document, storage)
     storage.export()
     try:
         with _interruptible():
@@ -79,25 +87,30 @@ def running(
     *,
     host: str = "127.0.0.1",
     port: int = 0,
+    grpc_port: int = 0,
     replicas: int | None = None,
+    insecure: bool = False,
     deploy: Path = DEPLOY_YAML,
     timeout: float = START,
 ) -> Iterator[str]:
     """Serve the leagues of `storage` in a process of its own while the context lasts; yields the base URL.
 
-    `port` 0 takes a free one. Every port and file that HAProxy needs besides is private to this server, so that several
-    may run on one machine. `timeout` is in seconds, until every replica answers. The server also stops when the
-    caller's process dies.
+    `port` and `grpc_port` 0 take free ones. Every port and file that HAProxy needs besides is private to this server,
+    so that several may run on one machine. `timeout` is in seconds, until every replica answers. The server also stops
+    when the caller's process dies.
 
     Raises what `serve_forever` raises.
     """
+    free = haproxy.free_ports(2, host)
     order = _Order(
         home=str(storage.home),
         database_url=storage.database_url,
         artifacts=str(storage.artifacts),
         host=host,
-        port=port or haproxy.free_ports(1, host)[0],
+        port=port or free[0],
+        grpc_port=grpc_port or free[1],
         replicas=replicas,
+        insecure=insecure,
         deploy=str(deploy),
     )
     command = [sys.executable, "-m", "serve_app.launch", json.dumps(asdict(order))]
@@ -120,18 +133,26 @@ class _Order:
     artifacts: str
     host: str
     port: int
+    grpc_port: int
     replicas: int | None
+    insecure: bool
     deploy: str
 
 
-def _document(deploy: Path, host: str | None, port: int | None, replicas: int | None) -> dict[str, Any]:
+def _document(
+    deploy: Path, host: str | None, port: int | None, grpc_port: int | None, replicas: int | None, insecure: bool
+) -> dict[str, Any]:
     """deploy.yaml with the caller's overrides. Raises ConfigError."""
     try:
         document = yaml.safe_load(deploy.read_text(encoding="utf-8"))
         http, (application,) = document["http_options"], document["applications"]
         http |= {"host": host or http["host"], "port": port or http["port"]}
+        if grpc_port is not None and "grpc_options" in document:
+            document["grpc_options"]["port"] = grpc_port
         if replicas is not None:
             application["deployments"][0]["num_replicas"] = replicas
+        if insecure:
+            application["args"] = application.get("args", {}) | {"require_keys": "never"}
     except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(
@@ -140,13 +161,44 @@ def _document(deploy: Path, host: str | None, port: int | None, replicas: int | 
     return document
 
 
+def _settings(document: dict[str, Any]) -> ServeSettings:
+    """What the replicas will be told. Raises ConfigError."""
+    try:
+        return ServeSettings.model_validate(document["applications"][0].get("args", {}))
+    except ValidationError as error:
+        raise ConfigError(f"deploy.yaml: args: {' '.join(str(error).split())}") from error
+
+
+def _refuse_strangers(document: dict[str, Any], storage: Storage) -> None:
+    """Raise ConfigError if other machines could reach a server that has nobody's key.
+
+    Such replicas would refuse every request: this says why beforehand. Opens the registry, once here, rather than all
+    replicas at the same time.
+    """
+    registry = Registry.open(storage)
+    try:
+        now = datetime.now(UTC)
+        has_key = any(key.is_valid(now) for key in registry.api_keys())
+    finally:
+        registry.close()
+    host = str(document["http_options"]["host"])
+    if is_exposed(host) and not has_key and _settings(document).require_keys != "never":
+        raise ConfigError(
+            f"other machines can reach {host}, and no API key is valid: `league keys create NAME --scope act`,"
+            " or `league serve --insecure` to let everybody in"
+        )
+
+
 def _serve_here(document: dict[str, Any], on_ready: Callable[[str], None] | None) -> None:
     """Serve on a Ray of our own."""
     host, port = document["http_options"]["host"], document["http_options"]["port"]
+    grpc = document.get("grpc_options", {})
     with haproxy.private_directory() as directory:
-        if not haproxy.is_free(host, port):
-            raise AlreadyRunning(f"port {port} of {host} is taken: another server runs there")
-        for name, value in haproxy.environment(directory).items():
+        for wanted in (port, grpc["port"]) if grpc else (port,):
+            if not haproxy.is_free(host, wanted):
+                raise AlreadyRunning(f"port {wanted} of {host} is taken: another server runs there")
+        largest = {"RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(_settings(document).max_body)}
+        for name, value in (haproxy.environment(directory) | largest).items():
             os.environ.setdefault(name, value)
         haproxy.require_binary()
         import ray
@@ -184,7 +236,10 @@ def _serve_on(address: str, storage: Storage, document: dict[str, Any], on_ready
     except ConnectionError as error:
         raise NotReady(f"Ray at {address} cannot be reached: {_last_line(str(error.__cause__ or error))}") from error
     try:
-        storage.check_reach({node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]})
+        nodes = {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
+        storage.check_reach(nodes)
+        if len(nodes) > 1:  # the HAProxies of all nodes call every replica
+            application["args"] = {"grpc_local_only": False} | application.get("args", {})
         try:
             _deploy(document, on_ready)
         finally:
@@ -195,7 +250,6 @@ def _serve_on(address: str, storage: Storage, document: dict[str, Any], on_ready
 
 def _deploy(document: dict[str, Any], on_ready: Callable[[str], None] | None) -> NoReturn:
     """Deploy and wait for a signal, which raises KeyboardInterrupt."""
-    from pydantic import ValidationError
     from ray.serve._private.api import serve_start
     from ray.serve.schema import ServeDeploySchema
 
@@ -205,7 +259,11 @@ def _deploy(document: dict[str, Any], on_ready: Callable[[str], None] | None) ->
         raise ConfigError(f"deploy.yaml: {' '.join(str(error).split())}") from error
     logging.getLogger("ray.serve").setLevel(logging.ERROR)  # of this process: the others have their files
     _interrupt_on_signals()  # ray.init has put its own handlers in place
-    client = serve_start(http_options=schema.http_options.model_dump(), proxy_location=schema.proxy_location)
+    client = serve_start(
+        http_options=schema.http_options.model_dump(),
+        grpc_options=schema.grpc_options.model_dump(),
+        proxy_location=schema.proxy_location,
+    )
     client.deploy_apps(schema, _blocking=False)
     url = f"http://{schema.http_options.host}:{schema.http_options.port}"
     _await_replicas(schema.applications[0].name, url.replace("0.0.0.0", "127.0.0.1"))
@@ -317,7 +375,9 @@ def main() -> None:
             Storage(Path(order.home), order.database_url, Path(order.artifacts)),
             host=order.host,
             port=order.port,
+            grpc_port=order.grpc_port,
             replicas=order.replicas,
+            insecure=order.insecure,
             deploy=Path(order.deploy),
             on_ready=lambda url: print(json.dumps({"url": url}), file=announce),
         )

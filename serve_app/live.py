@@ -41,6 +41,10 @@ class Live:
         """What answers where no version is asked for."""
         return self.get(league, CHAMPION)
 
+    def numbers(self, league: str) -> dict[str, int]:
+        """alias → the version that answers for it."""
+        return {alias: version.number for (of, alias), version in self._slots.items() if of == league}
+
     def fault(self, league: str) -> str | None:
         """Why the league's aliases are not all served as they should be."""
         faults = {alias: fault for (of, alias), fault in self._faults.items() if of == league}

@@ -17,11 +17,12 @@ WARM_BATCH = 64
 """Large enough that the time of a row shows, small enough to be done in milliseconds."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class LoadedPolicy:
     """One policy, ready to answer."""
 
-    policy: Policy
+    policy: OnnxPolicy
+    manifest: PolicyManifest
     reader: ObservationReader
     state: tuple[tuple[str, Leaf], ...]
     """Recurrent inputs; empty for a policy without."""
@@ -77,7 +78,7 @@ def _warm(policy: OnnxPolicy, manifest: PolicyManifest, inline: float) -> Loaded
         (tensor.name, Box(dtype=tensor.dtype, shape=_sizes(tensor.shape[1:]), low=None, high=None))
         for tensor in manifest.state
     )
-    return LoadedPolicy(policy, reader, state, rows)
+    return LoadedPolicy(policy, manifest, reader, state, rows)
 
 
 def _seconds(policy: Policy, reader: ObservationReader, rows: int) -> float:

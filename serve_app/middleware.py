@@ -1,7 +1,7 @@
 """The short way to the action route, before Ray Serve's own handling of a request.
 
-    HAProxy → uvicorn ┬→ /v1/policies/…  →  the application
-                      └→ anything else   →  Ray Serve → the application
+    HAProxy → uvicorn ┬→ /v1/policies/…, /v2/models/…  →  the application
+                      └→ anything else                 →  Ray Serve → the application
 
 What Serve does for each request (tasks that watch for a client that leaves, a request id, counting for its autoscaler,
 metrics) takes as long as all the rest. An action needs none of it: it is computed before it could be given up, and the
@@ -13,7 +13,8 @@ RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH names `middlewares`; without it everyt
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-POLICIES = "/v1/policies/"
+ACTIONS = ("/v1/policies/", "/v2/models/")
+"""Where actions and inferences are asked for."""
 _application: ASGIApp | None = None
 
 
@@ -36,7 +37,7 @@ class ShortWay:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Choose the way."""
-        if _application is not None and scope["type"] == "http" and scope["path"].startswith(POLICIES):
+        if _application is not None and scope["type"] == "http" and scope["path"].startswith(ACTIONS):
             await _application(scope, receive, send)
         else:
             await self._onward(scope, receive, send)

@@ -4,7 +4,7 @@ What Ray Serve itself limits (replicas, requests at once, queue, drain) stands i
 """
 
 from datetime import timedelta
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -24,6 +24,22 @@ class ServeSettings(BaseModel):
     """Requests for actions that a replica has begun and not yet answered; beyond them it answers 429."""
     max_batch: int = Field(default=1024, ge=1)
     """Most observations in one request."""
+    timeout: float = Field(default=4.5, gt=0)
+    """For one request, from its head to its reply; beyond it 504, or 408 if the body was the cause. Less than
+    RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy answers 500. A client may ask for less by
+    `x-request-timeout-ms`."""
+    max_waiting: int = Field(default=64, ge=1)
+    """Requests for actions that may wait for each other on the event loop, as backlog.py counts them. When more wait
+    for longer than `patience`, those beyond are answered 429."""
+    patience: float = Field(default=0.1, ge=0)
+    """How long a burst may last."""
+    require_keys: Literal["auto", "always", "never"] = "auto"
+    """Whether a request needs an API key. `auto`: as soon as the registry has one, and in any case where the server
+    listens to other machines. `never` is what `league serve --insecure` sets. Changes of what is served need one
+    always."""
+    grpc_local_only: bool = True
+    """Refuse gRPC from other machines. A replica's gRPC server, which is Ray Serve's, listens on all interfaces
+    whatever the host is; clients call HAProxy, which is on the same machine unless a cluster has several."""
     cached_versions: int = Field(default=8, ge=1)
     """Versions kept because somebody asked for them by number. Those that an alias names are kept besides."""
     poll: float = Field(default=0.2, gt=0)

@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from concurrent.futures import ThreadPoolExecutor
 
 from league.errors import ArtifactCorrupt
@@ -41,6 +41,10 @@ class Versions:
         if (version := self._loaded.get((league, number))) is not None:
             self._loaded.move_to_end((league, number))
         return version
+
+    def loaded(self) -> Set[Key]:
+        """The versions in memory. None of them counts as used."""
+        return self._loaded.keys()
 
     async def get(self, league: str, number: int) -> LoadedVersion:
         """A version, loaded if need be. Raises UnknownLeague, UnknownVersion, ArtifactCorrupt or StorageError."""

@@ -1,5 +1,6 @@
 """What serving replicas say that they serve."""
 
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import delete, select
@@ -14,12 +15,18 @@ KEPT = timedelta(days=1)
 
 
 def write(
-    session: Session, replica: str, league: str, version: int | None, sha256: str | None, fault: str | None
+    session: Session,
+    replica: str,
+    league: str,
+    version: int | None,
+    sha256: str | None,
+    fault: str | None,
+    aliases: Mapping[str, int],
 ) -> None:
     """Replace what `replica` said of `league`. Raises UnknownLeague."""
     leagues.require(session, league)
     now = datetime.now(UTC)
-    values = {"version": version, "sha256": sha256, "fault": fault, "seen_at": now}
+    values = {"version": version, "sha256": sha256, "fault": fault, "aliases": dict(aliases), "seen_at": now}
     upsert(session, Acknowledgement, {"replica": replica, "league": league}, values)
     session.execute(delete(Acknowledgement).where(Acknowledgement.seen_at < now - KEPT))
 
@@ -30,8 +37,15 @@ def fresh(session: Session, league: str, since: timedelta) -> list[rows.Acknowle
     query = select(Acknowledgement).filter_by(league=league).order_by(Acknowledgement.replica)
     found = session.scalars(query.where(Acknowledgement.seen_at >= datetime.now(UTC) - since))
     return [
-        rows.Acknowledgement(row.replica, row.league, row.version, row.sha256, row.fault, row.seen_at) for row in found
+        rows.Acknowledgement(row.replica, row.league, row.version, row.sha256, row.fault, row.aliases, row.seen_at)
+        for row in found
     ]
+
+
+def replicas(session: Session, since: timedelta) -> list[str]:
+    """Who said anything, of whatever league, in the last `since`."""
+    query = select(Acknowledgement.replica).where(Acknowledgement.seen_at >= datetime.now(UTC) - since)
+    return sorted(session.scalars(query.distinct()))
 
 
 def forget(session: Session, replica: str) -> None:

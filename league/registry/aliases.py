@@ -70,7 +70,7 @@ def move(
         wanted = f"{league}@{expected}" if expected else "not set"
         raise AliasMoved(f"alias {alias} of league {league} {now}, expected {wanted}: nothing was changed")
     if last and last.version == version:
-        return _row(last)
+        return row(last)
     event = AliasEvent(
         kind="set",
         version=version,
@@ -107,7 +107,7 @@ def history(session: Session, league: str, alias: str, at: datetime | None) -> l
     query = select(AliasEvent).filter_by(league=league, alias=alias).order_by(AliasEvent.id.desc())
     if at is not None:
         query = query.where(AliasEvent.at <= at).limit(1)
-    return [_row(event) for event in session.scalars(query)]
+    return [row(event) for event in session.scalars(query)]
 
 
 def _in_force(session: Session, league: str, alias: str) -> AliasEvent | None:
@@ -123,10 +123,11 @@ def _record(session: Session, league: str, alias: str, last: AliasEvent | None, 
     session.add(event)
     session.flush()
     session.merge(Alias(league=league, name=alias, version=event.version, event=event.id))
-    return _row(event)
+    return row(event)
 
 
-def _row(event: AliasEvent) -> rows.AliasEvent:
+def row(event: AliasEvent) -> rows.AliasEvent:
+    """An event as the registry answers it."""
     kind: Literal["set", "rollback"] = "rollback" if event.kind == "rollback" else "set"
     return rows.AliasEvent(
         id=event.id,

@@ -1,22 +1,24 @@
 """The face of the registry: each method is one transaction, or a version's whole way to being published."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from league.config import LeagueConfig
 from league.errors import StorageError
 from league.interface import Interface
 from league.refs import CHAMPION, CheckpointRef
-from league.registry import acknowledgements, aliases, leagues, publishing, verdicts, versions
+from league.registry import acknowledgements, aliases, keys, leagues, publishing, verdicts, versions
 from league.registry.aliases import AnyVersion
 from league.registry.artifacts import ArtifactStore
 from league.registry.database import Database
 from league.registry.faults import DISK_FULL_OR_SHUT, disk_faults
+from league.registry.idempotency import Call, once
 from league.registry.manifest import Manifest
-from league.registry.rows import Acknowledgement, AliasEvent, LeagueRow, VerdictRow, VersionRow
+from league.registry.rows import Acknowledgement, AliasEvent, KeyRow, LeagueRow, VerdictRow, VersionRow
 from league.settings import Storage
 
 Build = Callable[[Path, int], Manifest]
@@ -90,6 +92,11 @@ class Registry:
         with self.database.read() as session:
             return versions.every(session, league)
 
+    def version_numbers(self, league: str | None = None) -> dict[str, list[int]]:
+        """league → numbers of its versions, ascending: of one league or of all that have any."""
+        with self.database.read() as session:
+            return versions.numbers(session, league)
+
     def version(self, league: str, number: int) -> VersionRow:
         """One version. Raises UnknownLeague or UnknownVersion."""
         with self.database.read() as session:
@@ -156,27 +163,39 @@ class Registry:
         actor: str,
         reason: str,
         verdict: str | None = None,
+        call: Call | None = None,
     ) -> AliasEvent:
         """Point `alias` at `version` if it points at `expected` (None: if it does not exist; ANY: always).
 
-        Returns the event in force. Raises UnknownLeague, UnknownVersion, or AliasMoved, saying where it is.
+        Returns the event in force. A `call` that was applied before changes nothing and returns its event.
+        Raises UnknownLeague, UnknownVersion, KeyReused, or AliasMoved, saying where it is.
         """
         with self.database.write() as session:
-            return aliases.move(
+            return once(
                 session,
                 league,
-                alias,
-                version,
-                expected=expected,
-                actor=actor,
-                reason=reason,
-                verdict=verdict,
+                call,
+                lambda: aliases.move(
+                    session,
+                    league,
+                    alias,
+                    version,
+                    expected=expected,
+                    actor=actor,
+                    reason=reason,
+                    verdict=verdict,
+                ),
             )
 
-    def rollback(self, league: str, *, actor: str, reason: str) -> AliasEvent:
-        """Return the champion to the one before it. Raises UnknownLeague or NothingToRollBack."""
+    def rollback(self, league: str, *, actor: str, reason: str, call: Call | None = None) -> AliasEvent:
+        """Return the champion to the one before it, unless `call` did so: then return its event.
+
+        Raises UnknownLeague, NothingToRollBack or KeyReused.
+        """
         with self.database.write() as session:
-            return aliases.roll_back(session, league, CHAMPION, actor=actor, reason=reason)
+            return once(
+                session, league, call, lambda: aliases.roll_back(session, league, CHAMPION, actor=actor, reason=reason)
+            )
 
     def history(self, league: str, alias: str = CHAMPION, at: datetime | None = None) -> list[AliasEvent]:
         """The events of an alias, newest first; with `at`, only the one that was in force then."""
@@ -186,21 +205,61 @@ class Registry:
     # Acknowledgements
 
     def acknowledge(
-        self, replica: str, league: str, version: int | None, sha256: str | None, fault: str | None = None
+        self,
+        replica: str,
+        league: str,
+        version: int | None,
+        sha256: str | None,
+        fault: str | None = None,
+        aliases: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
-        """Say what a replica serves of a league, and why not what it should. Raises UnknownLeague."""
+        """Say what a replica serves of a league, by which alias, and why not what it should. Raises UnknownLeague."""
         with self.database.write() as session:
-            acknowledgements.write(session, replica, league, version, sha256, fault)
+            acknowledgements.write(session, replica, league, version, sha256, fault, aliases)
 
     def acknowledgements(self, league: str, since: timedelta = timedelta(seconds=15)) -> list[Acknowledgement]:
         """What replicas said of a league in the last `since`. Raises UnknownLeague."""
         with self.database.read() as session:
             return acknowledgements.fresh(session, league, since)
 
+    def replicas(self, since: timedelta = timedelta(seconds=15)) -> list[str]:
+        """The replicas that live: that said anything in the last `since`."""
+        with self.database.read() as session:
+            return acknowledgements.replicas(session, since)
+
     def forget(self, replica: str) -> None:
         """Remove what a replica said: it stops."""
         with self.database.write() as session:
             acknowledgements.forget(session, replica)
+
+    # API keys
+
+    def create_key(
+        self,
+        name: str,
+        scopes: Collection[str],
+        *,
+        only_leagues: Collection[str] = (),
+        expires_at: datetime | None = None,
+        rate: float | None = None,
+    ) -> tuple[KeyRow, str]:
+        """Make an API key; returns it with its text, which is kept nowhere.
+
+        scopes: of `keys.SCOPES`. only_leagues: all if empty. rate: requests per second.
+        Raises InvalidReference, InvalidInput, UnknownLeague or NameTaken.
+        """
+        with self.database.write() as session:
+            return keys.create(session, name, scopes, only_leagues=only_leagues, expires_at=expires_at, rate=rate)
+
+    def api_keys(self) -> list[KeyRow]:
+        """All API keys that ever were, oldest first."""
+        with self.database.read() as session:
+            return keys.every(session)
+
+    def revoke_key(self, name: str) -> KeyRow:
+        """Make an API key void, by its name or id. Raises UnknownKey."""
+        with self.database.write() as session:
+            return keys.revoke(session, name)
 
     # Verdicts
 

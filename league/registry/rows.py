@@ -78,7 +78,31 @@ class Acknowledgement:
     sha256: str | None
     fault: str | None
     """Why it does not serve what it should."""
+    aliases: dict[str, int]
+    """alias → the version that answers for it"""
     seen_at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class KeyRow:
+    """An API key, as far as it is kept."""
+
+    id: str
+    name: str
+    sha256: str
+    """The digest of the key's text."""
+    scopes: frozenset[str]
+    leagues: frozenset[str] | None
+    """Those that it is for; None: all."""
+    rate: float | None
+    """Requests per second, at each replica; None: unbounded."""
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+
+    def is_valid(self, now: datetime) -> bool:
+        """Whether it opens a door."""
+        return self.revoked_at is None and (self.expires_at is None or now < self.expires_at)
 
 
 @dataclass(frozen=True, slots=True)

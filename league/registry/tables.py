@@ -7,6 +7,7 @@ from sqlalchemy import (
     JSON,
     DateTime,
     Dialect,
+    Double,
     ForeignKey,
     ForeignKeyConstraint,
     Index,
@@ -145,7 +146,39 @@ class Acknowledgement(Table):
     version: Mapped[int | None]
     sha256: Mapped[str | None] = mapped_column(String(64))
     fault: Mapped[str | None] = mapped_column(Text)
+    aliases: Mapped[dict[str, int]] = mapped_column(JSON)
+    """alias → the version that answers for it"""
     seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
+
+
+class ApiKey(Table):
+    """A key that a caller shows. Never removed: `revoked_at` ends it."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(String(8), primary_key=True)
+    name: Mapped[str] = mapped_column(String(255), unique=True)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    """The digest of the key's text, which is kept nowhere."""
+    scopes: Mapped[list[str]] = mapped_column(JSON)
+    leagues: Mapped[list[str] | None] = mapped_column(JSON(none_as_null=True))
+    rate: Mapped[float | None] = mapped_column(Double)
+    created_at: Mapped[datetime] = mapped_column(Utc)
+    expires_at: Mapped[datetime | None] = mapped_column(Utc)
+    revoked_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
+class IdempotentCall(Table):
+    """A change that a caller named, and the event that it led to."""
+
+    __tablename__ = "idempotent_calls"
+
+    owner: Mapped[str] = mapped_column(ForeignKey("api_keys.id"), primary_key=True)
+    key: Mapped[str] = mapped_column(String(255), primary_key=True)
+    digest: Mapped[str] = mapped_column(String(64))
+    """Of what was asked."""
+    event: Mapped[int] = mapped_column(ForeignKey("alias_events.id"))
+    at: Mapped[datetime] = mapped_column(Utc, index=True)
 
 
 class Schedule(Table):

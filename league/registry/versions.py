@@ -23,6 +23,15 @@ def every(session: Session, league: str) -> list[VersionRow]:
     return _rows(session, league, list(session.scalars(_ready(league).order_by(Version.number))))
 
 
+def numbers(session: Session, league: str | None) -> dict[str, list[int]]:
+    """league → numbers of its versions, ascending: of one league or of all. Their manifests are not read."""
+    query = select(Version.league, Version.number).filter_by(state=READY).order_by(Version.league, Version.number)
+    found: dict[str, list[int]] = {}
+    for name, number in session.execute(query if league is None else query.filter_by(league=league)):
+        found.setdefault(name, []).append(number)
+    return found
+
+
 def of_source(session: Session, league: str, source: str) -> int | None:
     """The number of the version that was made from the checkpoint `source`."""
     return session.scalar(select(Version.number).filter_by(league=league, state=READY).where(Version.source == source))

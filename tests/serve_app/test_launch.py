@@ -7,17 +7,25 @@ import pytest
 
 from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
 from league.settings import Storage
-from serve_app.launch import running
+from serve_app.launch import DEPLOY_YAML, running
 
 
-def test_a_taken_port(storage: Storage) -> None:
+@pytest.mark.parametrize("which", ["port", "grpc_port"])
+def test_a_taken_port(storage: Storage, which: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with (
             pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is taken"),
-            running(storage, port=port),
+            running(storage, **{which: port}),  # type: ignore[arg-type]
         ):
             pass
+
+
+def test_settings_that_are_none(storage: Storage, tmp_path: Path) -> None:
+    deploy = tmp_path / "deploy.yaml"
+    deploy.write_text(DEPLOY_YAML.read_text().replace("args: {}", "args: {max_body: 1}"))
+    with pytest.raises(ConfigError, match="max_body"), running(storage, deploy=deploy):
+        pass
 
 
 @pytest.mark.parametrize("text", ["", "applications: []", "http_options: {}", "a: [", "- 1"])

@@ -15,7 +15,14 @@ def client(monkeypatch: pytest.MonkeyPatch) -> TestClient:
 
 
 @pytest.mark.parametrize(
-    ("path", "way"), [("/v1/policies/board/action", "short"), ("/v1/leagues", "long"), ("/-/healthz", "long")]
+    ("path", "way"),
+    [
+        ("/v1/policies/board/action", "short"),
+        ("/v2/models/board/infer", "short"),
+        ("/v2/health/ready", "long"),
+        ("/v1/leagues", "long"),
+        ("/-/healthz", "long"),
+    ],
 )
 def test_only_actions_take_the_short_way(client: TestClient, path: str, way: str) -> None:
     middleware.shorten(PlainTextResponse("short"))

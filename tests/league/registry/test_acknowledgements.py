@@ -59,3 +59,19 @@ def test_an_unknown_league_is_refused(registry: Registry) -> None:
         registry.acknowledge("replica-1", "chess", 1, "abc")
     with pytest.raises(UnknownLeague):
         registry.acknowledgements("chess")
+
+
+def test_a_replica_says_which_alias_answers_from_what(registry: Registry) -> None:
+    registry.acknowledge("replica-1", LEAGUE, 2, "abc", None, {"champion": 2, "candidate": 3})
+    (row,) = registry.acknowledgements(LEAGUE)
+    assert row.aliases == {"champion": 2, "candidate": 3}
+
+
+def test_replicas_live_as_long_as_they_say_anything(registry: Registry) -> None:
+    registered(registry, "another")
+    registry.acknowledge("replica-2", LEAGUE, 1, "abc")
+    registry.acknowledge("replica-1", "another", 1, "abc")
+    registry.acknowledge("replica-1", LEAGUE, 1, "abc")
+    registry.acknowledge("replica-3", LEAGUE, 1, "abc")
+    age(registry, "replica-3", timedelta(seconds=20))
+    assert registry.replicas() == ["replica-1", "replica-2"]

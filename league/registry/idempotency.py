@@ -1,0 +1,51 @@
+"""Calls that change state are applied once, however often they arrive.
+
+A caller names its call by a key of its own. The alias event that the call led to is kept with it, in the transaction of
+the change itself: the call and its answer are there together, or neither is. Events never change, so that the same
+answer can be given again.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import delete
+from sqlalchemy.orm import Session
+
+from league.errors import KeyReused
+from league.registry import aliases, leagues, rows
+from league.registry.database import insert
+from league.registry.tables import AliasEvent, IdempotentCall
+
+KEPT = timedelta(hours=24)
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A call as its caller names it: `owner` is the API key's id, `digest` tells what was asked."""
+
+    owner: str
+    key: str
+    digest: str
+
+
+def once(session: Session, league: str, call: Call | None, change: Callable[[], rows.AliasEvent]) -> rows.AliasEvent:
+    """Do `change` to an alias of a league, unless `call` has done so: then return the event that it led to.
+
+    A change that fails leaves nothing, and may be tried again. Raises UnknownLeague, what `change` raises, or KeyReused
+    if the call of that name asked for something else.
+    """
+    if call is None:
+        return change()
+    leagues.lock(session, league)  # a repetition waits here for the first
+    now = datetime.now(UTC)
+    session.execute(delete(IdempotentCall).where(IdempotentCall.at < now - KEPT))
+    known = session.get(IdempotentCall, (call.owner, call.key))
+    if known is not None and known.digest == call.digest:
+        return aliases.row(session.get_one(AliasEvent, known.event))
+    if known is None:
+        event = change()
+        values = {"owner": call.owner, "key": call.key, "digest": call.digest, "event": event.id, "at": now}
+        if insert(session, IdempotentCall, [values]):
+            return event
+    raise KeyReused(f"the Idempotency-Key {call.key!r} was used for another call: take a new one for each change")

@@ -1,0 +1,53 @@
+"""Sheds load before a queue grows: those who would wait behind too many others are told at once to come back.
+
+A replica answers on one event loop, and small inferences run on it. The queue is therefore not a list: it is the
+requests that have arrived while the loop was busy, all of which its next turn begins. Their number is what this counts,
+up to the `limit` that are taken. As in CoDel (Nichols and Jacobson, 2012, "Controlling queue delay"), a burst may
+exceed it: only a queue that stays too long for `patience` seconds is cut.
+"""
+
+import asyncio
+from collections.abc import Callable
+from time import monotonic
+
+from serve_app.error_handlers import Overloaded
+
+NEVER = float("-inf")
+
+
+class Backlog:
+    """The requests of one turn of the event loop. limit: those that it takes, once its queue stays too long."""
+
+    __slots__ = ("_clock", "_limit", "_long_at", "_long_since", "_patience", "_waiting")
+
+    def __init__(self, limit: int, patience: float, clock: Callable[[], float] = monotonic) -> None:
+        self._limit = limit
+        self._patience = patience
+        self._clock = clock
+        self._waiting = 0
+        self._long_since = self._long_at = NEVER
+
+    def admit(self) -> None:
+        """Let a request begin. Raises Overloaded."""
+        if not self._waiting:
+            # What is called soon is called in the next turn, before what arrives meanwhile.
+            asyncio.get_running_loop().call_soon(self._end_turn)
+        self._waiting += 1
+        if self._waiting > self._limit and self._is_standing():
+            raise Overloaded(f"more than {self._limit} requests wait here already")
+
+    def _is_standing(self) -> bool:
+        """Whether the queue has been too long in every turn of the last `patience` seconds."""
+        now = self._clock()
+        return now - self._long_at <= self._patience < now - self._long_since
+
+    def _end_turn(self) -> None:
+        is_long = self._waiting > self._limit
+        self._waiting = 0
+        if not is_long:
+            self._long_at = NEVER
+            return
+        now = self._clock()
+        if now - self._long_at > self._patience:
+            self._long_since = now
+        self._long_at = now

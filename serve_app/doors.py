@@ -1,0 +1,166 @@
+"""The doors of a replica: every request, over HTTP, a WebSocket or gRPC, passes here before anything of ours sees it.
+
+    key → rate → backlog → deadline → the application
+    401   429     429       504
+    403
+
+Behind HAProxy a replica still has ports of its own, which whoever reaches them may call: so the check is in the
+replica. A deadline is for HTTP alone: gRPC has one of its own, and a stream lasts.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from league.errors import InvalidInput, LeagueError
+from serve_app import permissions
+from serve_app.backlog import Backlog
+from serve_app.bodies import IS_READ
+from serve_app.deadlines import Expired, within
+from serve_app.error_handlers import (
+    BodyTooSlow,
+    DeadlineExceeded,
+    ErrorHandlers,
+    Forbidden,
+    RateLimited,
+    Unauthenticated,
+)
+from serve_app.keyring import Key, Keyring
+from serve_app.permissions import Need
+from serve_app.settings import ServeSettings
+
+KEY = "league.key"
+"""In the scope of a request that showed a key: that `Key`."""
+BEARER = b"bearer "
+READ_HERE = frozenset((b"authorization", b"x-api-key", b"x-request-timeout-ms"))
+DENIAL = "websocket.http.response"
+"""ASGI's extension by which a WebSocket that is refused learns why."""
+POLICY_VIOLATION = 1008
+
+
+class Doors:
+    """Who may pass, and how many at once. `is_exposed`: whether other machines reach this server."""
+
+    def __init__(self, keyring: Keyring, settings: ServeSettings, is_exposed: bool) -> None:
+        self._keyring = keyring
+        self._settings = settings
+        self._is_exposed = is_exposed
+        self.backlog = Backlog(settings.max_waiting, settings.patience)
+
+    @property
+    def are_locked(self) -> bool:
+        """Whether a request needs a key."""
+        if self._settings.require_keys == "auto":
+            return self._is_exposed or not self._keyring.is_empty
+        return self._settings.require_keys == "always"
+
+    def admit(self, need: Need, token: bytes | None) -> Key | None:
+        """Let a request or a call pass; returns its key.
+
+        Raises Unauthenticated, Forbidden, RateLimited or Overloaded.
+        """
+        key = None
+        if need.scope is not None and (need.is_change or self.are_locked):
+            key = self._authorize(need, token)
+        if need.scope == "act":
+            self.backlog.admit()
+        return key
+
+    def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
+        """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
+        headers = (
+            (name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()
+        )
+        self.admit(permissions.of_rpc(rpc, model), _shown(headers)[0])
+
+    def _authorize(self, need: Need, token: bytes | None) -> Key:
+        key = None if token is None else self._keyring.find(token)
+        if key is None:
+            raise Unauthenticated(self._why_not(need, token))
+        if need.scope not in key.scopes:
+            allowed = ", ".join(sorted(key.scopes))
+            raise Forbidden(f"this needs a key of scope {need.scope}: {key.name} is for {allowed}")
+        if key.leagues is not None and need.league not in key.leagues and (need.league or need.is_of_all):
+            allowed, what = ", ".join(sorted(key.leagues)), "all leagues" if need.is_of_all else "another league"
+            raise Forbidden(f"this is about {what}: {key.name} is for {allowed}")
+        if key.bucket is not None and (wait := key.bucket.take()):
+            raise RateLimited(f"{key.name} may call {key.bucket.rate:g} times a second", wait)
+        return key
+
+    def _why_not(self, need: Need, token: bytes | None) -> str:
+        if self._keyring.is_empty:
+            return f"this needs an API key, and there is none yet: league keys create NAME --scope {need.scope}"
+        if token is None:
+            return "this needs an API key: Authorization: Bearer plk_…"
+        return "this API key is unknown, revoked or expired"
+
+
+class Guarded:
+    """The ASGI application behind the doors."""
+
+    def __init__(self, application: ASGIApp, doors: Doors, settings: ServeSettings) -> None:
+        self._application = application
+        self._doors = doors
+        self._timeout = settings.timeout
+        self._errors = ErrorHandlers(settings.retry)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request in, or answer why not."""
+        if (kind := scope["type"]) == "lifespan":
+            await self._application(scope, receive, send)
+            return
+        try:
+            token, patience = _shown(scope["headers"])
+            need = permissions.of_request(kind, scope.get("method", "GET"), _path(scope))
+            key = self._doors.admit(need, token)
+            if key is not None:
+                scope[KEY] = key
+            if kind != "http":
+                await self._application(scope, receive, send)
+                return
+            timeout = self._timeout if patience is None else min(_seconds(patience), self._timeout)
+            await within(timeout, self._application(scope, receive, send))
+        except LeagueError as error:
+            await self._refuse(error, scope, receive, send)
+        except Expired:
+            await self._refuse(_too_late(scope, timeout), scope, receive, send)
+
+    async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
+            return
+        await self._errors.response(_path(scope), error)(scope, receive, send)
+
+
+def _shown(headers: Iterable[tuple[bytes, bytes]]) -> tuple[bytes | None, bytes | None]:
+    """The key's text and the time limit that a request's headers hold."""
+    token, timeout = None, None
+    for name, value in headers:
+        if name in READ_HERE:
+            if name == b"x-request-timeout-ms":
+                timeout = value
+            elif name == b"x-api-key":
+                token = value.strip()
+            elif value[: len(BEARER)].lower() == BEARER:
+                token = value[len(BEARER) :].strip()
+    return token, timeout
+
+
+def _seconds(milliseconds: bytes) -> float:
+    if not (milliseconds.isdigit() and len(milliseconds) <= 9 and int(milliseconds)):
+        raise InvalidInput("x-request-timeout-ms must be a positive number of milliseconds")
+    return int(milliseconds) / 1000
+
+
+def _too_late(scope: Scope, timeout: float) -> LeagueError:
+    if scope["method"] == "POST" and IS_READ not in scope:
+        return BodyTooSlow(f"the body did not arrive within {timeout:g} s")
+    return DeadlineExceeded(f"this was not answered within {timeout:g} s")
+
+
+def _path(scope: Scope) -> str:
+    """The path below the root path, as the router sees it."""
+    path: str = scope["path"]
+    root = scope.get("root_path", "")
+    return path[len(root) :] if root and path.startswith(root) else path

@@ -1,0 +1,165 @@
+"""The protocol over REST, below /v2.
+
+GET   v2 · v2/health/live · v2/health/ready · v2/models/M[/versions/V] · …/ready · …/config · …/stats · v2/models/stats
+POST  v2/models/M[/versions/V]/infer · v2/repository/index
+
+M is `{league}` or `{league}.{policy}`; V is a number or an alias, by default the champion. Statistics are those of the
+replica that answers. An error is `{"error": "…"}`.
+"""
+
+from typing import Any
+
+import orjson
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+
+from league.errors import InvalidInput, NotReady
+from serve_app.alias_watcher import AliasWatcher
+from serve_app.bodies import parse_object, read_bytes
+from serve_app.inference_protocol.catalogue import Catalogue
+from serve_app.inference_protocol.compression import compressed, decompressed
+from serve_app.inference_protocol.framing import read_request, write_response
+from serve_app.inference_protocol.inference import Inference
+from serve_app.routes.action import REPLICA
+from serve_app.settings import ServeSettings
+
+JSON, BINARY = b"application/json", b"application/octet-stream"
+HEADER_LENGTH = b"inference-header-content-length"
+LENGTH_DIGITS = 10
+"""A longer number of bytes is none."""
+
+
+class RestRoutes:
+    """The endpoints."""
+
+    def __init__(
+        self,
+        inference: Inference,
+        catalogue: Catalogue,
+        watcher: AliasWatcher,
+        settings: ServeSettings,
+        replica: str,
+    ) -> None:
+        self._infer = InferRoute(inference, settings, replica)
+        self._inference = inference
+        self._catalogue = catalogue
+        self._settings = settings
+        self._watcher = watcher
+
+    def routes(self) -> list[Route]:
+        """For Starlette, the most frequent first."""
+        infer = [
+            Route(f"{model}/infer", self._infer, methods=["POST"])
+            for model in ("/v2/models/{model}", "/v2/models/{model}/versions/{version}")
+        ]
+        server = [
+            Route("/v2", self._server),
+            Route("/v2/health/live", self._live),
+            Route("/v2/health/ready", self._ready),
+            Route("/v2/repository/index", self._index, methods=["POST"]),
+            Route("/v2/models/stats", self._statistics),
+        ]
+        of_models = [
+            Route(f"{model}{path}", endpoint)
+            for model in ("/v2/models/{model}", "/v2/models/{model}/versions/{version}")
+            for path, endpoint in (
+                ("", self._metadata),
+                ("/ready", self._model_ready),
+                ("/config", self._config),
+                ("/stats", self._statistics),
+            )
+        ]
+        return [*infer, *server, *of_models]
+
+    async def _server(self, _: Request) -> Response:
+        return _json(self._catalogue.server())
+
+    async def _live(self, _: Request) -> Response:
+        return _json({"live": True})
+
+    async def _ready(self, _: Request) -> Response:
+        if not self._watcher.is_ready:
+            raise NotReady("this replica does not follow the registry's aliases yet")
+        return _json({"ready": True})
+
+    async def _model_ready(self, request: Request) -> Response:
+        model, version = _named(request)
+        await self._inference.find(model, version)
+        return _json({"name": model, "ready": True})
+
+    async def _metadata(self, request: Request) -> Response:
+        return _json(await self._catalogue.metadata(*_named(request)))
+
+    async def _config(self, request: Request) -> Response:
+        return _json(await self._catalogue.config(*_named(request)))
+
+    async def _statistics(self, request: Request) -> Response:
+        return _json(await self._catalogue.statistics(*_named(request)))
+
+    async def _index(self, request: Request) -> Response:
+        body = await read_bytes(request.scope, request.receive, self._settings.max_body)
+        only_ready = parse_object(body).get("ready", False) if body else False
+        if type(only_ready) is not bool:
+            raise InvalidInput("ready must be true or false")
+        return _json(await self._catalogue.index(only_ready))
+
+
+class InferRoute:
+    """POST …/infer, an ASGI application of its own: the hot path."""
+
+    def __init__(self, inference: Inference, settings: ServeSettings, replica: str) -> None:
+        self._inference = inference
+        self._settings = settings
+        self._replica = (REPLICA, replica.encode())
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a POST. Raises LeagueError."""
+        with self._inference.admitted():
+            await self._answer(scope, receive, send)
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        header_length, encoding, accepted = _headers(scope)
+        limit = self._settings.max_body
+        body = await read_bytes(scope, receive, limit)
+        if encoding:
+            body = await decompressed(body, encoding, limit)
+        named = scope["path_params"]
+        request = read_request(named["model"], named.get("version", ""), body, header_length)
+        reply, length = await self._inference.infer(request.infer, lambda response: write_response(response, request))
+        headers = [self._replica, (b"content-type", JSON if length is None else BINARY)]
+        if length is not None:
+            headers.append((HEADER_LENGTH, b"%d" % length))
+        if accepted:
+            reply, chosen = await compressed(reply, accepted)
+            headers.append((b"vary", b"accept-encoding"))
+            if chosen is not None:
+                headers.append((b"content-encoding", chosen))
+        headers.append((b"content-length", b"%d" % len(reply)))
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": reply})
+
+
+def _headers(scope: Scope) -> tuple[int | None, bytes, bytes]:
+    """Inference-Header-Content-Length, Content-Encoding and Accept-Encoding. Raises InvalidInput."""
+    header_length, encoding, accepted = None, b"", b""
+    for name, value in scope["headers"]:
+        if name == HEADER_LENGTH:
+            if not value.isdigit() or len(value) > LENGTH_DIGITS:
+                raise InvalidInput("Inference-Header-Content-Length must be a number of bytes")
+            header_length = int(value)
+        elif name == b"content-encoding":
+            encoding = value
+        elif name == b"accept-encoding":
+            accepted = value
+    return header_length, encoding, accepted
+
+
+def _named(request: Request) -> tuple[str, str]:
+    """Model and version of a path, each empty where it has none."""
+    return request.path_params.get("model", ""), request.path_params.get("version", "")
+
+
+def _json(document: Any) -> Response:
+    return Response(orjson.dumps(document), media_type="application/json")

@@ -1,0 +1,77 @@
+"""What a request needs: a scope, and the league that it is about. Pure.
+
+act      POST …/action, …/infer; a stream
+read     GET (HEAD) of anything else; the index of models
+promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
+         thought of is not the one that is open
+nothing  health
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+HEALTH = ("/v1/health/", "/v2/health/")
+OF_NO_LEAGUE = ("/v2", "/docs", "/openapi.json")
+"""Paths, and what is below `/docs`, that tell nothing of a league."""
+
+
+class Need(NamedTuple):
+    """What a key must have. No scope: no key is needed."""
+
+    scope: str | None
+    league: str | None
+    """None: it is about none, or about all of them."""
+    is_of_all: bool = False
+    """Whether it is about all leagues."""
+    is_change: bool = False
+    """Whether it changes what is served."""
+
+
+NOTHING = Need(None, None)
+
+
+@lru_cache(maxsize=4096)  # the same few come again and again
+def of_request(kind: str, method: str, path: str) -> Need:
+    """What a request needs; `kind` is ASGI's, `http` or `websocket`, and `path` is below the root path."""
+    if path.startswith(HEALTH) and method in ("GET", "HEAD"):
+        return NOTHING
+    league = _league(path)
+    scope = _scope(kind, method, path)
+    is_of_none = path in OF_NO_LEAGUE or path.startswith("/docs/")
+    return Need(scope, league, league is None and not is_of_none, scope == "promote" and _is_of_alias(path))
+
+
+@lru_cache(maxsize=4096)
+def of_rpc(rpc: str, model: str) -> Need:
+    """What a call of gRPC's GRPCInferenceService needs; `model` is empty where it names none."""
+    if rpc in ("ServerLive", "ServerReady"):
+        return NOTHING
+    scope = "act" if rpc == "ModelInfer" else "read"
+    league = model.partition(".")[0] or None
+    return Need(scope, league, league is None and rpc != "ServerMetadata")
+
+
+def _scope(kind: str, method: str, path: str) -> str:
+    if kind == "websocket":
+        return "act"
+    if method in ("GET", "HEAD") or path == "/v2/repository/index":
+        return "read"
+    is_action = path.startswith("/v1/policies/") and path.endswith("/action")
+    is_inference = path.startswith("/v2/models/") and path.endswith("/infer")
+    return "act" if is_action or is_inference else "promote"
+
+
+def _is_of_alias(path: str) -> bool:
+    """Whether a path is `/v1/leagues/L/aliases/A` or `/v1/leagues/L/rollback`."""
+    parts = path.split("/")
+    return parts[1:3] == ["v1", "leagues"] and parts[4:5] in (["aliases"], ["rollback"])
+
+
+def _league(path: str) -> str | None:
+    """The league that a path names: `/v1/leagues/L…`, `/v1/policies/L.policy/…`, `/v2/models/L…`."""
+    _, *parts = path.split("/", 4)
+    if len(parts) < 3 or tuple(parts[:2]) not in (("v1", "leagues"), ("v1", "policies"), ("v2", "models")):
+        return None
+    if parts == ["v2", "models", "stats"]:
+        return None
+    return parts[2].partition(".")[0] or None

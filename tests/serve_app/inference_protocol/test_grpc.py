@@ -1,0 +1,231 @@
+"""gRPC without a client library: tensors in the fields of their datatype, and every way to get a message wrong."""
+
+import socket
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from league.settings import Storage
+from serve_app.inference_protocol import grpc_handlers
+from serve_app.inference_protocol import open_inference_pb2 as messages
+from serve_app.inference_protocol.grpc_messages import CONTENTS
+from tests.serve_app.inference_protocol.conftest import InProcess
+from tests.serve_app.inference_protocol.leagues import DTYPES
+from tests.serve_app.inference_protocol.observations import observations, policy_of
+
+Call = Callable[[str, Any], Any]
+Input = messages.ModelInferRequest.InferInputTensor
+CLIENTS_FAULT = {
+    grpc.StatusCode.INVALID_ARGUMENT,
+    grpc.StatusCode.NOT_FOUND,
+    grpc.StatusCode.RESOURCE_EXHAUSTED,
+}
+
+
+@pytest.fixture(scope="module")
+def call(replica: InProcess) -> Iterator[Call]:
+    """Call by name, with a message or its bytes."""
+    with grpc.insecure_channel(replica.grpc) as channel:
+
+        def call(rpc: str, request: Any) -> Any:
+            answer = getattr(messages, f"{rpc}Response").FromString
+            content = request if isinstance(request, bytes) else request.SerializeToString()
+            return channel.unary_unary(f"/{grpc_handlers.SERVICE}/{rpc}", None, answer)(content)
+
+        yield call
+
+
+def refused(call: Call, request: Any, rpc: str = "ModelInfer") -> str:
+    with pytest.raises(grpc.RpcError) as caught:
+        call(rpc, request)
+    assert caught.value.code() in CLIENTS_FAULT, caught.value  # type: ignore[attr-defined]
+    return str(caught.value.details())  # type: ignore[attr-defined]
+
+
+def vector(**changes: Any) -> messages.ModelInferRequest:
+    """A good request, with another input."""
+    tensor = {"name": "observation", "datatype": "FP32", "shape": [1, 2], "contents": {"fp32_contents": [0.5, -1]}}
+    inputs = [Input(**{key: value for key, value in (tensor | changes).items() if value is not None})]
+    return messages.ModelInferRequest(model_name="vector", inputs=inputs)
+
+
+def test_numbers_in_the_field_of_their_datatype(call: Call, leagues: Storage) -> None:
+    policy, signature = policy_of(leagues, "kinds")
+    arrays = observations(signature, 2)
+    # FP16 has no field, and without bytes for all there are bytes for none.
+    without = [name for name in arrays if signature.inputs[name].datatype != "FP16"]
+    assert len(without) == len(DTYPES) - 1
+    inputs = [
+        Input(
+            name=name,
+            datatype=signature.inputs[name].datatype,
+            shape=arrays[name].shape,
+            contents={CONTENTS[signature.inputs[name].datatype]: arrays[name].ravel().tolist()},
+        )
+        for name in without
+    ]
+    half = Input(name="observation.float16", datatype="FP16", shape=[2, 2, 3])
+    request = messages.ModelInferRequest(model_name="kinds", inputs=[*inputs, half])
+    assert "send it as bytes" in refused(call, request)
+    del request.inputs[-1]
+    assert "input observation.float16 is missing" in refused(call, request)
+    for tensor in request.inputs:
+        tensor.ClearField("contents")
+    request.inputs.append(half)
+    request.raw_input_contents.extend(
+        [*(arrays[name].tobytes() for name in without), arrays["observation.float16"].tobytes()]
+    )
+    answer = call("ModelInfer", request)
+    np.testing.assert_array_equal(
+        np.frombuffer(answer.raw_output_contents[0], np.float32).reshape(2, -1), policy.act(arrays).actions
+    )
+
+
+def test_an_answer_is_in_bytes(call: Call) -> None:
+    request = vector()
+    request.id = "tick"
+    answer = call("ModelInfer", request)
+    assert (answer.model_name, answer.model_version, answer.id) == ("vector", "1", "tick")
+    assert [(output.name, output.datatype, list(output.shape)) for output in answer.outputs] == [
+        ("action", "FP32", [1, 2]),
+        ("action_dist_inputs", "FP32", [1, 4]),
+    ]
+    assert answer.raw_output_contents[0] == np.array([0.5, -1], "<f4").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"contents": {"fp32_contents": [1]}}, "has 1 elements, expected 2"),
+        ({"contents": {"fp64_contents": [1, 2]}}, "has 0 elements, expected 2"),
+        ({"contents": None}, "has 0 elements, expected 2"),
+        ({"datatype": "FP64"}, "has datatype FP64, expected FP32"),
+        ({"datatype": ""}, "datatype ''"),
+        ({"shape": [2]}, "has shape [2], expected [batch, 2]"),
+        ({"shape": [-1, 2]}, "has shape [-1, 2]"),
+        ({"name": "other"}, "no input 'other'"),
+        ({"contents": {"fp32_contents": [float("nan"), 0]}}, "finite"),
+    ],
+)
+def test_a_bad_tensor_is_refused(call: Call, changes: dict[str, Any], words: str) -> None:
+    assert words in refused(call, vector(**changes))
+
+
+def test_bytes_are_for_all_inputs_or_for_none(call: Call) -> None:
+    request = vector()
+    request.raw_input_contents.append(bytes(8))
+    assert "contents as well as raw_input_contents" in refused(call, request)
+    request.inputs[0].ClearField("contents")
+    request.raw_input_contents.append(bytes(8))
+    assert "2 raw_input_contents for 1 inputs" in refused(call, request)
+    del request.raw_input_contents[:]
+    request.raw_input_contents.append(bytes(7))
+    assert "has 7 bytes, expected 8" in refused(call, request)
+
+
+def test_a_large_message_is_refused(call: Call, replica: InProcess) -> None:
+    request = messages.ModelInferRequest(model_name="vector", raw_input_contents=[bytes(600 * 1024)])
+    assert "larger than 524288 bytes" in refused(call, request)
+
+
+def test_too_many_calls_at_once_are_told_so(call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replica.server.inference, "in_flight", 10**6)
+    assert "in progress here already" in refused(call, vector())
+
+
+def test_a_call_that_is_not_there(call: Call) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        call("ModelStatistics", messages.ModelStatisticsRequest(name="nobody"))
+    assert caught.value.code() == grpc.StatusCode.NOT_FOUND  # type: ignore[attr-defined]
+    with pytest.raises(grpc.RpcError) as caught:
+        call("ModelInfer", messages.ModelInferRequest(model_name="empty"))
+    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
+
+
+def test_calls_from_elsewhere_are_refused(replica: InProcess) -> None:
+    """The port listens on all interfaces, as Ray Serve's does; this replica takes itself to be known as 127.0.0.1."""
+    outward, port = own_address(), replica.grpc.rpartition(":")[2]
+    if outward is None:
+        pytest.skip("this machine has no address but the loopback's")
+    with grpc.insecure_channel(f"{outward}:{port}") as channel:
+        live = channel.unary_unary(f"/{grpc_handlers.SERVICE}/ServerLive")
+        with pytest.raises(grpc.RpcError, match="from its own machine alone") as caught:
+            live(b"", timeout=10)
+    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
+
+
+def test_a_process_without_a_replica_says_so(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grpc_handlers, "_service", None)
+    with pytest.raises(grpc.RpcError, match="no replica answers here") as caught:
+        call("ServerLive", messages.ServerLiveRequest())
+    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
+
+
+def test_a_bug_is_told_to_the_log_alone(call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("secret")
+
+    monkeypatch.setattr(replica.server.catalogue, "server", fail)
+    with pytest.raises(grpc.RpcError) as caught:
+        call("ServerMetadata", messages.ServerMetadataRequest())
+    assert caught.value.code() == grpc.StatusCode.INTERNAL  # type: ignore[attr-defined]
+    assert "secret" not in caught.value.details()  # type: ignore[attr-defined]
+
+
+def own_address() -> str | None:
+    """An address of this machine that is not the loopback's."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: it asks for the route
+        except OSError:
+            return None
+        address = str(probe.getsockname()[0])
+    return None if address.startswith("127.") else address
+
+
+names = st.sampled_from(["observation", "action_mask", "state_in_0"]) | st.text(max_size=5)
+requests = st.builds(
+    messages.ModelInferRequest,
+    model_name=st.sampled_from(["board", "vector", "memory", "nested", "chess", "duo", "duo.left"]),
+    model_version=st.sampled_from(["", "1", "champion", "99", "x y"]),
+    inputs=st.lists(
+        st.builds(
+            Input,
+            name=names,
+            datatype=st.sampled_from([*CONTENTS, "FP16", "BYTES"]) | st.text(max_size=4),
+            shape=st.lists(st.integers(-1, 3) | st.just(2**62), max_size=4),
+            contents=st.none()
+            | st.builds(
+                messages.InferTensorContents,
+                fp32_contents=st.lists(st.floats(width=32), max_size=4),
+                int_contents=st.lists(st.integers(-(2**31), 2**31 - 1), max_size=4),
+                bool_contents=st.lists(st.booleans(), max_size=4),
+            ),
+        ),
+        max_size=3,
+    ),
+    outputs=st.lists(
+        st.builds(
+            messages.ModelInferRequest.InferRequestedOutputTensor,
+            name=st.sampled_from(["action", "action_dist_inputs"]) | st.text(max_size=5),
+        ),
+        max_size=3,
+    ),
+    raw_input_contents=st.lists(st.binary(max_size=100), max_size=3),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(request=requests | st.binary(max_size=60))
+def test_no_message_is_the_server_s_fault(call: Call, request: Any) -> None:
+    failure = None
+    try:
+        call("ModelInfer", request)
+    except grpc.RpcError as error:
+        failure = error
+    assert failure is None or failure.code() in CLIENTS_FAULT, failure  # type: ignore[attr-defined]

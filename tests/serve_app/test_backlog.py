@@ -1,0 +1,59 @@
+"""Load is shed when a queue stays too long, and a burst is not."""
+
+import asyncio
+
+import pytest
+
+from serve_app.backlog import Backlog
+from serve_app.error_handlers import Overloaded
+
+pytestmark = pytest.mark.anyio
+LIMIT, PATIENCE = 3, 0.1
+
+
+class Loop:
+    """A backlog whose turns are told how many requests they begin, and how long they take."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.backlog = Backlog(LIMIT, PATIENCE, lambda: self.now)
+
+    async def turn(self, requests: int, seconds: float) -> int:
+        """How many of a turn's requests were let in."""
+        admitted = 0
+        for _ in range(requests):
+            try:
+                self.backlog.admit()
+            except Overloaded:
+                continue
+            admitted += 1
+        self.now += seconds
+        await asyncio.sleep(0)
+        return admitted
+
+
+async def test_a_short_queue_is_never_cut() -> None:
+    loop = Loop()
+    assert [await loop.turn(LIMIT, 1.0) for _ in range(20)] == [LIMIT] * 20
+
+
+async def test_a_queue_that_stays_is_cut_after_patience_until_it_is_short_again() -> None:
+    loop = Loop()
+    assert [await loop.turn(10, 0.03) for _ in range(4)] == [10] * 4
+    await loop.turn(10, 0.03)
+    assert [await loop.turn(10, 0.03) for _ in range(20)] == [LIMIT] * 20
+    assert await loop.turn(LIMIT, 0.03) == LIMIT
+    assert await loop.turn(10, 0.03) == 10, "it begins anew"
+
+
+async def test_bursts_that_come_now_and_then_are_not_cut() -> None:
+    loop = Loop()
+    for _ in range(20):
+        assert await loop.turn(100, 0.05) == 100
+        loop.now += 10
+
+
+async def test_one_turn_that_takes_long_is_not_a_queue_that_stays() -> None:
+    loop = Loop()
+    assert await loop.turn(10, 5.0) == 10
+    assert await loop.turn(10, 0.01) == 10

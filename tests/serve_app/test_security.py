@@ -1,0 +1,274 @@
+"""Nothing that comes from a checkpoint or a request is run: traps of every kind are served and asked, none goes off.
+
+CPython announces what an unpickler looks up, and each process that is started, to an audit hook (PEP 578). Nothing else
+of this test's process unpickles meanwhile.
+"""
+
+import base64
+import gzip
+import hashlib
+import io
+import os
+import pickle
+import shutil
+import sys
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from sqlalchemy import update
+from starlette.testclient import TestClient
+
+from league.registry.manifest import MANIFEST, Manifest
+from league.registry.registry import Registry
+from league.registry.tables import Version
+from tests.league.policies.graphs import masked_mlp
+from tests.serve_app.leagues import promote, publish
+from tests.serve_app.test_action import BOARD, act
+
+SUSPICIOUS = frozenset(("pickle.find_class", "os.system", "os.exec", "subprocess.Popen", "os.posix_spawn"))
+_watched: list[str] | None = None
+
+
+def _hook(event: str, arguments: tuple[object, ...]) -> None:
+    if _watched is not None and event in SUSPICIOUS:
+        _watched.append(f"{event}{arguments}")
+
+
+sys.addaudithook(_hook)
+
+
+@contextmanager
+def nothing_runs() -> Iterator[None]:
+    """Fail if anything is unpickled, or any process is started, while the context lasts."""
+    global _watched
+    _watched = []
+    try:
+        yield
+        assert _watched == []
+    finally:
+        _watched = None
+
+
+class Trap:
+    """Unpickling it writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, (f"touch {self.path}",)
+
+
+@pytest.fixture
+def mark(tmp_path: Path) -> Path:
+    return tmp_path / "sprung"
+
+
+@pytest.fixture
+def trap(mark: Path) -> bytes:
+    """A pickle that goes off when it is loaded."""
+    return pickle.dumps(Trap(mark))
+
+
+def test_the_trap_would_go_off(trap: bytes, mark: Path) -> None:
+    with pytest.raises(AssertionError, match=r"pickle\.find_class"), nothing_runs():
+        pickle.loads(trap)
+    assert mark.exists()
+
+
+def torch_checkpoint(trap: bytes) -> bytes:
+    """What `torch.load` takes: a ZIP file with a pickle inside."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("archive/data.pkl", trap)
+        archive.writestr("archive/version", b"3\n")
+    return buffer.getvalue()
+
+
+def tar_bomb(trap: bytes) -> bytes:
+    """A small file that unpacks to a large one beside paths that lead out of the directory."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
+        for name, content in (("../../outside", trap), ("zeros", bytes(50 * 2**20))):
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            archive.addfile(info, io.BytesIO(content))
+    return buffer.getvalue()
+
+
+def outside_weights(path: Path) -> bytes:
+    """A graph whose weights lie in a file elsewhere."""
+    model = onnx.load_from_string(masked_mlp(seed=0))
+    for tensor in model.graph.initializer:
+        tensor.ClearField("raw_data")
+        tensor.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", str(path)), ("offset", "0"), ("length", "16")):
+            tensor.external_data.add(key=key, value=value)
+    return model.SerializeToString()
+
+
+def foreign_operator(path: Path) -> bytes:
+    """A graph with an operator that a Python library would have to bring."""
+    model = onnx.load_from_string(masked_mlp(seed=0))
+    model.graph.node.append(
+        helper.make_node("PyOp", [model.graph.output[0].name], ["more"], domain="ai.onnx.contrib", code=str(path))
+    )
+    model.opset_import.append(helper.make_opsetid("ai.onnx.contrib", 1))
+    return model.SerializeToString()
+
+
+GRAPHS: dict[str, Callable[[bytes, Path], bytes]] = {
+    "a pickle": lambda trap, _: trap,
+    "a checkpoint of torch": lambda trap, _: torch_checkpoint(trap),
+    "an archive": lambda trap, _: tar_bomb(trap),
+    "compressed zeros": lambda _, __: gzip.compress(bytes(50 * 2**20)),
+    "weights in another file": lambda _, mark: outside_weights(mark),
+    "weights in a relative path": lambda _, mark: outside_weights(Path("..") / ".." / mark.name),
+    "an operator of Python": lambda _, mark: foreign_operator(mark),
+    "nothing": lambda _, __: b"",
+}
+
+
+@pytest.mark.parametrize("kind", GRAPHS)
+def test_a_booby_trapped_version_is_refused_and_the_champion_stays(
+    client: TestClient, registry: Registry, trap: bytes, mark: Path, kind: str
+) -> None:
+    """Published with digests that are right, as somebody could who may publish."""
+    graph = masked_mlp(seed=0)
+    version = publish(registry, "board", {"shared": graph}, "run/trap")
+    swap(registry, version.number, version.manifest, {"shared.onnx": GRAPHS[kind](trap, mark)})
+    with nothing_runs():
+        promote(registry, "board", version.number)
+        until(lambda: faults(client))
+        assert act(client, observation=BOARD)["version"] == 1
+        reply = client.post(f"/v1/policies/board/action?version={version.number}", json={"observation": BOARD})
+        assert (reply.status_code, reply.json()["code"]) == (503, "artifact_corrupt")
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("name", ["../2/shared.onnx", "/etc/passwd", "missing.onnx", ".", "", "shared.onnx/x"])
+def test_a_manifest_that_names_other_files_is_refused(client: TestClient, registry: Registry, name: str) -> None:
+    version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
+    policy = version.manifest.policies["shared"].model_copy(update={"file": name})
+    swap(registry, version.number, version.manifest.model_copy(update={"policies": {"shared": policy}}), {})
+    promote(registry, "board", version.number)
+    until(lambda: faults(client))
+    assert act(client, observation=BOARD)["version"] == 1
+    promote(registry, "board", 2)
+    until(lambda: act(client, observation=BOARD)["version"] == 2)
+
+
+@pytest.mark.parametrize("name", ["../../outside", "/etc/passwd"])
+def test_a_digest_of_a_file_elsewhere_is_refused(client: TestClient, registry: Registry, name: str) -> None:
+    version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
+    (registry.artifacts.root / "outside").write_bytes(b"not this league's")
+    files = version.manifest.files | {name: "0" * 64}
+    swap(registry, version.number, version.manifest.model_copy(update={"files": files}), {})
+    promote(registry, "board", version.number)
+    until(lambda: "is missing" in (faults(client) or [""])[0])
+    assert act(client, observation=BOARD)["version"] == 1
+
+
+def as_symbolic_link(path: Path) -> None:
+    secret = path.parent.parent / "secret"
+    secret.write_text("somebody else's")
+    path.unlink()
+    path.symlink_to(secret)
+
+
+def as_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def as_directory(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def as_device(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+def as_nothing(path: Path) -> None:
+    shutil.rmtree(path.parent)
+
+
+@pytest.mark.parametrize("file", ["shared.onnx", MANIFEST])
+@pytest.mark.parametrize("replace", [as_symbolic_link, as_pipe, as_directory, as_device, as_nothing])
+def test_a_file_that_is_none_is_refused_and_nobody_waits(
+    client: TestClient, registry: Registry, replace: Callable[[Path], None], file: str
+) -> None:
+    replace(registry.artifacts.path("board", 3) / file)
+    promote(registry, "board", 3)
+    until(lambda: faults(client))
+    assert act(client, observation=BOARD)["version"] == 1
+    promote(registry, "board", 2)
+    until(lambda: act(client, observation=BOARD)["version"] == 2)
+
+
+TYPES = ("application/json", "application/octet-stream", "application/x-pickle", "application/python-pickle", None)
+PATHS = ("/v1/policies/board/action", "/v2/models/board/infer", "/v2/repository/index", "/v1/leagues/board/rollback")
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_booby_trapped_request_is_refused(
+    client: TestClient, registry: Registry, trap: bytes, mark: Path, path: str
+) -> None:
+    _, token = registry.create_key("all", ["act", "read", "promote"])
+    text = base64.b64encode(trap).decode()
+    bodies: list[bytes] = [
+        trap,
+        zlib.compress(trap),
+        text.encode(),
+        b'{"observation": "%s"}' % text.encode(),
+        b'{"observation": {"__reduce__": ["os.system", ["touch %s"]]}}' % str(mark).encode(),
+        b'{"py/object": "os.system", "py/reduce": ["touch %s"]}' % str(mark).encode(),
+        b'{"inputs": [{"name": "observation", "shape": [1], "datatype": "BYTES", "data": ["%s"]}]}' % text.encode(),
+        b"!!python/object/apply:os.system ['touch %s']" % str(mark).encode(),
+    ]
+    with nothing_runs():
+        for body in bodies:
+            for media_type in TYPES:
+                headers = {"x-api-key": token, "idempotency-key": "a"}
+                headers |= {} if media_type is None else {"content-type": media_type}
+                reply = client.post(path, content=body, headers=headers)
+                assert 400 <= reply.status_code < 500, reply.text
+        body = zlib.compress(bytes(60 * 2**20), 9)
+        reply = client.post(path, content=body, headers={"x-api-key": token, "content-encoding": "deflate"})
+        assert 400 <= reply.status_code < 500, "and a body that is much larger than it looks"
+    assert not mark.exists()
+    reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers={"x-api-key": token})
+    assert reply.json()["version"] == 1
+
+
+def swap(registry: Registry, number: int, manifest: Manifest, files: dict[str, bytes]) -> None:
+    """Replace what was published, with digests that are right, in the store and in the database."""
+    directory = registry.artifacts.path(manifest.league, number)
+    for name, content in files.items():
+        (directory / name).write_bytes(content)
+    digests = manifest.files | {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    text = manifest.model_copy(update={"files": digests}).to_json()
+    (directory / MANIFEST).write_text(text)
+    with registry.database.write() as session:
+        values = {"manifest": text, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+        session.execute(update(Version).filter_by(league=manifest.league, number=number).values(values))
+
+
+def faults(client: TestClient) -> list[str]:
+    return client.get("/v1/leagues/board").json()["faults"]
+
+
+def until(condition: Callable[[], object], seconds: float = 20) -> None:
+    deadline = monotonic() + seconds
+    while not condition():
+        assert monotonic() < deadline
