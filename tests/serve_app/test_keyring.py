@@ -33,7 +33,7 @@ def keyring(row: KeyRow) -> Iterator[Keyring]:
     keyring = Keyring()
     assert keyring.is_empty
     keyring.follow([row])
-    yield keyring
+    return keyring
 
 
 def test_a_key_is_found_by_its_text_alone(keyring: Keyring, row: KeyRow) -> None:
