@@ -1,6 +1,5 @@
 """The keys in a replica's memory."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
@@ -29,7 +28,7 @@ def row() -> KeyRow:
 
 
 @pytest.fixture
-def keyring(row: KeyRow) -> Iterator[Keyring]:
+def keyring(row: KeyRow) -> Keyring:
     keyring = Keyring()
     assert keyring.is_empty
     keyring.follow([row])
