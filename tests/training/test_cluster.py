@@ -1,3 +1,6 @@
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -5,8 +8,9 @@ import ray
 
 from league.errors import ConfigError
 from league.settings import Storage
-from training.cluster import connected
+from training.cluster import LocalRay, connected
 
+DEADLINE = 120
 SHARED = Storage(Path("/home/x"), "postgresql://db/league", Path("/mnt/artifacts"))
 
 
@@ -39,3 +43,39 @@ def test_the_callers_ray_is_left_running(tmp_path: Path) -> None:
     with connected(None, Storage.at(tmp_path)):
         pass
     assert ray.is_initialized()
+
+
+LOCAL = """
+import json, httpx, ray
+from pathlib import Path
+from league.settings import Storage
+from training.cluster import LocalRay, connected
+with connected(None, Storage.at("here"), LocalRay(cpus=1, object_store=100, dashboard=True)) as url:
+    print(json.dumps({
+        "resources": ray.cluster_resources(), "status": httpx.get(url, timeout=60).status_code, "url": url,
+    }))
+assert not ray.is_initialized()
+"""
+
+
+def test_a_local_ray_keeps_to_its_limits_and_shows_its_dashboard() -> None:
+    done = subprocess.run([sys.executable, "-c", LOCAL], capture_output=True, text=True, timeout=DEADLINE)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["resources"]["CPU"] == 1
+    assert found["resources"]["object_store_memory"] == 100 * 10**6
+    assert found["url"].startswith("http://127.0.0.1:")
+    assert found["status"] == 200
+
+
+@pytest.mark.parametrize("limits", [LocalRay(cpus=1), LocalRay(object_store=100), LocalRay(dashboard=True)])
+def test_a_cluster_has_limits_of_its_own(tmp_path: Path, limits: LocalRay) -> None:
+    with pytest.raises(ConfigError, match="for a local Ray"), connected("auto", Storage.at(tmp_path), limits):
+        pass
+
+
+def test_an_object_store_that_is_too_small_for_ray(tmp_path: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", LOCAL.replace("=100", "=50")], capture_output=True, text=True, timeout=DEADLINE
+    )
+    assert "ConfigError: --object-store: at least 80 MB, got 50" in found.stderr

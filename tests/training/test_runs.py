@@ -37,6 +37,27 @@ def test_only_the_budget_may_change(storage: Storage) -> None:
         Run.resume(storage, tictactoe(lr=0.5))
 
 
+def test_a_complete_run_goes_on_with_a_larger_budget(storage: Storage) -> None:
+    Run.begin(storage, tictactoe(steps=10, minutes=5), None, None).complete()
+    for budget in ({"steps": 10, "minutes": 5}, {"steps": 9, "minutes": 4}):
+        with pytest.raises(NotFound, match="unless --steps or --minutes is larger"):
+            Run.resume(storage, tictactoe(**budget))
+    assert not Run.resume(storage, tictactoe(steps=11, minutes=5)).record.complete
+    Run.resume(storage, tictactoe(steps=11, minutes=5)).complete()
+    assert Run.resume(storage, tictactoe(steps=11)).record.config.training.minutes is None
+
+
+def test_opponents_stay_who_they_were_when_the_run_began(storage: Storage) -> None:
+    """Though the alias may have moved since."""
+    written = tictactoe(opponents=[{"ref": "@champion", "share": 0.5}])
+    begun = Run.begin(storage, written, None, None, {"@champion": "tictactoe@3"})
+    assert begun.record.config.training.opponents[0].ref == "tictactoe@3"
+    assert Run.resume(storage, written).record.config == begun.record.config
+    for other in ({"ref": "@latest", "share": 0.5}, {"ref": "@champion", "share": 0.25}):
+        with pytest.raises(ConfigError, match=r"training\.opponents has changed"):
+            Run.resume(storage, tictactoe(opponents=[other]))
+
+
 def test_one_driver_at_a_time(storage: Storage) -> None:
     run = Run.begin(storage, tictactoe(), None, None)
     with run.locked():

@@ -95,7 +95,7 @@ from tests.training.test_sweep import LONG
 from training.sweep import sweep
 sweep(LONG, registry=Registry.open(Storage.at(sys.argv[1])))
 """
-LONG = league({"steps": [256, 4096]}, training={"epochs": 32, "minibatch_size": 32}, metric="shared/length")
+LONG = league({"steps": [256, 1024]}, training={"epochs": 32, "minibatch_size": 32}, metric="shared/length")
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -116,7 +116,7 @@ def test_a_sweep_that_was_killed_goes_on_with_what_is_not_over(registry: Registr
     report = sweep(LONG, registry=registry, resume=True, publish_best=False, console=Console(file=shown))
     assert outcome.stat().st_mtime_ns == before, "what is over is not tried again"
     assert "trial 0" not in shown.getvalue()
-    assert [trial.outcome.steps for trial in report.trials if trial.outcome] == [256, 4096]
+    assert [trial.outcome.steps for trial in report.trials if trial.outcome] == [256, 1024]
     assert report.version is None
     first_of_second_life = EventAccumulator(str(max((report.path / "trial-001").glob("events*"))))
     assert first_of_second_life.Reload().Scalars("run/steps")[0].step > 256, "it went on from its checkpoint"
