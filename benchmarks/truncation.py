@@ -4,14 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from training.learners.ppo import PPOLearner
 from training.learners.train_batch import Chunks
 
 
-def as_rllib(_: Algorithm) -> None:
+def as_rllib(algorithm: Algorithm) -> None:
     """RLlib 2.60 flags agents that are truncated together as terminated (`multi_agent_episode.py`): the learner of
     this process then bootstraps only where a chunk was cut."""
-    PPOLearner.bootstraps = staticmethod(unless_done)
+    algorithm.learner_group._learner.bootstraps = unless_done
 
 
 def unless_done(chunks: Chunks) -> NDArray:

@@ -1,5 +1,6 @@
 """`league train` and `league sweep`."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """128 + SIGINT."""
+TOKENS = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
 
 Config = Annotated[Path, typer.Argument(help="The league's file, such as configs/connect_four.yaml.")]
 Address = Annotated[
@@ -69,6 +71,8 @@ def train(
     """
     settings = _given(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus)
     league = LeagueConfig.load(config).with_training(**settings)
+    if job:
+        _show_token()
     from training.cluster import LocalRay, check_unlimited
 
     local = LocalRay(cpus, object_store, dashboard)
@@ -182,6 +186,13 @@ def _note(error: Exception | None, is_open: bool, ended_early: bool) -> str:
     if error is not None:
         return str(error)
     return "not over" if is_open else "ended early" if ended_early else ""
+
+
+def _show_token() -> None:
+    """Ray 2.60 asks for a token at each dashboard by default, but shows the one that this user has only if it was told
+    to before it was imported."""
+    if os.environ.keys() & TOKENS or Path("~/.ray/auth_token").expanduser().exists():
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
 def _submit(address: str, config: Path, arguments: list[str]) -> None:

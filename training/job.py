@@ -6,15 +6,23 @@ import shlex
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
+from ray.exceptions import AuthenticationError
 from ray.job_submission import JobStatus, JobSubmissionClient
 
 from league.errors import ConfigError, LeagueError
 from league.settings import Storage
 
+STARTS_WITHIN = 60.0
+"""Seconds."""
+NOT_YET = "No available agent"
+"""Ray's words for a cluster that takes no jobs yet."""
+CHATTY = ("ray.dashboard.modules.job.sdk", "ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging")
 LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 
 
@@ -32,14 +40,13 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
         raise ConfigError(f"--job: expected --address http://HOST:8265, the cluster's dashboard, got {address!r}")
     if host not in LOOPBACK:
         _check_reach(host, storage)
-    logging.getLogger("ray.dashboard.modules.job.sdk").setLevel(logging.ERROR)
+    for chatty in CHATTY:
+        logging.getLogger(chatty).setLevel(logging.ERROR)
     client = _client(address)
     with tempfile.TemporaryDirectory() as directory:
         shutil.copy(config, directory)
-        job = client.submit_job(
-            entrypoint=shlex.join(["league", "train", config.name, "--address", "auto", *arguments]),
-            runtime_env={"working_dir": directory, "env_vars": _environment(storage)},
-        )
+        command = shlex.join(["league", "train", config.name, "--address", "auto", *arguments])
+        job = _begin(client, command, {"working_dir": directory, "env_vars": _environment(storage)})
     say(f"Job {job} is submitted. To stop it: ray job stop {job} --address {address}")
     try:
         asyncio.run(_follow(client, job, say))
@@ -53,9 +60,23 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
 def _client(address: str) -> JobSubmissionClient:
     try:
         return JobSubmissionClient(address)
+    except AuthenticationError as error:
+        raise ConfigError(f"--job: {address} wants a token: set RAY_AUTH_TOKEN, or RAY_AUTH_TOKEN_PATH") from error
     except (ConnectionError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"--job: no Ray dashboard at {address}: {reason}") from error
+
+
+def _begin(client: JobSubmissionClient, command: str, runtime_env: dict[str, Any]) -> str:
+    """Submit the job. A cluster that has just started takes a while until it takes jobs."""
+    deadline = time.monotonic() + STARTS_WITHIN
+    while True:
+        try:
+            return str(client.submit_job(entrypoint=command, runtime_env=runtime_env))
+        except RuntimeError as error:
+            if NOT_YET not in str(error) or time.monotonic() > deadline:
+                raise LeagueError(f"the cluster did not take the job: {' '.join(str(error).split())}") from error
+            time.sleep(0.5)
 
 
 async def _follow(client: JobSubmissionClient, job: str, say: Callable[[str], None]) -> None:

@@ -106,7 +106,7 @@ def gather(
                 memory = memories[group.policy]
                 situation = Met(batch.observations, memory.before(batch))
                 met[group.policy].append(situation)
-                dist_inputs, state = _answer(modules[group.policy], situation)
+                dist_inputs, state = answer(modules[group.policy], situation)
                 memory.keep(batch, state)
                 drawn = distributions[group.policy]
                 if group.explores:
@@ -131,18 +131,18 @@ def prove(path: Path, policy: str, module: ActorCritic, batches: list[Met], spac
     near_ties = mismatches = 0
     largest = worst = 0.0
     for situation in batches:
-        expected, state = _answer(module, situation)
+        expected, state = answer(module, situation)
         if not np.isfinite(expected).all():
             raise ParityError(f"policy {policy} has outputs that are not finite: training has diverged")
         mode = module.distribution.mode(torch.from_numpy(expected)).numpy()
         before = {f"{STATE_IN}{i}": value for i, value in enumerate(situation.state.values())}
-        answer = graph.distribution(situation.observations, state=before or None)
-        assert answer.dist_inputs is not None
-        wrong, tied = _differing(answer.actions, to_environment(mode, space), expected, space)
+        exported = graph.distribution(situation.observations, state=before or None)
+        assert exported.dist_inputs is not None
+        wrong, tied = differing(exported.actions, to_environment(mode, space), expected, space)
         mismatches, near_ties = mismatches + wrong, near_ties + tied
-        largest = max(largest, float(np.abs(answer.dist_inputs - expected).max()))
-        pairs = [(answer.dist_inputs, expected)]
-        pairs += zip((answer.state or {}).values(), state.values(), strict=True)
+        largest = max(largest, float(np.abs(exported.dist_inputs - expected).max()))
+        pairs = [(exported.dist_inputs, expected)]
+        pairs += zip((exported.state or {}).values(), state.values(), strict=True)
         worst = max(worst, *(float((np.abs(found - known) / (1 + np.abs(known))).max()) for found, known in pairs))
     count = sum(map(len, batches))
     if mismatches or not worst <= TOLERANCE:
@@ -153,16 +153,16 @@ def prove(path: Path, policy: str, module: ActorCritic, batches: list[Met], spac
     return Parity(observations=count, mismatches=mismatches, near_ties=near_ties, max_difference=largest)
 
 
-def _answer(module: ActorCritic, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:
+def answer(module: ActorCritic, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:
     """What a module answers: inputs of its distribution (k, d), and the states after."""
-    answer = module.forward_inference(
+    outputs = module.forward_inference(
         {
             Columns.OBS: {name: torch.from_numpy(array) for name, array in situation.observations.items()},
             Columns.STATE_IN: {key: torch.from_numpy(array) for key, array in situation.state.items()},
         }
     )
-    state = {key: value.numpy() for key, value in answer.get(Columns.STATE_OUT, {}).items()}
-    return answer[Columns.ACTION_DIST_INPUTS].numpy(), state
+    state = {key: value.numpy() for key, value in outputs.get(Columns.STATE_OUT, {}).items()}
+    return outputs[Columns.ACTION_DIST_INPUTS].numpy(), state
 
 
 def _is_enough(met: Mapping[str, list[Met]], interface: Interface, seconds: float) -> bool:
@@ -186,7 +186,7 @@ def _count(batches: list[Met]) -> int:
     return sum(map(len, batches))
 
 
-def _differing(actions: NDArray, expected: NDArray, dist_inputs: NDArray, space: Space) -> tuple[int, int]:
+def differing(actions: NDArray, expected: NDArray, dist_inputs: NDArray, space: Space) -> tuple[int, int]:
     """Rows whose actions differ, and rows that do so in near ties only."""
     if isinstance(space, Box):
         low, high = bounds(space)

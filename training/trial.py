@@ -172,6 +172,9 @@ def build(
     algorithm = config.env_runners(num_cpus_per_env_runner=runner_cpus).build_algo()
     time_each_update(algorithm)
     if checkpoint is not None:
+        # RLlib sends no weights to a runner that has not answered for those before, as one that is still starting: it
+        # would go on playing with its initial ones.
+        algorithm.env_runner_group.foreach_env_runner("ping", local_env_runner=False)
         algorithm.restore_from_path(str(checkpoint))
     return algorithm
 

@@ -9,11 +9,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 import yaml
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.haproxy import free_ports
 from tests.cli.conftest import League
 
 DEADLINE = 180
@@ -107,7 +109,8 @@ def test_a_sweep_prints_its_trials_and_the_best_ones_settings(league: League, co
     outcome = league("sweep", str(config), "--steps=256", "--cpus=2", "--dashboard", timeout=DEADLINE)
     assert outcome.code == 0, outcome.err
     assert "Ray's dashboard: http://127.0.0.1:" in outcome.out
-    rows = [line.split() for line in outcome.out.splitlines() if line.strip().startswith(("0 ", "1 "))]
+    lines = [line.split() for line in outcome.out.splitlines()]
+    rows = [line for line in lines if line[:1] in (["0"], ["1"]) and "of" not in line]
     assert [row[1:3] for row in rows] == [["[8]", "0.01"], ["[16]", "0.01"]]
     best = max(range(2), key=lambda number: float(rows[number][3]))
     assert f"Trial {best} is the best." in outcome.out
@@ -142,30 +145,40 @@ def test_what_cannot_be_is_refused_in_a_line(
     assert words in outcome.err
 
 
-CLUSTER = """
-import sys, ray
-print(ray.init(address="local", num_cpus=2, include_dashboard=True, logging_level="ERROR").dashboard_url, flush=True)
-sys.stdin.read()
-"""
-
-
-def test_training_as_a_job_of_a_cluster(league: League, config: Path, home: Path) -> None:
-    cluster = subprocess.Popen(
-        [sys.executable, "-c", CLUSTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+@pytest.fixture
+def cluster() -> Iterator[str]:
+    """A cluster of one machine, with ports of its own, as other Rays may be running; the address of its dashboard."""
+    gcs, dashboard, agent = free_ports(3, "127.0.0.1")
+    ports = {"port": gcs, "dashboard-port": dashboard, "dashboard-agent-listen-port": agent}
+    command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--num-cpus=2"]
+    command += [f"--{name}={port}" for name, port in ports.items()]
+    ray = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        assert cluster.stdout is not None
-        address = f"http://{cluster.stdout.readline().strip()}"
-        outcome = league("train", str(config), "--job", "--address", address, "--steps=256", timeout=DEADLINE)
-        assert outcome.code == 0, outcome.out + outcome.err
-        assert "To stop it: ray job stop raysubmit_" in outcome.out
-        assert "Published tictactoe@1." in outcome.out
-        (version,) = Registry.open(Storage.at(home)).versions("tictactoe")
-        assert version.steps == 256
-
-        outcome = league("train", str(config), "--job", "--address", address, "--from=@7", timeout=DEADLINE)
-        assert outcome.code == 1
-        assert "has no version 7" in outcome.out
-        assert outcome.err.startswith("league: job raysubmit_")
+        yield f"http://127.0.0.1:{dashboard}"
     finally:
-        cluster.communicate(timeout=DEADLINE)
+        ray.terminate()
+        ray.wait(DEADLINE)
+
+
+def is_up(address: str) -> bool:
+    """Whether something answers, if only that it wants a token."""
+    try:
+        httpx.get(address)
+    except httpx.TransportError:
+        return False
+    return True
+
+
+def test_training_as_a_job_of_a_cluster(league: League, config: Path, home: Path, cluster: str) -> None:
+    wait_for(lambda: is_up(cluster))
+    outcome = league("train", str(config), "--job", "--address", cluster, "--steps=256", timeout=DEADLINE)
+    assert outcome.code == 0, outcome.out + outcome.err
+    assert "To stop it: ray job stop raysubmit_" in outcome.out
+    assert "Published tictactoe@1." in outcome.out
+    (version,) = Registry.open(Storage.at(home)).versions("tictactoe")
+    assert version.steps == 256
+
+    outcome = league("train", str(config), "--job", "--address", cluster, "--from=@7", timeout=DEADLINE)
+    assert outcome.code == 1
+    assert "has no version 7" in outcome.out
+    assert outcome.err.startswith("league: job raysubmit_")

@@ -172,9 +172,6 @@ SLOW = tictactoe(steps=1536, **SETTINGS | {"epochs": 16, "minibatch_size": 32})
 """Long enough between two checkpoints to be killed there."""
 
 
-@pytest.mark.xfail(
-    reason="open: with a remote runner, what follows a resumed checkpoint has differed; runners: 0 is exact"
-)
 @pytest.mark.usefixtures("ray_session")
 def test_a_run_that_is_killed_and_goes_on_publishes_what_one_that_was_not_does(tmp_path: Path) -> None:
     """kill -9 of the driver in the middle."""

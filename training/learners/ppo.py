@@ -117,7 +117,7 @@ class PPOLearner(TorchLearner):
                 gamma=self.hyperparameters[policy].gamma,
                 lambda_=self.hyperparameters[policy].lambda_,
                 sequence=recurrence.sequence if recurrence else None,
-                bootstraps=type(self).bootstraps,
+                bootstraps=self.bootstraps,
             )
             for policy, module in self.module.items()
             if policy in chunks
