@@ -123,7 +123,7 @@ def _registry() -> Iterator[Check]:
 
 RAY_PROBE = """
 import ray
-ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+ray.init(address="local", num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
 print(ray.get(ray.remote(lambda: "answers").remote()))
 ray.shutdown()
 """

@@ -1,10 +1,11 @@
 """`league train` and `league sweep`."""
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 import yaml
@@ -205,13 +206,22 @@ def _submit(address: str, config: Path, arguments: list[str]) -> None:
 
 @contextmanager
 def _ended_by_ctrl_c() -> Iterator[None]:
-    """Ctrl-C is no fault: say what there is to say, and end."""
+    """Ctrl-C is no fault: say what there is to say, and end. What says nothing ends at once."""
     try:
         yield
     except KeyboardInterrupt as end:
-        if str(end):
-            say(f"\n{end}")
+        if not str(end):
+            _end_at_once()
+        say(f"\n{end}")
         raise typer.Exit(INTERRUPTED) from end
+
+
+def _end_at_once() -> NoReturn:
+    """A version may be in the making on a thread of its own. Python would end that thread by force, below Ray's
+    handlers, which take that for a crash. Nothing is lost: --resume publishes it."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(INTERRUPTED)
 
 
 def _given(**options: object) -> dict[str, object]:
