@@ -29,9 +29,7 @@ def is_plain(ask: Ask, policy: LoadedPolicy, quotes: int) -> bool:
     return quotes == 2 * (ask.strings + len(ask.observations) * policy.reader.keys)
 
 
-def read_given_state(
-    ask: Ask, version: LoadedVersion, policy: LoadedPolicy, has_strings: bool = True
-) -> Arrays | None:
+def read_given_state(ask: Ask, version: LoadedVersion, policy: LoadedPolicy, has_strings: bool = True) -> Arrays | None:
     """The recurrent state that came with the request. Raises ObservationError or InvalidState."""
     if ask.tokens is None and not ask.state:
         return None

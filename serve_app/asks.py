@@ -77,7 +77,9 @@ def pinned_version(ask: Ask, asked: str) -> str:
         return asked
     version = common_version(tokens)
     if version_of(asked) not in (version, asked):
-        raise InvalidState(f"state is of version {version}, and version {asked} is asked for: an episode stays at its own")
+        raise InvalidState(
+            f"state is of version {version}, and version {asked} is asked for: an episode stays at its own"
+        )
     return str(version)
 
 

@@ -60,6 +60,20 @@ class Doors:
             self.backlog.admit()
         return key
 
+    def admit_message(self, key: Key | None) -> None:
+        """Let a message of a stream pass, whose handshake showed `key`.
+
+        Raises Unauthenticated (also if the key is valid no longer), RateLimited or Overloaded.
+        """
+        if key is None:
+            if self.are_locked:
+                raise Unauthenticated("this stream needs an API key by now")
+        elif not self._keyring.holds(key):
+            raise Unauthenticated(f"the API key {key.name} was revoked, or has expired")
+        else:
+            _take(key)
+        self.backlog.admit()
+
     def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
         """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
         headers = (
@@ -77,8 +91,7 @@ class Doors:
         if key.leagues is not None and need.league not in key.leagues and (need.league or need.is_of_all):
             allowed, what = ", ".join(sorted(key.leagues)), "all leagues" if need.is_of_all else "another league"
             raise Forbidden(f"this is about {what}: {key.name} is for {allowed}")
-        if key.bucket is not None and (wait := key.bucket.take()):
-            raise RateLimited(f"{key.name} may call {key.bucket.rate:g} times a second", wait)
+        _take(key)
         return key
 
     def _why_not(self, need: Need, token: bytes | None) -> str:
@@ -124,6 +137,12 @@ class Guarded:
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
             return
         await self._errors.response(_path(scope), error)(scope, receive, send)
+
+
+def _take(key: Key) -> None:
+    """Count a call. Raises RateLimited."""
+    if key.bucket is not None and (wait := key.bucket.take()):
+        raise RateLimited(f"{key.name} may call {key.bucket.rate:g} times a second", wait)
 
 
 def _shown(headers: Iterable[tuple[bytes, bytes]]) -> tuple[bytes | None, bytes | None]:

@@ -1,8 +1,8 @@
 """Errors become HTTP answers here, once: a status, a stable `code`, and a sentence.
 
 InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415) · Unauthenticated 401 · Forbidden 403
-NotFound 404 (VersionRetired 410) · BodyTooSlow 408 · Conflict 409 · Overloaded, RateLimited 429 with Retry-After · DeadlineExceeded 504
-NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · anything else 500
+NotFound 404 (VersionRetired 410) · BodyTooSlow 408 · Conflict 409 · Overloaded, RateLimited 429 with Retry-After
+NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · DeadlineExceeded 504 · anything else 500
 """
 
 import logging

@@ -61,7 +61,9 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
     """
     version = registry.version(league, number)
     if registry.artifacts.is_purged(league, number):
-        raise VersionRetired(f"{version.ref} was retired: its files were removed, and a new episode needs another version")
+        raise VersionRetired(
+            f"{version.ref} was retired: its files were removed, and a new episode needs another version"
+        )
     registry.artifacts.verify(league, number, version.sha256)
     policies = {}
     for name, manifest in version.manifest.policies.items():

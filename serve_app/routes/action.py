@@ -1,7 +1,7 @@
 """POST /v1/policies/{model}/action: observations in, actions out. The hot path: no framework between the bytes.
 
     request  {"observation": …}  or  {"observations": [ … ]};  besides "state", "explore", "seed", "probabilities"
-    reply    {"action": …}       or  {"actions": [ … ]};       besides "model", "version", "sha256" and what is asked for
+    reply    {"action": …}       or  {"actions": [ … ]};       besides "model", "version", "sha256" and what is wanted
 
 `seed` is an integer, or one for each observation of a batch. An observation explored with a seed of its own gets the
 same action in every batch; in a batch with one seed, so does an observation at the same place.
