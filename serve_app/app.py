@@ -15,7 +15,7 @@ from ray import serve
 from ray.serve import Application
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.routing import Route
+from starlette.routing import Route, WebSocketRoute
 
 from league.registry.registry import Registry
 from league.settings import Storage
@@ -37,8 +37,11 @@ from serve_app.routes.action import ActionRoute
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.promotion import PromotionRoutes
+from serve_app.routes.stream import StreamRoute
 from serve_app.settings import ServeSettings
+from serve_app.streams import StreamParts
 from serve_app.versions import Versions
+from serve_app.websocket_protocol import install
 
 LOOPBACK = "127.0.0.1"
 
@@ -66,6 +69,7 @@ class PolicyServer:
     def __serve_build_asgi_app__(self) -> Starlette:
         application = self._server.application()
         shorten(application)
+        install(self._server.settings.max_body)
         offer(self._server.inference_service)
         return application
 
@@ -102,6 +106,7 @@ class Server:
         self.key_watcher = KeyWatcher(registry, self.keyring, settings)
         self.doors = Doors(self.keyring, settings, is_exposed)
         self.action = ActionRoute(self.models, settings, replica)
+        self.stream = StreamRoute(StreamParts(self.models, self.live, self.doors, settings), replica)
         self.inference = Inference(self.models, settings)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
@@ -117,6 +122,7 @@ class Server:
         return Starlette(
             routes=[
                 Route("/v1/policies/{model}/action", self.action, methods=["POST"]),
+                WebSocketRoute("/v1/policies/{model}/stream", self.stream),
                 *open_inference.routes(),
                 Route("/v1/leagues", leagues.leagues),
                 Route("/v1/leagues/{league}", leagues.league),

@@ -26,7 +26,7 @@ async def within(seconds: float, work: Awaitable[T]) -> T:
         return result
     try:
         async with asyncio.timeout(seconds) as limit:
-            return await _continued(steps, waits_for)
+            return await continued(steps, waits_for)
     except TimeoutError as error:
         if limit.expired():
             raise Expired from error
@@ -34,7 +34,7 @@ async def within(seconds: float, work: Awaitable[T]) -> T:
 
 
 @coroutine
-def _continued(steps: Generator[Any, Any, T], waits_for: Any) -> Generator[Any, Any, T]:
+def continued(steps: Generator[Any, Any, T], waits_for: Any) -> Generator[Any, Any, T]:
     """The rest of what was begun by hand and waits: what `await` does."""
     while True:
         try:

@@ -13,19 +13,12 @@ from typing import Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import InvalidInput, LeagueError
+from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
 from serve_app import permissions
 from serve_app.backlog import Backlog
 from serve_app.bodies import IS_READ
 from serve_app.deadlines import Expired, within
-from serve_app.error_handlers import (
-    BodyTooSlow,
-    DeadlineExceeded,
-    ErrorHandlers,
-    Forbidden,
-    RateLimited,
-    Unauthenticated,
-)
+from serve_app.error_handlers import BodyTooSlow, ErrorHandlers
 from serve_app.keyring import Key, Keyring
 from serve_app.permissions import Need
 from serve_app.settings import ServeSettings
@@ -67,6 +60,20 @@ class Doors:
             self.backlog.admit()
         return key
 
+    def admit_message(self, key: Key | None) -> None:
+        """Let a message of a stream pass, whose handshake showed `key`.
+
+        Raises Unauthenticated (also if the key is valid no longer), RateLimited or Overloaded.
+        """
+        if key is None:
+            if self.are_locked:
+                raise Unauthenticated("this stream needs an API key by now")
+        elif not self._keyring.holds(key):
+            raise Unauthenticated(f"the API key {key.name} was revoked, or has expired")
+        else:
+            _take(key)
+        self.backlog.admit()
+
     def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
         """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
         headers = (
@@ -84,8 +91,7 @@ class Doors:
         if key.leagues is not None and need.league not in key.leagues and (need.league or need.is_of_all):
             allowed, what = ", ".join(sorted(key.leagues)), "all leagues" if need.is_of_all else "another league"
             raise Forbidden(f"this is about {what}: {key.name} is for {allowed}")
-        if key.bucket is not None and (wait := key.bucket.take()):
-            raise RateLimited(f"{key.name} may call {key.bucket.rate:g} times a second", wait)
+        _take(key)
         return key
 
     def _why_not(self, need: Need, token: bytes | None) -> str:
@@ -131,6 +137,12 @@ class Guarded:
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
             return
         await self._errors.response(_path(scope), error)(scope, receive, send)
+
+
+def _take(key: Key) -> None:
+    """Count a call. Raises RateLimited."""
+    if key.bucket is not None and (wait := key.bucket.take()):
+        raise RateLimited(f"{key.name} may call {key.bucket.rate:g} times a second", wait)
 
 
 def _shown(headers: Iterable[tuple[bytes, bytes]]) -> tuple[bytes | None, bytes | None]:

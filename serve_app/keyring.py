@@ -22,12 +22,13 @@ from serve_app.settings import ServeSettings
 class Key:
     """A key that is not revoked."""
 
-    __slots__ = ("bucket", "expires", "id", "leagues", "name", "row", "scopes")
+    __slots__ = ("bucket", "digest", "expires", "id", "leagues", "name", "row", "scopes")
 
     def __init__(self, row: KeyRow, bucket: TokenBucket | None) -> None:
         self.row = row
         self.id = row.id
         self.name = row.name
+        self.digest = bytes.fromhex(row.sha256)
         self.scopes = row.scopes
         self.leagues = row.leagues
         self.expires = float("inf") if row.expires_at is None else row.expires_at.timestamp()
@@ -54,6 +55,10 @@ class Keyring:
             return None
         key = self._keys.get(hashlib.sha256(token).digest())
         return key if key is not None and time() < key.expires else None
+
+    def holds(self, key: Key) -> bool:
+        """Whether a key that was found is still one."""
+        return self._keys.get(key.digest) is key and time() < key.expires
 
     def _key(self, row: KeyRow) -> Key:
         known = self._keys.get(bytes.fromhex(row.sha256))

@@ -1,11 +1,12 @@
-"""The short way to the action route, before Ray Serve's own handling of a request.
+"""The short way to actions and streams, before Ray Serve's own handling of a request.
 
     HAProxy → uvicorn ┬→ /v1/policies/…, /v2/models/…  →  the application
                       └→ anything else                 →  Ray Serve → the application
 
 What Serve does for each request (tasks that watch for a client that leaves, a request id, counting for its autoscaler,
 metrics) takes as long as all the rest. An action needs none of it: it is computed before it could be given up, and the
-route bounds its requests itself. Draining is uvicorn's: a server that stops finishes what it has begun.
+route bounds its requests itself. Draining is uvicorn's: a server that stops finishes what it has begun, and closes
+streams with 1012.
 
 RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH names `middlewares`; without it everything goes the long way.
 """
@@ -14,7 +15,8 @@ from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 ACTIONS = ("/v1/policies/", "/v2/models/")
-"""Where actions and inferences are asked for."""
+"""Where actions, streams and inferences are asked for."""
+DIRECT = ("http", "websocket")
 _application: ASGIApp | None = None
 
 
@@ -37,7 +39,7 @@ class ShortWay:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Choose the way."""
-        if _application is not None and scope["type"] == "http" and scope["path"].startswith(ACTIONS):
+        if _application is not None and scope["type"] in DIRECT and scope["path"].startswith(ACTIONS):
             await _application(scope, receive, send)
         else:
             await self._onward(scope, receive, send)

@@ -18,10 +18,13 @@ class ServeSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_body: int = Field(default=4 * 2**20, ge=1024)
-    """A larger request body is refused with 413. A replica may hold `max_in_flight` of them at once, and HAProxy
-    repeats a request on another replica only if it fits into RAY_SERVE_HAPROXY_TUNE_BUFSIZE."""
+    """A larger request body is refused with 413, and a larger message ends its stream with 1009. A replica may hold
+    `max_in_flight` of them at once, and HAProxy repeats a request on another replica only if it fits into
+    RAY_SERVE_HAPROXY_TUNE_BUFSIZE."""
     max_in_flight: int = Field(default=256, ge=1)
     """Requests for actions that a replica has begun and not yet answered; beyond them it answers 429."""
+    max_streams: int = Field(default=1024, ge=1)
+    """Streams open in a replica; one more is refused with 429."""
     max_batch: int = Field(default=1024, ge=1)
     """Most observations in one request."""
     timeout: float = Field(default=4.5, gt=0)

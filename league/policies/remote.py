@@ -117,8 +117,8 @@ def _request(
 ) -> dict[str, Any]:
     rows = len(next(iter(observations.values())))
     document: dict[str, Any] = {"observations": [_observation(observations, row) for row in range(rows)]}
-    if state is not None:
-        document["state"] = {name: np.ascontiguousarray(array) for name, array in state.items()}
+    # As arrays: rows of matches come and go, and numbers must stay what they are to the last bit.
+    document["state"] = {name: np.ascontiguousarray(array) for name, array in (state or {}).items()}
     if explore:
         if rng is None or len(rng) != rows:
             raise InvalidInput(f"exploring {rows} rows needs rng, one generator per row")
