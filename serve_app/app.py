@@ -31,13 +31,19 @@ from serve_app.inference_protocol.rest import RestRoutes
 from serve_app.keyring import Keyring, KeyWatcher
 from serve_app.live import Live
 from serve_app.loading import load
+from serve_app.metrics import Metrics
 from serve_app.middleware import shorten
 from serve_app.models import Models
+from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
+from serve_app.routes.metrics import MetricsRoute
 from serve_app.routes.promotion import PromotionRoutes
+from serve_app.routes.traffic import TrafficRoutes
 from serve_app.settings import ServeSettings
+from serve_app.shadow import Shadow
+from serve_app.traffic import Traffic
 from serve_app.versions import Versions
 
 LOOPBACK = "127.0.0.1"
@@ -96,22 +102,31 @@ class Server:
             partial(load, registry, inline=settings.inline), settings.cached_versions, settings.retry
         )
         self.live = Live(self.versions)
-        self.models = Models(registry, self.live, self.versions)
-        self.watcher = AliasWatcher(registry, self.live, replica, settings)
+        self.traffic = Traffic(self.live)
+        self.shadow = Shadow(self.live, self.traffic, settings)
+        self.metrics = Metrics(self.live, self.traffic, self.shadow)
+        self.errors = ErrorHandlers(settings.retry, self.metrics.failed)
+        self.models = Models(registry, self.live, self.versions, self.traffic)
+        self.watcher = AliasWatcher(registry, self.live, self.traffic, replica, settings)
         self.keyring = Keyring()
         self.key_watcher = KeyWatcher(registry, self.keyring, settings)
         self.doors = Doors(self.keyring, settings, is_exposed)
-        self.action = ActionRoute(self.models, settings, replica)
-        self.inference = Inference(self.models, settings)
+        self.action = ActionRoute(self.models, self.shadow, self.metrics, settings, replica)
+        self.inference = Inference(self.models, self.shadow, self.metrics, settings)
+        self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
-            self.inference, self.catalogue, self.watcher, self.doors, settings, machine
+            self.inference, self.catalogue, self.watcher, self.doors, settings, machine, self.metrics.failed
         )
+
+    def _in_flight(self) -> dict[str, int]:
+        return {"action": self.action.in_flight, "infer": self.inference.in_flight}
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
         leagues = LeagueRoutes(self.models)
         promotion = PromotionRoutes(self.models, self.settings)
+        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
@@ -123,20 +138,24 @@ class Server:
                 Route("/v1/leagues/{league}/versions", leagues.versions),
                 Route("/v1/leagues/{league}/aliases/{alias}", promotion.move, methods=["POST"]),
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
+                Route("/v1/leagues/{league}/traffic", traffic.show),
+                Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
+                Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
             ],
-            middleware=[Middleware(Guarded, self.doors, self.settings)],
-            exception_handlers=ErrorHandlers(self.settings.retry).table(),
+            middleware=[Middleware(Guarded, self.doors, self.errors, self.settings)],
+            exception_handlers=self.errors.table(),
             lifespan=self._running,
         )
 
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:
         try:
-            async with self.key_watcher.watching(), self.watcher.watching():
+            async with self.key_watcher.watching(), self.watcher.watching(), self.reporter.reporting():
                 yield
         finally:
+            self.shadow.close()
             self.models.close()
             self.versions.close()
             self.registry.close()

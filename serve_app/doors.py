@@ -69,10 +69,7 @@ class Doors:
 
     def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
         """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
-        headers = (
-            (name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()
-        )
-        self.admit(permissions.of_rpc(rpc, model), _shown(headers)[0])
+        self.admit(permissions.of_rpc(rpc, model), _shown(headers_of(metadata))[0])
 
     def _authorize(self, need: Need, token: bytes | None) -> Key:
         key = None if token is None else self._keyring.find(token)
@@ -99,11 +96,11 @@ class Doors:
 class Guarded:
     """The ASGI application behind the doors."""
 
-    def __init__(self, application: ASGIApp, doors: Doors, settings: ServeSettings) -> None:
+    def __init__(self, application: ASGIApp, doors: Doors, errors: ErrorHandlers, settings: ServeSettings) -> None:
         self._application = application
         self._doors = doors
+        self._errors = errors
         self._timeout = settings.timeout
-        self._errors = ErrorHandlers(settings.retry)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request in, or answer why not."""
@@ -131,6 +128,11 @@ class Guarded:
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
             return
         await self._errors.response(_path(scope), error)(scope, receive, send)
+
+
+def headers_of(metadata: Iterable[tuple[str, Any]] | None) -> list[tuple[bytes, bytes]]:
+    """The metadata of a call of gRPC as headers."""
+    return [(name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()]
 
 
 def _shown(headers: Iterable[tuple[bytes, bytes]]) -> tuple[bytes | None, bytes | None]:

@@ -127,7 +127,9 @@ class InferRoute:
             body = await decompressed(body, encoding, limit)
         named = scope["path_params"]
         request = read_request(named["model"], named.get("version", ""), body, header_length)
-        reply, length = await self._inference.infer(request.infer, lambda response: write_response(response, request))
+        reply, length = await self._inference.infer(
+            request.infer, lambda response: write_response(response, request), scope["headers"]
+        )
         headers = [self._replica, (b"content-type", JSON if length is None else BINARY)]
         if length is not None:
             headers.append((HEADER_LENGTH, b"%d" % length))

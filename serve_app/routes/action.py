@@ -12,6 +12,7 @@ same action in every batch; in a batch with one seed, so does an observation at 
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import perf_counter_ns
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -27,12 +28,16 @@ from league.seeds import generator
 from serve_app.bodies import parse_object, read_body
 from serve_app.error_handlers import BodyTooLarge, Overloaded
 from serve_app.loading import LoadedPolicy
+from serve_app.metrics import Metrics
 from serve_app.models import Models
 from serve_app.observations import kind, read_state, refuse_strings
 from serve_app.settings import ServeSettings
+from serve_app.shadow import Shadow, Show
 
 KEYS = frozenset(("observation", "observations", "state", "explore", "seed"))
 REPLICA = b"x-league-replica"
+API = "action"
+"""What this route is called in metrics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +57,10 @@ class Ask:
 class ActionRoute:
     """The endpoint, an ASGI application of its own."""
 
-    def __init__(self, models: Models, settings: ServeSettings, replica: str) -> None:
+    def __init__(self, models: Models, shadow: Shadow, metrics: Metrics, settings: ServeSettings, replica: str) -> None:
         self._models = models
+        self._shadow = shadow
+        self._metrics = metrics
         self._settings = settings
         self._replica = (REPLICA, replica.encode())
         self.in_flight = 0
@@ -70,12 +77,15 @@ class ActionRoute:
             self.in_flight -= 1
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        begun = perf_counter_ns()
         body = await read_body(scope, receive, self._settings.max_body)
         model = scope["path_params"]["model"]
-        version, policy = await self._models.find(model, _version(scope["query_string"]))
+        version, policy = await self._models.find(model, _version(scope["query_string"]), scope["headers"])
         ask = read_ask(body, self._settings.max_batch)
-        reply = await _reply(ask, policy) | {"model": model, "version": version.number, "sha256": version.sha256}
+        show = self._shadow.of(model, version)
+        reply = await _reply(ask, policy, show) | {"model": model, "version": version.number, "sha256": version.sha256}
         await _send(send, orjson.dumps(reply), self._replica)
+        self._metrics.answered(API, model, version, len(ask.observations), perf_counter_ns() - begun)
 
 
 def read_ask(body: bytes, max_batch: int) -> Ask:
@@ -99,7 +109,7 @@ def read_ask(body: bytes, max_batch: int) -> Ask:
     return Ask(observations, is_batch, state, explore, seed, document, body.count(b'"'))
 
 
-async def _reply(ask: Ask, policy: LoadedPolicy) -> dict[str, Any]:
+async def _reply(ask: Ask, policy: LoadedPolicy, show: Show | None) -> dict[str, Any]:
     rows = len(ask.observations)
     observations, state = _arrays(ask, policy)
     rng = _generators(ask.seed, rows) if ask.explore else None
@@ -108,6 +118,8 @@ async def _reply(ask: Ask, policy: LoadedPolicy) -> dict[str, Any]:
         return policy.policy.act(observations, state=state, explore=ask.explore, rng=rng)
 
     answer = act() if rows <= policy.inline_rows else await asyncio.to_thread(act)
+    if show is not None:
+        show(observations, state, None if ask.explore else answer.actions)
     actions = answer.actions.tolist()
     reply = {"actions": actions} if ask.is_batch else {"action": actions[0]}
     if answer.state is not None:
