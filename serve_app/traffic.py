@@ -89,12 +89,8 @@ def position(league: str, key: bytes) -> float:
 
     It depends on nothing else, so a key stays on its side while the share stays, and a greater share only adds keys.
     """
-    digest = hashlib.blake2b(key, digest_size=8, person=b"canary", salt=_salt(league)).digest()
-    return int.from_bytes(digest, "big") / 2**64
-
-
-def _salt(league: str) -> bytes:
-    return hashlib.blake2b(league.encode(), digest_size=16).digest()
+    digest = hashlib.blake2b(league.encode() + b"\0" + key, digest_size=8).digest()
+    return int.from_bytes(digest[:6], "big") / 2**48  # a double holds it exactly, so that 1 is never reached
 
 
 def _sides(portions: Mapping[str, Portion | None]) -> dict[str, Side]:
