@@ -7,7 +7,7 @@ without Ray Serve's part on that way (middleware.py).
 """
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 
 import ray
@@ -19,6 +19,7 @@ from starlette.routing import Route
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.access_log import AccessLog
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.doors import Doors, Guarded
 from serve_app.error_handlers import ErrorHandlers
@@ -103,6 +104,7 @@ class Server:
         )
         self.live = Live(self.versions)
         self.traffic = Traffic(self.live)
+        self.access_log = _access_log(registry, settings, replica)
         self.shadow = Shadow(self.live, self.traffic, settings)
         self.metrics = Metrics(self.live, self.traffic, self.shadow)
         self.errors = ErrorHandlers(settings.retry, self.metrics.failed)
@@ -144,7 +146,7 @@ class Server:
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
             ],
-            middleware=[Middleware(Guarded, self.doors, self.errors, self.settings)],
+            middleware=[Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log)],
             exception_handlers=self.errors.table(),
             lifespan=self._running,
         )
@@ -152,10 +154,21 @@ class Server:
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:
         try:
-            async with self.key_watcher.watching(), self.watcher.watching(), self.reporter.reporting():
+            async with AsyncExitStack() as running:
+                if self.access_log is not None:
+                    await running.enter_async_context(self.access_log.writing())
+                await running.enter_async_context(self.key_watcher.watching())
+                await running.enter_async_context(self.watcher.watching())
+                await running.enter_async_context(self.reporter.reporting())
                 yield
         finally:
             self.shadow.close()
             self.models.close()
             self.versions.close()
             self.registry.close()
+
+
+def _access_log(registry: Registry, settings: ServeSettings, replica: str) -> AccessLog | None:
+    if settings.access_log is None:
+        return None
+    return AccessLog(registry.storage.home / settings.access_log, replica)

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from league.errors import InvalidInput, LeagueError
 from serve_app import permissions
+from serve_app.access_log import LINE, AccessLog
 from serve_app.backlog import Backlog
 from serve_app.bodies import IS_READ
 from serve_app.deadlines import Expired, within
@@ -96,8 +97,16 @@ class Doors:
 class Guarded:
     """The ASGI application behind the doors."""
 
-    def __init__(self, application: ASGIApp, doors: Doors, errors: ErrorHandlers, settings: ServeSettings) -> None:
+    def __init__(
+        self,
+        application: ASGIApp,
+        doors: Doors,
+        errors: ErrorHandlers,
+        settings: ServeSettings,
+        log: AccessLog | None = None,
+    ) -> None:
         self._application = application
+        self._log = log
         self._doors = doors
         self._errors = errors
         self._timeout = settings.timeout
@@ -107,12 +116,16 @@ class Guarded:
         if (kind := scope["type"]) == "lifespan":
             await self._application(scope, receive, send)
             return
+        if self._log is not None:
+            send = self._log.begin(scope, _path(scope), send)
         try:
             token, patience = _shown(scope["headers"])
             need = permissions.of_request(kind, scope.get("method", "GET"), _path(scope))
             key = self._doors.admit(need, token)
             if key is not None:
                 scope[KEY] = key
+                if self._log is not None:
+                    scope[LINE]["key"] = key.name
             if kind != "http":
                 await self._application(scope, receive, send)
                 return

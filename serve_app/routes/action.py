@@ -25,6 +25,7 @@ from league.errors import InvalidInput, ObservationError
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from league.seeds import generator
+from serve_app.access_log import LINE, answered_by
 from serve_app.bodies import parse_object, read_body
 from serve_app.error_handlers import BodyTooLarge, Overloaded
 from serve_app.loading import LoadedPolicy
@@ -84,6 +85,8 @@ class ActionRoute:
         ask = read_ask(body, self._settings.max_batch)
         show = self._shadow.of(model, version)
         reply = await _reply(ask, policy, show) | {"model": model, "version": version.number, "sha256": version.sha256}
+        if LINE in scope:
+            answered_by(scope, model, version.number)
         await _send(send, orjson.dumps(reply), self._replica)
         self._metrics.answered(API, model, version, len(ask.observations), perf_counter_ns() - begun)
 
