@@ -12,6 +12,7 @@ from cli.evaluation import evaluate, nightly
 from cli.output import errors
 from cli.replay import replay
 from cli.serving import act, serve
+from cli.traffic import traffic
 from cli.training import sweep, train
 from cli.versions import history, promote, rollback, versions
 from league.errors import InvalidInput, LeagueError, NotFound
@@ -39,6 +40,7 @@ for command in (
     promote,
     rollback,
     history,
+    traffic,
     replay,
     serve,
     act,

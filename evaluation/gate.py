@@ -87,6 +87,36 @@ def judge(settings: GateConfig, matches: Sequence[Match], challenger: str) -> De
     return replace(decision, distinct_games=distinct_games(matches[: decision.blocks]))
 
 
+def floor(
+    settings: GateConfig, observations: int, failed: int, agreement: float | None, latency_ms: float | None
+) -> str | None:
+    """Why a challenger may not be promoted, by what it has shown as a shadow of the champion; None if it may.
+
+    observations: how many were mirrored to it. failed: requests that it could not answer. agreement: on which share of
+    the observations it took the champion's action. latency_ms: within which it computed 95 % of the requests.
+    """
+    if settings.shadow_agreement is None and settings.latency_ms is None:
+        return None
+    if observations < settings.shadow_observations or agreement is None or latency_ms is None:
+        return (
+            f"it was shown {observations} observations as the champion's shadow, and its gate asks for"
+            f" {settings.shadow_observations} to judge shadow_agreement and latency_ms by"
+        )
+    if failed:
+        return f"as a shadow it could not answer {failed} requests"
+    if settings.shadow_agreement is not None and agreement < settings.shadow_agreement:
+        return (
+            f"as a shadow it acted as the champion does on {agreement:.1%} of {observations} observations,"
+            f" and its gate asks for {settings.shadow_agreement:.1%}"
+        )
+    if settings.latency_ms is not None and latency_ms > settings.latency_ms:
+        return (
+            f"as a shadow it computed 95 % of the requests within {latency_ms:g} ms,"
+            f" and its gate asks for {settings.latency_ms:g} ms"
+        )
+    return None
+
+
 class Watch:
     """Follows a verdict's matches as they come in, block by block, and knows when its test is over.
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from evaluation import promotion, tournament
-from evaluation.gate import Decision, Watch, judge
+from evaluation.gate import Decision, Watch, floor, judge
 from evaluation.paired import paired_difference
 from evaluation.report import Difference, Listener, Progress, VerdictReport
 from evaluation.schedule import verdict as verdict_schedule
@@ -77,7 +77,7 @@ def conclude(
 
 
 def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
-    """Why this verdict cannot go on: it would be about a champion, or an environment, of the past."""
+    """Why this verdict cannot go on: it would be about a champion, or an environment, of the past, or in vain."""
     if promotion.is_applied(registry, verdict):
         return None
     now = registry.aliases(verdict.league).get(CHAMPION)
@@ -86,7 +86,17 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
         return f"{holder} now, and {verdict.champion} was tested against"
     if _schedule(registry, verdict).environment_digest != registry.league(verdict.league).environment_digest:
         return "the league's environment has been changed since"
-    return None
+    return None if now is None else _below_floor(registry, verdict, now)
+
+
+def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str | None:
+    """Why the candidate is not even tested: it has not shown enough as the champion's shadow."""
+    for shadowing in registry.shadowings(verdict.league):
+        if (shadowing.candidate, shadowing.champion) == (verdict.candidate, champion):
+            latency = shadowing.milliseconds(0.95)
+            seen = shadowing.observations, shadowing.failed, shadowing.agreement
+            return floor(_gate(verdict), *seen, latency)
+    return floor(_gate(verdict), 0, 0, None, None)
 
 
 def _schedule(registry: Registry, verdict: VerdictRow) -> Schedule:

@@ -227,6 +227,13 @@ class GateConfig(_Part):
     """Probability of rejecting under H1."""
     max_blocks: int = Field(default=2000, ge=1)
     """Blocks after which the verdict is `inconclusive` and the champion stays."""
+    shadow_agreement: float | None = Field(default=None, ge=0, le=1)
+    """Share of mirrored observations on which the challenger must act as the champion does; null asks for none. Like
+    `latency_ms`, it applies where there is a champion, whose requests can be mirrored."""
+    latency_ms: float | None = Field(default=None, gt=0)
+    """Milliseconds of the processor within which the challenger must compute 95 % of mirrored requests."""
+    shadow_observations: int = Field(default=1000, ge=1)
+    """Mirrored observations without which those two are not known."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -1,4 +1,4 @@
-"""Follows the registry's aliases, drives the live slots, and tells the registry what this replica serves.
+"""Follows the registry's aliases and traffic, drives the live slots, and tells the registry what this replica serves.
 
 One task on the event loop; the database is asked in a thread of its own, so that a database that hangs holds up nothing
 but this.
@@ -14,9 +14,11 @@ from typing import NamedTuple, TypeVar
 
 from league.errors import LeagueError
 from league.registry.registry import Registry
-from serve_app.live import Live
+from league.registry.rows import Traffic as Setting
+from serve_app.live import Alias, Live
 from serve_app.polling import Polling
 from serve_app.settings import ServeSettings
+from serve_app.traffic import Traffic, pinned
 
 GOODBYE = 5.0
 """Seconds that shutting down may wait for the database."""
@@ -31,14 +33,16 @@ class Said(NamedTuple):
     sha256: str | None
     fault: str | None
     aliases: Mapping[str, int]
+    traffic: int | None
 
 
 class AliasWatcher:
-    """Keeps `live` at the registry's aliases and acknowledges it as `replica`."""
+    """Keeps `live` at the registry's aliases, `traffic` at its settings, and acknowledges both as `replica`."""
 
-    def __init__(self, registry: Registry, live: Live, replica: str, settings: ServeSettings) -> None:
+    def __init__(self, registry: Registry, live: Live, traffic: Traffic, replica: str, settings: ServeSettings) -> None:
         self._registry = registry
         self._live = live
+        self._traffic = traffic
         self._replica = replica
         self._settings = settings
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="aliases")
@@ -64,7 +68,9 @@ class AliasWatcher:
 
     async def look(self) -> None:
         """Look at the aliases once: swap what moved, then say so. Raises StorageError."""
-        await self._live.follow(await self._call(self._registry.all_aliases))
+        aliases, settings = await self._call(self._wanted)
+        await self._live.follow(aliases | pinned(settings))
+        self._traffic.follow(settings)
         self._polling.saw()
         await self._acknowledge()
 
@@ -82,7 +88,11 @@ class AliasWatcher:
     def _serves(self, league: str) -> Said:
         champion = self._live.champion(league)
         number, sha256 = (champion.number, champion.sha256) if champion else (None, None)
-        return Said(number, sha256, self._live.fault(league), self._live.numbers(league))
+        followed = self._traffic.followed(league)
+        return Said(number, sha256, self._live.fault(league), self._live.numbers(league), followed)
+
+    def _wanted(self) -> tuple[dict[Alias, int], dict[str, Setting]]:
+        return self._registry.all_aliases(), self._registry.all_traffic()
 
     async def _call(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)

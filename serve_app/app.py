@@ -7,7 +7,7 @@ without Ray Serve's part on that way (middleware.py).
 """
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 
 import ray
@@ -19,6 +19,7 @@ from starlette.routing import Route, WebSocketRoute
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.access_log import AccessLog
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.doors import Doors, Guarded
 from serve_app.error_handlers import ErrorHandlers
@@ -31,15 +32,21 @@ from serve_app.inference_protocol.rest import RestRoutes
 from serve_app.keyring import Keyring, KeyWatcher
 from serve_app.live import Live
 from serve_app.loading import load
+from serve_app.metrics import Metrics
 from serve_app.middleware import shorten
 from serve_app.models import Models
+from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
+from serve_app.routes.metrics import MetricsRoute
 from serve_app.routes.promotion import PromotionRoutes
 from serve_app.routes.stream import StreamRoute
+from serve_app.routes.traffic import TrafficRoutes
 from serve_app.settings import ServeSettings
+from serve_app.shadow import Shadow
 from serve_app.streams import StreamParts
+from serve_app.traffic import Traffic
 from serve_app.versions import Versions
 from serve_app.websocket_protocol import install
 
@@ -100,23 +107,34 @@ class Server:
             partial(load, registry, inline=settings.inline), settings.cached_versions, settings.retry
         )
         self.live = Live(self.versions)
-        self.models = Models(registry, self.live, self.versions)
-        self.watcher = AliasWatcher(registry, self.live, replica, settings)
+        self.traffic = Traffic(self.live)
+        self.access_log = _access_log(registry, settings, replica)
+        self.shadow = Shadow(self.live, self.traffic, settings)
+        self.metrics = Metrics(self.live, self.traffic, self.shadow)
+        self.errors = ErrorHandlers(settings.retry, self.metrics.failed)
+        self.models = Models(registry, self.live, self.versions, self.traffic)
+        self.watcher = AliasWatcher(registry, self.live, self.traffic, replica, settings)
         self.keyring = Keyring()
         self.key_watcher = KeyWatcher(registry, self.keyring, settings)
         self.doors = Doors(self.keyring, settings, is_exposed)
-        self.action = ActionRoute(self.models, settings, replica)
-        self.stream = StreamRoute(StreamParts(self.models, self.live, self.doors, settings), replica)
-        self.inference = Inference(self.models, settings)
+        self.action = ActionRoute(self.models, self.shadow, self.metrics, settings, replica)
+        parts = StreamParts(self.models, self.live, self.traffic, self.shadow, self.metrics, self.doors, settings)
+        self.stream = StreamRoute(parts, replica)
+        self.inference = Inference(self.models, self.shadow, self.metrics, settings)
+        self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
-            self.inference, self.catalogue, self.watcher, self.doors, settings, machine
+            self.inference, self.catalogue, self.watcher, self.doors, settings, machine, self.metrics.failed
         )
+
+    def _in_flight(self) -> dict[str, int]:
+        return {"action": self.action.in_flight, "infer": self.inference.in_flight}
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
         leagues = LeagueRoutes(self.models)
         promotion = PromotionRoutes(self.models, self.settings)
+        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
@@ -129,20 +147,35 @@ class Server:
                 Route("/v1/leagues/{league}/versions", leagues.versions),
                 Route("/v1/leagues/{league}/aliases/{alias}", promotion.move, methods=["POST"]),
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
+                Route("/v1/leagues/{league}/traffic", traffic.show),
+                Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
+                Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
             ],
-            middleware=[Middleware(Guarded, self.doors, self.settings)],
-            exception_handlers=ErrorHandlers(self.settings.retry).table(),
+            middleware=[Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log)],
+            exception_handlers=self.errors.table(),
             lifespan=self._running,
         )
 
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:
         try:
-            async with self.key_watcher.watching(), self.watcher.watching():
+            async with AsyncExitStack() as running:
+                if self.access_log is not None:
+                    await running.enter_async_context(self.access_log.writing())
+                await running.enter_async_context(self.key_watcher.watching())
+                await running.enter_async_context(self.watcher.watching())
+                await running.enter_async_context(self.reporter.reporting())
                 yield
         finally:
+            self.shadow.close()
             self.models.close()
             self.versions.close()
             self.registry.close()
+
+
+def _access_log(registry: Registry, settings: ServeSettings, replica: str) -> AccessLog | None:
+    if settings.access_log is None:
+        return None
+    return AccessLog(registry.storage.home / settings.access_log, replica)

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
 from serve_app import permissions
+from serve_app.access_log import LINE, AccessLog
 from serve_app.backlog import Backlog
 from serve_app.bodies import IS_READ
 from serve_app.deadlines import Expired, within
@@ -76,10 +77,7 @@ class Doors:
 
     def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
         """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
-        headers = (
-            (name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()
-        )
-        self.admit(permissions.of_rpc(rpc, model), _shown(headers)[0])
+        self.admit(permissions.of_rpc(rpc, model), _shown(headers_of(metadata))[0])
 
     def _authorize(self, need: Need, token: bytes | None) -> Key:
         key = None if token is None else self._keyring.find(token)
@@ -105,23 +103,35 @@ class Doors:
 class Guarded:
     """The ASGI application behind the doors."""
 
-    def __init__(self, application: ASGIApp, doors: Doors, settings: ServeSettings) -> None:
+    def __init__(
+        self,
+        application: ASGIApp,
+        doors: Doors,
+        errors: ErrorHandlers,
+        settings: ServeSettings,
+        log: AccessLog | None = None,
+    ) -> None:
         self._application = application
+        self._log = log
         self._doors = doors
+        self._errors = errors
         self._timeout = settings.timeout
-        self._errors = ErrorHandlers(settings.retry)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request in, or answer why not."""
         if (kind := scope["type"]) == "lifespan":
             await self._application(scope, receive, send)
             return
+        if self._log is not None:
+            send = self._log.begin(scope, _path(scope), send)
         try:
             token, patience = _shown(scope["headers"])
             need = permissions.of_request(kind, scope.get("method", "GET"), _path(scope))
             key = self._doors.admit(need, token)
             if key is not None:
                 scope[KEY] = key
+                if self._log is not None:
+                    scope[LINE]["key"] = key.name
             if kind != "http":
                 await self._application(scope, receive, send)
                 return
@@ -143,6 +153,11 @@ def _take(key: Key) -> None:
     """Count a call. Raises RateLimited."""
     if key.bucket is not None and (wait := key.bucket.take()):
         raise RateLimited(f"{key.name} may call {key.bucket.rate:g} times a second", wait)
+
+
+def headers_of(metadata: Iterable[tuple[str, Any]] | None) -> list[tuple[bytes, bytes]]:
+    """The metadata of a call of gRPC as headers."""
+    return [(name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()]
 
 
 def _shown(headers: Iterable[tuple[bytes, bytes]]) -> tuple[bytes | None, bytes | None]:

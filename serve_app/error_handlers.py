@@ -6,6 +6,7 @@ NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · DeadlineExceeded
 """
 
 import logging
+from collections.abc import Callable
 from math import ceil
 from typing import Any
 
@@ -80,9 +81,13 @@ def status_of(error: LeagueError) -> int:
 
 
 class ErrorHandlers:
-    """Starlette's exception handlers; a 503 asks to come back after `retry` seconds, a 429 after one."""
+    """Starlette's exception handlers; a 503 asks to come back after `retry` seconds, a 429 after one.
 
-    def __init__(self, retry: float) -> None:
+    count: told the path and the code of each error.
+    """
+
+    def __init__(self, retry: float, count: Callable[[str, str], None]) -> None:
+        self._count = count
         self._headers = {
             401: {"www-authenticate": "Bearer"},
             408: {"connection": "close"},  # what still comes of the body is not read
@@ -107,6 +112,7 @@ class ErrorHandlers:
         headers = self._headers.get(status)
         if isinstance(error, RateLimited):
             headers = {"retry-after": str(max(1, ceil(error.wait)))}
+        self._count(path, error.code)
         return answer(path, status, error.code, str(error), headers)
 
     async def http_error(self, request: Request, error: Exception) -> Response:
@@ -117,11 +123,13 @@ class ErrorHandlers:
             405: f"{request.method} is not allowed at {request.url.path[:200]}",
         }.get(error.status_code, error.detail)
         code = CODES.get(error.status_code, "http_error")
+        self._count(request.scope["path"], code)
         return answer(request.scope["path"], error.status_code, code, message, error.headers)
 
     async def fault(self, request: Request, error: Exception) -> Response:
         """A bug. Its traceback is for the log, not for a stranger."""
         logger.error("a request failed", exc_info=error)
+        self._count(request.scope["path"], "internal_error")
         return answer(request.scope["path"], 500, "internal_error", "the server failed; its log says why")
 
 

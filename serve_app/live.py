@@ -6,6 +6,7 @@ the alias moves → stage (in a thread: verify, load, warm) → swap → the old
 
 import asyncio
 import logging
+from collections import Counter
 
 from league.errors import LeagueError
 from league.refs import CHAMPION
@@ -28,6 +29,8 @@ class Live:
         self._slots: dict[Alias, LoadedVersion] = {}
         self._wanted: dict[Alias, int] = {}
         self._faults: dict[Alias, str] = {}
+        self.swaps: Counter[str] = Counter()
+        """league → how often one of its slots got another version"""
 
     def get(self, league: str, alias: str) -> LoadedVersion | None:
         """What answers for an alias."""
@@ -37,6 +40,10 @@ class Live:
         """The leagues that have an alias."""
         return sorted({league for league, _ in self._wanted})
 
+    def knows(self, league: str) -> bool:
+        """Whether a league has an alias."""
+        return any(league == known for known, _ in self._wanted)
+
     def champion(self, league: str) -> LoadedVersion | None:
         """What answers where no version is asked for."""
         return self.get(league, CHAMPION)
@@ -44,6 +51,10 @@ class Live:
     def numbers(self, league: str) -> dict[str, int]:
         """alias → the version that answers for it."""
         return {alias: version.number for (of, alias), version in self._slots.items() if of == league}
+
+    def is_served(self, alias: Alias) -> bool:
+        """Whether an alias answers from the version that it names now."""
+        return alias in self._wanted and self._serves(alias, self._wanted[alias])
 
     def fault(self, league: str) -> str | None:
         """Why the league's aliases are not all served as they should be."""
@@ -77,6 +88,8 @@ class Live:
         except LeagueError as error:
             self._stay(alias, number, str(error))
             return
+        if self._slots.get(alias) is not version:
+            self.swaps[league] += 1
         self._slots[alias] = version
         self._faults.pop(alias, None)
         logger.info("%s@%s is now version %d", league, name, number)

@@ -1,4 +1,4 @@
-"""From a version's number to something that answers: verify every file, load the graphs, warm them up."""
+"""From the number of a version to what answers: verify its files, load the graphs, let them answer their probes."""
 
 import time
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 from league.errors import ArtifactCorrupt, InvalidInput, UnknownPolicy, VersionRetired
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
+from league.policies.probes import Probes
 from league.registry.manifest import PolicyManifest
 from league.registry.registry import Registry
 from league.spaces import Box, Leaf
@@ -69,8 +70,12 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
     for name, manifest in version.manifest.policies.items():
         # Read again, verified as it is read: the file may have changed since.
         graph = registry.artifacts.read(version.manifest, manifest.file)
+        policy = OnnxPolicy(graph, manifest)
+        if manifest.probes is not None:
+            probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
+            probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
         try:
-            policies[name] = _warm(OnnxPolicy(graph, manifest), manifest, inline)
+            policies[name] = _warm(policy, manifest, inline)
         except InvalidInput as error:
             raise ArtifactCorrupt(f"policy {name} of {version.ref} does not run: {error}") from error
     return LoadedVersion(league, number, version.sha256, policies)

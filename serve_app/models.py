@@ -11,6 +11,7 @@ from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
 from league.registry.registry import Registry
 from serve_app.live import Live
 from serve_app.loading import LoadedPolicy, LoadedVersion
+from serve_app.traffic import Headers, Traffic
 from serve_app.versions import Versions
 
 T = TypeVar("T")
@@ -23,15 +24,19 @@ version_of = lru_cache(maxsize=1024)(parse_version)
 class Models:
     """Finds what answers: in the live slots, else among the versions in memory, else in the registry."""
 
-    def __init__(self, registry: Registry, live: Live, versions: Versions) -> None:
+    def __init__(self, registry: Registry, live: Live, versions: Versions, traffic: Traffic) -> None:
         self._registry = registry
         self._live = live
+        self._traffic = traffic
         self._versions = versions
         self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="registry")
 
-    async def find(self, model: str, version: str = CHAMPION) -> tuple[LoadedVersion, LoadedPolicy]:
+    async def find(
+        self, model: str, version: str = CHAMPION, headers: Headers = ()
+    ) -> tuple[LoadedVersion, LoadedPolicy]:
         """What `model` (`{league}` or `{league}.{policy}`) is at `version`, a number or an alias.
 
+        headers: the request's, whose key may send a request for a champion to its canary.
         Raises InvalidReference, UnknownLeague, UnknownVersion, VersionRetired, UnknownAlias, UnknownPolicy,
         ArtifactCorrupt or StorageError; NotReady for a league without a champion.
         """
@@ -40,6 +45,8 @@ class Models:
             loaded = self._versions.held(ref.league, asked) or await self._versions.get(ref.league, asked)
         else:
             loaded = self._live.get(ref.league, asked) or await self._resolve(ref.league, asked)
+            if asked == CHAMPION and self._traffic.canaries:
+                loaded = self._traffic.answering(loaded, headers)
         return loaded, loaded.policy(ref.policy)
 
     async def ask(self, question: Callable[[Registry], T]) -> T:

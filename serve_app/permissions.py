@@ -35,7 +35,7 @@ def of_request(kind: str, method: str, path: str) -> Need:
     """What a request needs; `kind` is ASGI's, `http` or `websocket`, and `path` is below the root path."""
     if path.startswith(HEALTH) and method in ("GET", "HEAD"):
         return NOTHING
-    league = _league(path)
+    league = league_of(path)
     scope = _scope(kind, method, path)
     is_of_none = path in OF_NO_LEAGUE or path.startswith("/docs/")
     return Need(scope, league, league is None and not is_of_none, scope == "promote" and _is_of_alias(path))
@@ -62,12 +62,12 @@ def _scope(kind: str, method: str, path: str) -> str:
 
 
 def _is_of_alias(path: str) -> bool:
-    """Whether a path is `/v1/leagues/L/aliases/A` or `/v1/leagues/L/rollback`."""
+    """Whether a path is `/v1/leagues/L/aliases/A`, `/v1/leagues/L/rollback` or `/v1/leagues/L/traffic`."""
     parts = path.split("/")
-    return parts[1:3] == ["v1", "leagues"] and parts[4:5] in (["aliases"], ["rollback"])
+    return parts[1:3] == ["v1", "leagues"] and parts[4:5] in (["aliases"], ["rollback"], ["traffic"])
 
 
-def _league(path: str) -> str | None:
+def league_of(path: str) -> str | None:
     """The league that a path names: `/v1/leagues/L…`, `/v1/policies/L.policy/…`, `/v2/models/L…`."""
     _, *parts = path.split("/", 4)
     if len(parts) < 3 or tuple(parts[:2]) not in (("v1", "leagues"), ("v1", "policies"), ("v2", "models")):

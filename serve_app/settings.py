@@ -54,6 +54,13 @@ class ServeSettings(BaseModel):
     """Between two acknowledgements of the same. At most a third of ACKNOWLEDGED_WITHIN: two may get lost."""
     retry: float = Field(default=3.0, gt=0)
     """How long a version that could not be loaded is not tried again; also the `Retry-After` of a 503."""
+    access_log: str | None = None
+    """Directory of an access log, inside LEAGUE_HOME unless it is absolute: a file of JSON lines for each replica. None
+    for no log."""
+    shadow_waiting: int = Field(default=256, ge=1)
+    """Requests that may wait to be mirrored to a shadow; beyond them they are not mirrored, and counted as dropped."""
+    shadow_load: float = Field(default=0.1, gt=0, lt=1)
+    """Share of a core that mirrored requests may take. What does not fit is dropped."""
     inline: float = Field(default=0.001, gt=0)
     """Inference that takes longer runs in a thread, so that it holds up neither other requests nor health checks."""
 

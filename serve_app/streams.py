@@ -6,6 +6,7 @@ stream that follows goes to another version only when all its episodes begin ane
 
 from dataclasses import dataclass
 from math import ceil
+from time import perf_counter_ns
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, Unauthenticated
 from league.policies.policy import Actions
+from league.refs import CHAMPION
 from serve_app.acting import Arrays, act, act_as_asked, generators, is_plain, reply_to
 from serve_app.asks import KEYS, Ask, pinned_version, read_ask, read_flag, refuse_unknown
 from serve_app.bodies import parse_object
@@ -22,16 +24,21 @@ from serve_app.error_handlers import MalformedBody, logger, status_of
 from serve_app.keyring import Key
 from serve_app.live import Live
 from serve_app.loading import LoadedPolicy, LoadedVersion
+from serve_app.metrics import Metrics
 from serve_app.models import Models, policy_ref
 from serve_app.observations import kind
 from serve_app.settings import ServeSettings
+from serve_app.shadow import Shadow
 from serve_app.stream_framing import Framing, read_head
 from serve_app.tokens import read_state, write_tokens
+from serve_app.traffic import Headers, Traffic
 
 OF_STREAMS = frozenset(("reset", "return_state"))
 """Keys that the action route does not have."""
 POLICY_VIOLATION = 1008
 NOT_UTF8 = 1007
+API = "stream"
+"""What messages of streams are called in metrics."""
 FAULT = {"code": "internal_error", "message": "the server failed; its log says why", "status": 500}
 
 
@@ -72,6 +79,9 @@ class StreamParts:
 
     models: Models
     live: Live
+    traffic: Traffic
+    shadow: Shadow
+    metrics: Metrics
     doors: Doors
     settings: ServeSettings
 
@@ -80,6 +90,7 @@ class Stream:
     """The conversation of one connection: messages are handed in one after the other.
 
     follows: the alias whose version answers; None: the version that is `served` does.
+    headers: of the handshake, whose key may send a stream that follows the champion to its canary.
     """
 
     def __init__(
@@ -88,12 +99,14 @@ class Stream:
         model: str,
         served: tuple[LoadedVersion, LoadedPolicy],
         follows: str | None,
+        headers: Headers,
         key: Key | None,
     ) -> None:
         self._parts = parts
         self._model = model
         self._ref = policy_ref(model)
         self._follows = follows
+        self._headers = headers
         self._key = key
         self._served = Served.of(model, *served)
         self._state: Arrays | None = None
@@ -122,6 +135,7 @@ class Stream:
         return _text({"closing": True, "state": self._tokens()} | self._served.signature)
 
     async def _answer_text(self, data: bytes) -> Message:
+        begun = perf_counter_ns()
         document = _parsed(data)
         refuse_unknown(document, KEYS | OF_STREAMS)
         own = document.keys() & OF_STREAMS
@@ -139,20 +153,27 @@ class Stream:
         quotes = data.count(b'"') - 2 * len(own)
         observations = served.policy.reader.read(ask.observations, is_plain(ask, served.policy, quotes))
         answer = await act_as_asked(ask, served.policy, observations, state)
+        self._show(served, observations, state, None if ask.explore else answer.actions)
         self._remember(served, answer, ask.is_batch)
         reply = reply_to(ask, answer, observations, served.policy) | served.signature
         if return_state and self._state is not None:
             reply["state"] = self._tokens()
-        return _text(reply)
+        message = _text(reply)
+        self._count(served, len(ask.observations), begun)
+        return message
 
     async def _answer_binary(self, data: bytes) -> Message:
+        begun = perf_counter_ns()
         ask = read_head(data, self._parts.settings.max_batch)
         served, state = self._continued(ask.rows, ask.reset, ask.resets)
         observations = served.framing.read(ask)
         rng = generators(ask.seed, ask.rows) if ask.explore else None
         answer = await act(served.policy, observations, state, rng)
+        self._show(served, observations, state, None if ask.explore else answer.actions)
         self._remember(served, answer, is_batch=ask.rows > 1)
-        return Message(served.framing.write(answer.actions, served.version.number), False)
+        message = Message(served.framing.write(answer.actions, served.version.number), False)
+        self._count(served, ask.rows, begun)
+        return message
 
     async def _memory(self, ask: Ask, is_anew: bool, resets: NDArray | None) -> tuple[Served, Arrays | None]:
         """What answers, and with which recurrent state. Raises InvalidState and what `Models.find` raises."""
@@ -187,9 +208,19 @@ class Stream:
         if self._follows is None:
             return self._served
         version = self._parts.live.get(self._ref.league, self._follows) or self._served.version
+        if self._follows == CHAMPION and self._parts.traffic.canaries:
+            version = self._parts.traffic.answering(version, self._headers)
         if version is self._served.version:
             return self._served
         return Served.of(self._model, version, version.policy(self._ref.policy))
+
+    def _show(self, served: Served, observations: Arrays, state: Arrays | None, actions: NDArray | None) -> None:
+        show = self._parts.shadow.of(self._model, served.version)
+        if show is not None:
+            show(observations, state, actions)
+
+    def _count(self, served: Served, rows: int, begun: int) -> None:
+        self._parts.metrics.answered(API, self._model, served.version, rows, perf_counter_ns() - begun)
 
     def _remember(self, served: Served, answer: Actions, is_batch: bool) -> None:
         self._served, self._state, self._is_batch = served, answer.state, is_batch

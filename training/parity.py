@@ -18,12 +18,13 @@ from league.environments.lockstep import stepping
 from league.environments.stepping import Episode
 from league.errors import ParityError
 from league.interface import Interface
-from league.policies.actions import bounds, to_environment
-from league.policies.draws import elements
+from league.policies.actions import to_environment
+from league.policies.agreement import excused, same
 from league.policies.onnx import STATE_IN, OnnxPolicy
+from league.policies.probes import Probes
 from league.registry.manifest import Parity
 from league.seeds import derive, generator
-from league.spaces import ACTION_MASK, Box, MultiDiscrete, Space
+from league.spaces import ACTION_MASK, Space
 from training.modules.actor_critic import ActorCritic
 from training.sampling.distributions import distribution
 from training.sampling.memories import Memories
@@ -37,13 +38,11 @@ FEWEST = 256
 ENOUGH_SECONDS, MOST_SECONDS = 8.0, 120.0
 """Of play, after which FEWEST observations are enough, and after which a policy with fewer counts as never acting."""
 COPIES = 8
-NEAR_TIE = 1e-5
-"""Two actions whose logits are closer may swap by the order of summation in another runtime."""
 TOLERANCE = 1e-3
 """Largest difference of an input x of the distribution, or of a number of the state, relative to 1 + |x|: beyond it,
 the two would not explore alike."""
-ACTION_TOLERANCE = 1e-4
-"""Largest difference of a number of an action, relative to the span between its bounds, else to 1 + |x|."""
+PROBES, PROBE_BYTES = 32, 2**20
+"""Probes that are recorded of a policy, fewer where their observations take more than that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +134,7 @@ def prove(path: Path, policy: str, module: ActorCritic, batches: list[Met], spac
         if not np.isfinite(expected).all():
             raise ParityError(f"policy {policy} has outputs that are not finite: training has diverged")
         mode = module.distribution.mode(torch.from_numpy(expected)).numpy()
-        before = {f"{STATE_IN}{i}": value for i, value in enumerate(situation.state.values())}
-        exported = graph.distribution(situation.observations, state=before or None)
+        exported = graph.distribution(situation.observations, state=_state_in(situation.state) or None)
         assert exported.dist_inputs is not None
         wrong, tied = differing(exported.actions, to_environment(mode, space), expected, space)
         mismatches, near_ties = mismatches + wrong, near_ties + tied
@@ -151,6 +149,25 @@ def prove(path: Path, policy: str, module: ActorCritic, batches: list[Met], spac
             f"and by up to {largest:g} in an input of the distribution"
         )
     return Parity(observations=count, mismatches=mismatches, near_ties=near_ties, max_difference=largest)
+
+
+def probes(path: Path, batches: list[Met]) -> Probes:
+    """Some of the situations, evenly spread over them, with what the graph at `path` does in each."""
+    starts = np.cumsum([0, *map(len, batches)])
+    size = sum(array[0].nbytes for array in batches[0].observations.values())
+    wanted = min(PROBES, max(1, PROBE_BYTES // size), int(starts[-1]))
+    rows = np.linspace(0, starts[-1] - 1, wanted).astype(int)
+    found = [(batches[i], row - starts[i]) for row in rows for i in [int(np.searchsorted(starts, row, "right")) - 1]]
+    observations = {
+        name: np.stack([met.observations[name][row] for met, row in found]) for name in batches[0].observations
+    }
+    state = _state_in({key: np.stack([met.state[key][row] for met, row in found]) for key in batches[0].state})
+    return Probes(observations, state, OnnxPolicy(path).act(observations, state=state or None).actions)
+
+
+def _state_in(state: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """A module's state under the names of the graph's inputs."""
+    return {f"{STATE_IN}{i}": value for i, value in enumerate(state.values())}
 
 
 def answer(module: ActorCritic, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:
@@ -188,21 +205,5 @@ def _count(batches: list[Met]) -> int:
 
 def differing(actions: NDArray, expected: NDArray, dist_inputs: NDArray, space: Space) -> tuple[int, int]:
     """Rows whose actions differ, and rows that do so in near ties only."""
-    if isinstance(space, Box):
-        low, high = bounds(space)
-        span = np.where(np.isfinite(low) & np.isfinite(high), high - low, 1 + np.abs(expected))
-        differs = np.abs(actions - expected) > ACTION_TOLERANCE * span
-        return int(differs.reshape(len(differs), -1).any(axis=1).sum()), 0
-    parts = elements(dist_inputs, space) if isinstance(space, MultiDiscrete) else [dist_inputs]
-    margins = np.stack([_margin(logits) for logits in parts], axis=1)
-    differs = (actions != expected).reshape(len(actions), -1)
-    wrong = (differs & (margins >= NEAR_TIE)).any(axis=1)
-    return int(wrong.sum()), int((differs.any(axis=1) & ~wrong).sum())
-
-
-def _margin(logits: NDArray) -> NDArray:
-    """How far the best logit is above the second, per row; infinite where there is but one action."""
-    if logits.shape[-1] < 2:
-        return np.full(len(logits), np.inf)
-    ordered = np.sort(logits, axis=-1)
-    return ordered[:, -1] - ordered[:, -2]
+    alike, fine = same(actions, expected, space), excused(actions, expected, dist_inputs, space)
+    return int((~fine).sum()), int((fine & ~alike).sum())

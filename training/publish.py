@@ -10,7 +10,7 @@ from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT
 
 from league.config import LeagueConfig
 from league.interface import Interface
-from league.registry.manifest import TRAINING, Manifest, PolicyManifest
+from league.registry.manifest import PROBES, TRAINING, Manifest, PolicyManifest
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
 from league.stack import installed
@@ -105,9 +105,11 @@ def _export(
     staging: Path, policy: str, module: ActorCritic, interface: Interface, observations: list[parity.Met]
 ) -> PolicyManifest:
     spaces = interface.of_policy(policy)
-    file = f"{policy}.onnx"
+    file, probes = f"{policy}.onnx", f"{policy}{PROBES}"
     export_policy(module, spaces, staging / file)
     inputs, outputs, state = graph_tensors(module, spaces)
+    proof = parity.prove(staging / file, policy, module, observations, spaces.action)
+    (staging / probes).write_bytes(parity.probes(staging / file, observations).to_bytes())
     return PolicyManifest(
         file=file,
         observation=spaces.observation,
@@ -115,5 +117,6 @@ def _export(
         inputs=inputs,
         outputs=outputs,
         state=state,
-        parity=parity.prove(staging / file, policy, module, observations, spaces.action),
+        parity=proof,
+        probes=probes,
     )

@@ -22,12 +22,13 @@ def write(
     sha256: str | None,
     fault: str | None,
     aliases: Mapping[str, int],
+    traffic: int | None,
 ) -> None:
     """Replace what `replica` said of `league`. Raises UnknownLeague."""
     leagues.require(session, league)
     now = datetime.now(UTC)
-    values = {"version": version, "sha256": sha256, "fault": fault, "aliases": dict(aliases), "seen_at": now}
-    upsert(session, Acknowledgement, {"replica": replica, "league": league}, values)
+    values = {"version": version, "sha256": sha256, "fault": fault, "aliases": dict(aliases), "traffic": traffic}
+    upsert(session, Acknowledgement, {"replica": replica, "league": league}, values | {"seen_at": now})
     session.execute(delete(Acknowledgement).where(Acknowledgement.seen_at < now - KEPT))
 
 
@@ -37,7 +38,9 @@ def fresh(session: Session, league: str, since: timedelta) -> list[rows.Acknowle
     query = select(Acknowledgement).filter_by(league=league).order_by(Acknowledgement.replica)
     found = session.scalars(query.where(Acknowledgement.seen_at >= datetime.now(UTC) - since))
     return [
-        rows.Acknowledgement(row.replica, row.league, row.version, row.sha256, row.fault, row.aliases, row.seen_at)
+        rows.Acknowledgement(
+            row.replica, row.league, row.version, row.sha256, row.fault, row.aliases, row.seen_at, row.traffic
+        )
         for row in found
     ]
 

@@ -94,6 +94,10 @@ class ArtifactStore:
 
     def read(self, manifest: Manifest, name: str) -> bytes:
         """The bytes of one file of a version, verified as they are read. Raises ArtifactCorrupt."""
+        if name not in manifest.files:
+            raise ArtifactCorrupt(
+                f"{manifest.league}@{manifest.version} has no file {name!r}, which its manifest names"
+            )
         return _verified(self.path(manifest.league, manifest.version) / name, manifest.files[name])
 
     def _staging(self, league: str, number: int) -> Path:

@@ -1,15 +1,16 @@
-"""Waits until every live replica follows an alias, as their acknowledgements tell."""
+"""Waits until every live replica follows an alias or a setting of traffic, as their acknowledgements tell."""
 
 import time
 from collections.abc import Callable
 from datetime import timedelta
 
-from league.errors import AliasMoved, NotReady
+from league.errors import AliasMoved, Conflict, NotReady
 from league.registry.registry import Registry
-from league.registry.rows import Acknowledgement
+from league.registry.rows import Acknowledgement, Traffic
 
 LOOK = 0.02
 """Seconds between two looks."""
+SILENT = "has said nothing of this league"
 LIVES = timedelta(seconds=15)
 """A replica that has said nothing for longer does not live any more."""
 
@@ -26,25 +27,71 @@ def await_followers(
 
     Raises AliasMoved if the alias points elsewhere by now, or NotReady, which names who does not follow, and why.
     """
+
+    def check() -> None:
+        if (now := registry.aliases(league).get(alias)) != version:
+            raise AliasMoved(f"{league}@{alias} has moved on to version {now} meanwhile")
+
+    return _await(
+        registry,
+        league,
+        f"{league}@{alias} is version {version}",
+        check=check,
+        follows=lambda said: said.aliases.get(alias) == version,
+        tell=lambda said: _serves(said, alias),
+        timeout=timeout,
+        sleep=sleep,
+    )
+
+
+def await_traffic(
+    registry: Registry, setting: Traffic, timeout: float, sleep: Callable[[float], None] = time.sleep
+) -> list[str]:
+    """The replicas, at least one, all of which follow a setting of traffic now. `timeout` is in seconds.
+
+    Raises Conflict if there is a newer setting by now, or NotReady, which names who does not follow, and why.
+    """
+
+    def check() -> None:
+        if registry.traffic(setting.league).id != setting.id:
+            raise Conflict(f"the traffic of {setting.league} was set otherwise meanwhile")
+
+    return _await(
+        registry,
+        setting.league,
+        f"the traffic of {setting.league} is set",
+        check=check,
+        follows=lambda said: said.traffic == setting.id,
+        tell=lambda said: said.fault or "has not followed",
+        timeout=timeout,
+        sleep=sleep,
+    )
+
+
+def _await(
+    registry: Registry,
+    league: str,
+    done: str,
+    *,
+    check: Callable[[], None],
+    follows: Callable[[Acknowledgement], bool],
+    tell: Callable[[Acknowledgement], str],
+    timeout: float,
+    sleep: Callable[[float], None],
+) -> list[str]:
+    """The replicas, once all follow. `check` raises when that is in vain; `tell` says why one does not."""
     deadline = time.monotonic() + timeout
     while True:
-        now = registry.aliases(league).get(alias)
-        if now != version:
-            raise AliasMoved(f"{league}@{alias} has moved on to version {now} meanwhile")
+        check()
         replicas = registry.replicas(LIVES)
         said = {one.replica: one for one in registry.acknowledgements(league, LIVES)}
-        late = [replica for replica in replicas if not _follows(said.get(replica), alias, version)]
+        late = [replica for replica in replicas if replica not in said or not follows(said[replica])]
         if replicas and not late:
             return replicas
         if time.monotonic() >= deadline:
-            reasons = [f"{replica} {_reason(said.get(replica), alias)}" for replica in late]
-            moved = f"{league}@{alias} is version {version}, but after {timeout:g} s"
-            raise NotReady(f"{moved} {_why(len(replicas), reasons)}")
+            reasons = [f"{replica} {tell(said[replica]) if replica in said else SILENT}" for replica in late]
+            raise NotReady(f"{done}, but after {timeout:g} s {_why(len(replicas), reasons)}")
         sleep(LOOK)
-
-
-def _follows(said: Acknowledgement | None, alias: str, version: int) -> bool:
-    return said is not None and said.aliases.get(alias) == version
 
 
 def _why(replicas: int, reasons: list[str]) -> str:
@@ -53,9 +100,7 @@ def _why(replicas: int, reasons: list[str]) -> str:
     return f"{len(reasons)} of {replicas} replicas do not serve it: {'; '.join(reasons)}"
 
 
-def _reason(said: Acknowledgement | None, alias: str) -> str:
-    if said is None:
-        return "has said nothing of this league"
+def _serves(said: Acknowledgement, alias: str) -> str:
     number = said.aliases.get(alias)
     serves = "serves nothing" if number is None else f"serves version {number}"
     return f"{serves} ({said.fault})" if said.fault else serves

@@ -1,21 +1,22 @@
 """Calls that change state are applied once, however often they arrive.
 
-A caller names its call by a key of its own. The alias event that the call led to is kept with it, in the transaction of
-the change itself: the call and its answer are there together, or neither is. Events never change, so that the same
-answer can be given again.
+A caller names its call by a key of its own. The event that the call led to, of an alias or of traffic, is kept with it,
+in the transaction of the change itself: the call and its answer are there together, or neither is. Events never change,
+so that the same answer can be given again.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import TypeVar, cast
 
 from sqlalchemy import delete
 from sqlalchemy.orm import Session
 
 from league.errors import KeyReused
-from league.registry import aliases, leagues, rows
+from league.registry import aliases, leagues, rows, traffic
 from league.registry.database import insert
-from league.registry.tables import AliasEvent, IdempotentCall
+from league.registry.tables import AliasEvent, IdempotentCall, TrafficEvent
 
 KEPT = timedelta(hours=24)
 
@@ -29,8 +30,11 @@ class Call:
     digest: str
 
 
-def once(session: Session, league: str, call: Call | None, change: Callable[[], rows.AliasEvent]) -> rows.AliasEvent:
-    """Do `change` to an alias of a league, unless `call` has done so: then return the event that it led to.
+E = TypeVar("E", rows.AliasEvent, rows.Traffic)
+
+
+def once(session: Session, league: str, call: Call | None, change: Callable[[], E]) -> E:
+    """Do `change` to what is served of a league, unless `call` has done so: then return the event that it led to.
 
     A change that fails leaves nothing, and may be tried again. Raises UnknownLeague, what `change` raises, or KeyReused
     if the call of that name asked for something else.
@@ -42,10 +46,18 @@ def once(session: Session, league: str, call: Call | None, change: Callable[[], 
     session.execute(delete(IdempotentCall).where(IdempotentCall.at < now - KEPT))
     known = session.get(IdempotentCall, (call.owner, call.key))
     if known is not None and known.digest == call.digest:
-        return aliases.row(session.get_one(AliasEvent, known.event))
+        # The digest tells what was asked, so the event is of the kind that `change` makes.
+        return cast(E, _event(session, known))
     if known is None:
         event = change()
-        values = {"owner": call.owner, "key": call.key, "digest": call.digest, "event": event.id, "at": now}
+        column = "traffic" if isinstance(event, rows.Traffic) else "event"
+        values = {"owner": call.owner, "key": call.key, "digest": call.digest, column: event.id, "at": now}
         if insert(session, IdempotentCall, [values]):
             return event
     raise KeyReused(f"the Idempotency-Key {call.key!r} was used for another call: take a new one for each change")
+
+
+def _event(session: Session, call: IdempotentCall) -> rows.AliasEvent | rows.Traffic:
+    if call.traffic is not None:
+        return traffic.row(session.get_one(TrafficEvent, call.traffic))
+    return aliases.row(session.get_one(AliasEvent, call.event))

@@ -12,6 +12,8 @@ from league.spaces import Space
 MANIFEST = "manifest.json"
 TRAINING = "training"
 """The directory of RLlib's state, which only training reads."""
+PROBES = ".probes.npz"
+"""Behind a policy's name: the file of its probes."""
 
 
 class _Record(BaseModel):
@@ -50,6 +52,8 @@ class PolicyManifest(_Record):
     state: tuple[Tensor, ...] = ()
     """The recurrent inputs `state_in_<i>`, zeros at the start of an episode."""
     parity: Parity
+    probes: str | None = None
+    """The file of its probes (policies/probes.py), which it answers before it serves; None in versions without."""
 
 
 class Manifest(_Record):

@@ -1,6 +1,6 @@
 """The face of the registry: each method is one transaction, or a version's whole way to being published."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -11,14 +11,36 @@ from league.config import LeagueConfig
 from league.errors import StorageError
 from league.interface import Interface
 from league.refs import CHAMPION, CheckpointRef
-from league.registry import acknowledgements, aliases, keys, leagues, publishing, verdicts, versions
+from league.registry import (
+    acknowledgements,
+    aliases,
+    keys,
+    leagues,
+    publishing,
+    reports,
+    shadows,
+    traffic,
+    verdicts,
+    versions,
+)
 from league.registry.aliases import AnyVersion
 from league.registry.artifacts import ArtifactStore
 from league.registry.database import Database
 from league.registry.faults import DISK_FULL_OR_SHUT, disk_faults
 from league.registry.idempotency import Call, once
 from league.registry.manifest import Manifest
-from league.registry.rows import Acknowledgement, AliasEvent, KeyRow, LeagueRow, VerdictRow, VersionRow
+from league.registry.rows import (
+    Acknowledgement,
+    AliasEvent,
+    KeyRow,
+    LeagueRow,
+    Portion,
+    Shadowing,
+    Traffic,
+    VerdictRow,
+    VersionRow,
+)
+from league.registry.traffic import KEEP, Unchanged
 from league.settings import Storage
 
 Build = Callable[[Path, int], Manifest]
@@ -212,10 +234,14 @@ class Registry:
         sha256: str | None,
         fault: str | None = None,
         aliases: Mapping[str, int] = MappingProxyType({}),
+        traffic: int | None = None,
     ) -> None:
-        """Say what a replica serves of a league, by which alias, and why not what it should. Raises UnknownLeague."""
+        """Say what a replica serves of a league, by which alias, and why not what it should. Raises UnknownLeague.
+
+        traffic: the id of the setting that it follows.
+        """
         with self.database.write() as session:
-            acknowledgements.write(session, replica, league, version, sha256, fault, aliases)
+            acknowledgements.write(session, replica, league, version, sha256, fault, aliases, traffic)
 
     def acknowledgements(self, league: str, since: timedelta = timedelta(seconds=15)) -> list[Acknowledgement]:
         """What replicas said of a league in the last `since`. Raises UnknownLeague."""
@@ -231,6 +257,63 @@ class Registry:
         """Remove what a replica said: it stops."""
         with self.database.write() as session:
             acknowledgements.forget(session, replica)
+            reports.forget(session, replica, acknowledgements.KEPT)
+
+    # Traffic
+
+    def set_traffic(
+        self,
+        league: str,
+        *,
+        canary: Portion | Unchanged | None = KEEP,
+        shadow: Portion | Unchanged | None = KEEP,
+        actor: str,
+        reason: str,
+        call: Call | None = None,
+    ) -> Traffic:
+        """Set where requests for a league's champion go besides; None ends a canary or shadow, KEEP leaves it.
+
+        Returns the setting in force. A `call` that was applied before changes nothing and returns its setting.
+        Raises UnknownLeague, UnknownVersion, UnknownAlias, InvalidInput or KeyReused.
+        """
+        with self.database.write() as session:
+            return once(
+                session,
+                league,
+                call,
+                lambda: traffic.put(session, league, canary=canary, shadow=shadow, actor=actor, reason=reason),
+            )
+
+    def traffic(self, league: str) -> Traffic:
+        """Where requests for a league's champion go besides. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return traffic.current(session, league)
+
+    def all_traffic(self) -> dict[str, Traffic]:
+        """league → the same, of all leagues that have a setting, by one cheap query."""
+        with self.database.read() as session:
+            return traffic.every(session)
+
+    def traffic_history(self, league: str) -> list[Traffic]:
+        """All settings of a league's traffic, newest first. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return traffic.history(session, league)
+
+    def report(self, replica: str, document: dict[str, Any], shadowings: Iterable[Shadowing] = ()) -> None:
+        """Write what a replica measures of itself, and what it has counted of shadows since it started."""
+        with self.database.write() as session:
+            reports.write(session, replica, document)
+            shadows.write(session, replica, shadowings)
+
+    def reports(self, since: timedelta = timedelta(seconds=15)) -> dict[str, dict[str, Any]]:
+        """replica → what it measures of itself, of those that said so in the last `since`."""
+        with self.database.read() as session:
+            return reports.fresh(session, since)
+
+    def shadowings(self, league: str) -> list[Shadowing]:
+        """What all replicas ever counted of a league's shadows, by candidate and champion."""
+        with self.database.read() as session:
+            return shadows.merged(session, league)
 
     # API keys
 

@@ -5,6 +5,7 @@ from datetime import datetime
 from typing import Any, Literal
 
 from league.config import LeagueConfig
+from league.histograms import Histogram
 from league.interface import Interface
 from league.registry.manifest import Manifest
 
@@ -81,6 +82,64 @@ class Acknowledgement:
     aliases: dict[str, int]
     """alias → the version that answers for it"""
     seen_at: datetime
+    traffic: int | None = None
+    """The setting of canary and shadow that it follows whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Portion:
+    """A version, by number or by alias, and the share of requests that it gets, from 0 to 1."""
+
+    version: int | str
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """Where requests for a league's champion go besides. Without an id, nothing was ever set."""
+
+    league: str
+    id: int | None = None
+    canary: Portion | None = None
+    """Answers its share, instead of the champion."""
+    shadow: Portion | None = None
+    """Is shown its share, after the champion has answered."""
+    actor: str | None = None
+    reason: str | None = None
+    at: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Shadowing:
+    """A candidate's answers to requests that `champion` had answered."""
+
+    league: str
+    candidate: int
+    champion: int
+    requests: int
+    """Mirrored and compared."""
+    observations: int
+    """In those requests."""
+    agreed: int
+    """Observations for which both take the same greedy action."""
+    failed: int
+    """Requests that the candidate could not answer."""
+    dropped: int
+    """Requests that were not mirrored because too many others were."""
+    skipped: int
+    """Requests that cannot be mirrored: with recurrent state, which is another network's."""
+    latency: tuple[int, ...]
+    """Counts in the buckets of league/histograms.py, of the time that the candidate computed for one request."""
+    ns: int
+    """The sum of those times in nanoseconds."""
+
+    @property
+    def agreement(self) -> float | None:
+        return self.agreed / self.observations if self.observations else None
+
+    def milliseconds(self, share: float) -> float | None:
+        """Within which the candidate computed `share` of the requests; see `Histogram.quantile`."""
+        return Histogram(self.latency).quantile(share)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from typing import Any
 
 from sqlalchemy import (
     JSON,
+    BigInteger,
     DateTime,
     Dialect,
     Double,
@@ -148,7 +149,62 @@ class Acknowledgement(Table):
     fault: Mapped[str | None] = mapped_column(Text)
     aliases: Mapped[dict[str, int]] = mapped_column(JSON)
     """alias → the version that answers for it"""
+    traffic: Mapped[int | None]
+    """The setting of canary and shadow that it follows."""
     seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
+
+
+class TrafficEvent(Table):
+    """What a league's canary and shadow were set to, by whom and why. Never changed; the newest is in force."""
+
+    __tablename__ = "traffic_events"
+    __table_args__ = (Index("ix_traffic_events_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    canary: Mapped[str | None] = mapped_column(String(255))
+    """A number or an alias."""
+    canary_share: Mapped[float | None] = mapped_column(Double)
+    shadow: Mapped[str | None] = mapped_column(String(255))
+    shadow_share: Mapped[float | None] = mapped_column(Double)
+    actor: Mapped[str] = mapped_column(Text)
+    reason: Mapped[str] = mapped_column(Text)
+    at: Mapped[datetime] = mapped_column(Utc)
+
+
+class ShadowCount(Table):
+    """What a replica has counted of a candidate that requests for the champion were mirrored to, since it started."""
+
+    __tablename__ = "shadow_counts"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "candidate"], ["versions.league", "versions.number"]),
+        ForeignKeyConstraint(["league", "champion"], ["versions.league", "versions.number"]),
+    )
+
+    replica: Mapped[str] = mapped_column(String(255), primary_key=True)
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    candidate: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    champion: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    requests: Mapped[int] = mapped_column(BigInteger)
+    observations: Mapped[int] = mapped_column(BigInteger)
+    agreed: Mapped[int] = mapped_column(BigInteger)
+    failed: Mapped[int] = mapped_column(BigInteger)
+    dropped: Mapped[int] = mapped_column(BigInteger)
+    skipped: Mapped[int] = mapped_column(BigInteger)
+    latency: Mapped[list[int]] = mapped_column(JSON)
+    """Counts in the buckets of league/histograms.py."""
+    ns: Mapped[int] = mapped_column(BigInteger)
+    at: Mapped[datetime] = mapped_column(Utc, index=True)
+
+
+class Report(Table):
+    """What a replica measures of itself, as serve_app/metrics.py writes it."""
+
+    __tablename__ = "reports"
+
+    replica: Mapped[str] = mapped_column(String(255), primary_key=True)
+    document: Mapped[dict[str, Any]] = mapped_column(JSON)
+    at: Mapped[datetime] = mapped_column(Utc, index=True)
 
 
 class ApiKey(Table):
@@ -169,7 +225,7 @@ class ApiKey(Table):
 
 
 class IdempotentCall(Table):
-    """A change that a caller named, and the event that it led to."""
+    """A change that a caller named, and the event that it led to: of an alias, or of traffic."""
 
     __tablename__ = "idempotent_calls"
 
@@ -177,7 +233,8 @@ class IdempotentCall(Table):
     key: Mapped[str] = mapped_column(String(255), primary_key=True)
     digest: Mapped[str] = mapped_column(String(64))
     """Of what was asked."""
-    event: Mapped[int] = mapped_column(ForeignKey("alias_events.id"))
+    event: Mapped[int | None] = mapped_column(ForeignKey("alias_events.id"))
+    traffic: Mapped[int | None] = mapped_column(ForeignKey("traffic_events.id"))
     at: Mapped[datetime] = mapped_column(Utc, index=True)
 
 

@@ -7,19 +7,22 @@ import grpc
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import Message
 
-from league.errors import ArtifactCorrupt, BodyTooLarge, NotFound, NotReady, StorageError
+from league.errors import ArtifactCorrupt, BodyTooLarge, LeagueError, NotFound, NotReady, StorageError
 from serve_app.alias_watcher import AliasWatcher
-from serve_app.doors import Doors
+from serve_app.doors import Doors, headers_of
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.catalogue import Catalogue, Document
 from serve_app.inference_protocol.grpc_messages import read_request, write_response
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.peers import is_of
 from serve_app.settings import ServeSettings
+from serve_app.traffic import Headers
+
+INFER = "ModelInfer"
 
 
 class InferenceService:
-    """The calls of a replica. `machine` is the address by which its node is known."""
+    """The calls of a replica. `machine` is the address by which its node is known; `count` is told of each error."""
 
     def __init__(
         self,
@@ -29,6 +32,7 @@ class InferenceService:
         doors: Doors,
         settings: ServeSettings,
         machine: str,
+        count: Callable[[str, str], None],
     ) -> None:
         self._inference = inference
         self._catalogue = catalogue
@@ -36,6 +40,7 @@ class InferenceService:
         self._doors = doors
         self._settings = settings
         self._machine = machine
+        self._count = count
         self.rpcs: dict[str, Callable[[Any], Awaitable[Message]]] = {
             "ServerLive": self._server_live,
             "ServerReady": self._server_ready,
@@ -43,7 +48,6 @@ class InferenceService:
             "ServerMetadata": self._server_metadata,
             "ModelMetadata": self._model_metadata,
             "ModelConfig": self._model_config,
-            "ModelInfer": self._model_infer,
             "ModelStatistics": self._model_statistics,
             "RepositoryIndex": self._repository_index,
         }
@@ -53,10 +57,17 @@ class InferenceService:
         if self._settings.grpc_local_only and not is_of(context.peer(), self._machine):
             raise NotReady("a replica answers gRPC from its own machine alone: call the server's port")
         model = getattr(request, "model_name", "") or getattr(request, "name", "")
-        self._doors.admit_rpc(context.invocation_metadata(), rpc, model)
-        if request.ByteSize() > self._settings.max_body:
-            raise BodyTooLarge(f"the message is larger than {self._settings.max_body} bytes")
-        return await self.rpcs[rpc](request)
+        metadata = context.invocation_metadata()
+        try:
+            self._doors.admit_rpc(metadata, rpc, model)
+            if request.ByteSize() > self._settings.max_body:
+                raise BodyTooLarge(f"the message is larger than {self._settings.max_body} bytes")
+            if rpc == INFER:
+                return await self._model_infer(request, headers_of(metadata))
+            return await self.rpcs[rpc](request)
+        except LeagueError as error:
+            self._count(f"/v2/models/{model}", error.code)
+            raise
 
     async def _server_live(self, _: Message) -> Message:
         return messages.ServerLiveResponse(live=True)
@@ -90,9 +101,9 @@ class InferenceService:
         models = await self._catalogue.index(request.ready)
         return _message({"models": models}, messages.RepositoryIndexResponse())
 
-    async def _model_infer(self, request: messages.ModelInferRequest) -> Message:
+    async def _model_infer(self, request: messages.ModelInferRequest, headers: Headers) -> Message:
         with self._inference.admitted():
-            return await self._inference.infer(read_request(request), write_response)
+            return await self._inference.infer(read_request(request), write_response, headers)
 
 
 def _message(document: Document, empty: Message) -> Message:

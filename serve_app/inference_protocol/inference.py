@@ -17,10 +17,15 @@ from serve_app.inference_protocol.signature import Signature, signature_of
 from serve_app.inference_protocol.statistics import Statistics
 from serve_app.inference_protocol.tensors import Tensor, read_inputs
 from serve_app.loading import LoadedPolicy, LoadedVersion
+from serve_app.metrics import Metrics
 from serve_app.models import Models, policy_ref
 from serve_app.settings import ServeSettings
+from serve_app.shadow import Shadow, Show
+from serve_app.traffic import Headers
 
 T = TypeVar("T")
+API = "infer"
+"""What inferences are called in metrics, over REST and gRPC."""
 
 
 class InferRequest(NamedTuple):
@@ -60,8 +65,10 @@ class Served(NamedTuple):
 class Inference:
     """The policies of a replica under the protocol. Runs on the event loop."""
 
-    def __init__(self, models: Models, settings: ServeSettings) -> None:
+    def __init__(self, models: Models, shadow: Shadow, metrics: Metrics, settings: ServeSettings) -> None:
         self._models = models
+        self._shadow = shadow
+        self._metrics = metrics
         self._settings = settings
         self._signatures: WeakKeyDictionary[LoadedPolicy, Signature] = WeakKeyDictionary()
         self.statistics = Statistics()
@@ -79,19 +86,23 @@ class Inference:
         finally:
             self.in_flight -= 1
 
-    async def find(self, model: str, version: str) -> Served:
+    async def find(self, model: str, version: str, headers: Headers = ()) -> Served:
         """What answers for a model. Raises what `Models.find` raises."""
-        loaded, policy = await self._models.find(model, version or CHAMPION)
+        loaded, policy = await self._models.find(model, version or CHAMPION, headers)
         signature = self._signatures.get(policy)
         if signature is None:
             signature = self._signatures[policy] = signature_of(policy.manifest)
         name = loaded.league if len(loaded.policies) == 1 else str(policy_ref(model))
         return Served(name, loaded, policy, signature)
 
-    async def infer(self, request: InferRequest, encode: Callable[[InferResponse], T]) -> T:
-        """Answer a request in the form that `encode` gives it. Raises LeagueError."""
+    async def infer(self, request: InferRequest, encode: Callable[[InferResponse], T], headers: Headers = ()) -> T:
+        """Answer a request in the form that `encode` gives it. Raises LeagueError.
+
+        headers: the request's, whose key may send a request for a champion to its canary.
+        """
         begun = perf_counter_ns()
-        served = await self.find(request.model, request.version)
+        served = await self.find(request.model, request.version, headers)
+        show = self._shadow.of(request.model, served.version)
         found = perf_counter_ns()
         entry = self.statistics.entry(served.name, served.version.number)
         try:
@@ -100,7 +111,7 @@ class Inference:
                 raise InvalidInput("no state is kept between requests: send state_out_<i> back as state_in_<i>")
             arrays = read_inputs(request.inputs, served.signature, self._settings.max_batch)
             read = perf_counter_ns()
-            outputs = await _run(arrays, wanted, served)
+            outputs = await _run(arrays, wanted, served, show)
             ran = perf_counter_ns()
             response = InferResponse(request.model, str(served.version.number), request.id, outputs)
             encoded = encode(response)
@@ -108,7 +119,9 @@ class Inference:
             entry.fail(perf_counter_ns() - begun)
             raise
         rows = len(next(iter(arrays.values())))
-        entry.succeed(rows, begun, found, read, ran, perf_counter_ns())
+        done = perf_counter_ns()
+        entry.succeed(rows, begun, found, read, ran, done)
+        self._metrics.answered(API, request.model, served.version, rows, done - begun)
         return encoded
 
 
@@ -124,7 +137,9 @@ def _wanted(outputs: Sequence[str], signature: Signature) -> Sequence[str]:
     return outputs
 
 
-async def _run(arrays: dict[str, NDArray], wanted: Sequence[str], served: Served) -> dict[str, NDArray]:
+async def _run(
+    arrays: dict[str, NDArray], wanted: Sequence[str], served: Served, show: Show | None
+) -> dict[str, NDArray]:
     ports, policy = served.signature.inputs, served.policy.policy
     state = {name: array for name, array in arrays.items() if ports[name].is_state} or None
 
@@ -135,6 +150,8 @@ async def _run(arrays: dict[str, NDArray], wanted: Sequence[str], served: Served
 
     rows = len(next(iter(arrays.values())))
     answer = act() if rows <= served.policy.inline_rows else await asyncio.to_thread(act)
+    if show is not None:
+        show({name: array for name, array in arrays.items() if not ports[name].is_state}, state, answer.actions)
     return {name: _output(name, answer) for name in wanted}
 
 

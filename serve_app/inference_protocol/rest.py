@@ -16,12 +16,13 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, NotReady
+from serve_app.access_log import LINE, answered_by
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.bodies import parse_object, read_bytes
 from serve_app.inference_protocol.catalogue import Catalogue
 from serve_app.inference_protocol.compression import compressed, decompressed
 from serve_app.inference_protocol.framing import read_request, write_response
-from serve_app.inference_protocol.inference import Inference
+from serve_app.inference_protocol.inference import Inference, InferResponse
 from serve_app.routes.action import REPLICA
 from serve_app.settings import ServeSettings
 
@@ -127,7 +128,13 @@ class InferRoute:
             body = await decompressed(body, encoding, limit)
         named = scope["path_params"]
         request = read_request(named["model"], named.get("version", ""), body, header_length)
-        reply, length = await self._inference.infer(request.infer, lambda response: write_response(response, request))
+
+        def write(response: InferResponse) -> tuple[bytes, int | None]:
+            if LINE in scope:
+                answered_by(scope, response.model, int(response.version))
+            return write_response(response, request)
+
+        reply, length = await self._inference.infer(request.infer, write, scope["headers"])
         headers = [self._replica, (b"content-type", JSON if length is None else BINARY)]
         if length is not None:
             headers.append((HEADER_LENGTH, b"%d" % length))

@@ -10,6 +10,7 @@ same action in every batch; in a batch with one seed, so does an observation at 
 `sha256` is the digest of the version's manifest.json, which holds the digests of all its files.
 """
 
+from time import perf_counter_ns
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -18,21 +19,28 @@ from starlette.types import Receive, Scope, Send
 
 from league.errors import Overloaded
 from league.refs import CHAMPION
+from serve_app.access_log import LINE, answered_by
 from serve_app.acting import act_as_asked, is_plain, read_given_state, reply_to, written_state
 from serve_app.asks import KEYS, Ask, pinned_version, read_ask, refuse_unknown
 from serve_app.bodies import parse_object, read_body
 from serve_app.loading import LoadedPolicy, LoadedVersion
+from serve_app.metrics import Metrics
 from serve_app.models import Models
 from serve_app.settings import ServeSettings
+from serve_app.shadow import Shadow, Show
 
 REPLICA = b"x-league-replica"
+API = "action"
+"""What this route is called in metrics."""
 
 
 class ActionRoute:
     """The endpoint, an ASGI application of its own."""
 
-    def __init__(self, models: Models, settings: ServeSettings, replica: str) -> None:
+    def __init__(self, models: Models, shadow: Shadow, metrics: Metrics, settings: ServeSettings, replica: str) -> None:
         self._models = models
+        self._shadow = shadow
+        self._metrics = metrics
         self._settings = settings
         self._replica = (REPLICA, replica.encode())
         self.in_flight = 0
@@ -49,15 +57,20 @@ class ActionRoute:
             self.in_flight -= 1
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        begun = perf_counter_ns()
         body = await read_body(scope, receive, self._settings.max_body)
         document = parse_object(body)
         refuse_unknown(document, KEYS)
         ask = read_ask(document, self._settings.max_batch)
         model = scope["path_params"]["model"]
-        version, policy = await self._models.find(model, pinned_version(ask, query(scope).get("version", CHAMPION)))
-        reply = await _reply(ask, body.count(b'"'), version, policy)
+        asked = pinned_version(ask, query(scope).get("version", CHAMPION))
+        version, policy = await self._models.find(model, asked, scope["headers"])
+        reply = await _reply(ask, body.count(b'"'), version, policy, self._shadow.of(model, version))
         reply |= {"model": model, "version": version.number, "sha256": version.sha256}
+        if LINE in scope:
+            answered_by(scope, model, version.number)
         await _send(send, orjson.dumps(reply), self._replica)
+        self._metrics.answered(API, model, version, len(ask.observations), perf_counter_ns() - begun)
 
 
 def query(scope: Scope) -> dict[str, str]:
@@ -66,11 +79,15 @@ def query(scope: Scope) -> dict[str, str]:
     return dict(parse_qsl(text.decode("latin-1"), keep_blank_values=True, max_num_fields=16)) if text else {}
 
 
-async def _reply(ask: Ask, quotes: int, version: LoadedVersion, policy: LoadedPolicy) -> dict[str, Any]:
+async def _reply(
+    ask: Ask, quotes: int, version: LoadedVersion, policy: LoadedPolicy, show: Show | None
+) -> dict[str, Any]:
     plain = is_plain(ask, policy, quotes)
     observations = policy.reader.read(ask.observations, plain)
     state = read_given_state(ask, version, policy, not plain)
     answer = await act_as_asked(ask, policy, observations, state)
+    if show is not None:
+        show(observations, state, None if ask.explore else answer.actions)
     reply = reply_to(ask, answer, observations, policy)
     if answer.state is not None:
         if ask.state is not None:

@@ -33,24 +33,26 @@ LONGEST = 255
 """Characters of an Idempotency-Key."""
 
 
-class _Body(BaseModel):
+class Change(BaseModel):
+    """The body of a call that changes what is served."""
+
     model_config = ConfigDict(extra="forbid", strict=True)
 
     reason: str = Field(default="over HTTP", min_length=1, max_length=2000, pattern=r"^[^\x00]+$")
 
 
-class Move(_Body):
+class Move(Change):
     """The body of a promotion."""
 
     version: int = Field(ge=1, le=MAX_VERSION)
     expected: int | None = Field(default=None, ge=1, le=MAX_VERSION)
 
 
-class Return(_Body):
+class Return(Change):
     """The body of a rollback."""
 
 
-B = TypeVar("B", bound=_Body)
+B = TypeVar("B", bound=Change)
 
 
 class PromotionRoutes:
@@ -64,7 +66,7 @@ class PromotionRoutes:
         """Point an alias at a version. Raises UnknownLeague, UnknownVersion, AliasMoved, KeyReused or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
         alias = check_alias(request.path_params["alias"])
-        body = _parse(Move, await self._body(request))
+        body = parse(Move, await self._body(request))
         expected = body.expected if "expected" in body.model_fields_set else ANY
 
         def change(registry: Registry, actor: str, call: Call) -> AliasEvent:
@@ -77,7 +79,7 @@ class PromotionRoutes:
     async def roll_back(self, request: Request) -> JSONResponse:
         """Return to the champion before. Raises UnknownLeague, NothingToRollBack, KeyReused or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        body = _parse(Return, await self._body(request) or b"{}")
+        body = parse(Return, await self._body(request) or b"{}")
 
         def change(registry: Registry, actor: str, call: Call) -> AliasEvent:
             return registry.rollback(league, actor=actor, reason=body.reason, call=call)
@@ -88,14 +90,19 @@ class PromotionRoutes:
         return await read_body(request.scope, request.receive, self._settings.max_body)
 
     async def _apply(
-        self, request: Request, body: _Body, change: Callable[[Registry, str, Call], AliasEvent]
+        self, request: Request, body: Change, change: Callable[[Registry, str, Call], AliasEvent]
     ) -> JSONResponse:
-        key: Key = request.scope[KEY]
-        asked = f"{request.url.path} {body.model_dump_json(exclude_unset=True)}"
-        digest = hashlib.sha256(asked.encode()).hexdigest()
-        call = Call(owner=key.id, key=_idempotency_key(request), digest=digest)
+        key, call = call_of(request, body)
         event = await self._models.ask(lambda registry: change(registry, key.name, call))
         return JSONResponse(_document(event))
+
+
+def call_of(request: Request, body: Change) -> tuple[Key, Call]:
+    """Who calls, and the name of the call. Raises InvalidInput."""
+    key: Key = request.scope[KEY]
+    asked = f"{request.url.path} {body.model_dump_json(exclude_unset=True)}"
+    digest = hashlib.sha256(asked.encode()).hexdigest()
+    return key, Call(owner=key.id, key=_idempotency_key(request), digest=digest)
 
 
 def _idempotency_key(request: Request) -> str:
@@ -108,7 +115,8 @@ def _idempotency_key(request: Request) -> str:
     return key
 
 
-def _parse(kind: type[B], body: bytes) -> B:
+def parse(kind: type[B], body: bytes) -> B:
+    """The body of a change. Raises InvalidInput."""
     try:
         return kind.model_validate_json(body)
     except ValidationError as error:

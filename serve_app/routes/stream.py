@@ -48,9 +48,11 @@ class StreamRoute:
             check_alias(follows)
             if "version" in asked:
                 raise InvalidInput("version and follow contradict each other: a stream stays, or follows")
-        version, policy = await self._parts.models.find(model, follows or asked.get("version", CHAMPION))
+        version, policy = await self._parts.models.find(
+            model, follows or asked.get("version", CHAMPION), scope["headers"]
+        )
         headers = {b"x-league-version": str(version.number), b"x-league-sha256": version.sha256, REPLICA: self._replica}
-        stream = Stream(self._parts, model, (version, policy), follows, scope.get(KEY))
+        stream = Stream(self._parts, model, (version, policy), follows, scope["headers"], scope.get(KEY))
         return stream, [(name, value.encode()) for name, value in headers.items()]
 
     async def _converse(self, stream: Stream, scope: Scope, receive: Receive, send: Send) -> None:

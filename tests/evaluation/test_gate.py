@@ -1,4 +1,6 @@
+import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from evaluation.gate import Watch, decide, distinct_games, judge
+from evaluation.gate import Watch, decide, distinct_games, floor, judge
 from evaluation.sequential import bounds, elo_estimate, expected_games, gsprt_llr
 from league.config import GateConfig
 from league.results.records import Game, Match
@@ -172,3 +174,31 @@ def _simulate(shares: np.ndarray, gates: int, seed: int) -> tuple[float, float]:
         assert decision.blocks == ends[gate]
         assert (decision.outcome == "promote") == (llrs[gate] >= upper)
     return float((llrs >= upper).mean()), float(ends.mean())
+
+
+ASKS = GateConfig(shadow_agreement=0.9, latency_ms=2.0, shadow_observations=100)
+
+
+@pytest.mark.parametrize(
+    ("shown", "reason"),
+    [
+        ((100, 0, 0.9, 2.0), None),
+        ((99, 0, 1.0, 0.1), "shown 99 observations .* asks for 100"),
+        ((0, 0, None, None), "shown 0 observations"),
+        ((100, 0, 0.899, 2.0), "on 89.9% of 100 observations, .* 90.0%"),
+        ((100, 0, 1.0, 5.0), "within 5 ms, .* 2 ms"),
+        ((100, 1, 1.0, 0.1), "could not answer 1 requests"),
+    ],
+)
+def test_a_floor_asks_for_what_a_shadow_has_shown(shown: tuple[Any, ...], reason: str | None) -> None:
+    told = floor(ASKS, *shown)
+    assert told is None if reason is None else re.search(reason, str(told))
+
+
+def test_without_a_floor_nothing_need_be_shown() -> None:
+    assert floor(GateConfig(), 0, 0, None, None) is None
+
+
+def test_each_floor_stands_alone() -> None:
+    assert floor(GateConfig(shadow_agreement=0.5), 1000, 0, 0.6, 99.0) is None
+    assert floor(GateConfig(latency_ms=1), 1000, 0, 0.0, 0.5) is None

@@ -17,8 +17,10 @@ from evaluation.nightly import nightly
 from evaluation.report import NightReport, Progress, VerdictReport
 from league.config import LeagueConfig
 from league.errors import AlreadyRunning, ConfigError
+from league.histograms import BOUNDS
 from league.registry.database import Database
 from league.registry.registry import Registry
+from league.registry.rows import Shadowing
 from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.evaluation import examples
@@ -309,3 +311,28 @@ def test_a_home_that_cannot_be_written_is_one_sentence(registry: Registry) -> No
 def test_hypotheses_out_of_reach_are_refused_by_name() -> None:
     with pytest.raises(ConfigError, match="elo1"):
         examples.config(gate={"elo1": 400})
+
+
+def test_a_candidate_that_was_no_shadow_is_not_tested_where_its_gate_asks_for_that(tmp_path: Path) -> None:
+    gate = {"shadow_agreement": 0.5, "latency_ms": 10, "shadow_observations": 10}
+    config = examples.config(play={"opening_plies": 2, "copies": 2}, gate=gate)
+    registry = league_of(tmp_path / "home", MIDDLING, STRONG, STRONGEST, config=config)
+    registry.set_alias(examples.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
+    latency = (0, 100, *[0] * (len(BOUNDS) - 1))
+    shown = [Shadowing(examples.LEAGUE, 3, 1, 100, 100, 60, 0, 0, 0, latency, 4_000_000)]
+    registry.report("replica-1", {}, shown)
+    report = nightly(config, registry=registry)
+    assert outcomes(report) == [
+        ("tictactoe@2", "tictactoe@1", "void", False),
+        ("tictactoe@3", "tictactoe@1", "promote", True),
+    ]
+    assert report.verdicts[0].games == 0
+    assert "shown 0 observations as the champion's shadow" in str(report.verdicts[0].note)
+    registry.close()
+
+
+def test_where_there_is_no_champion_there_is_nothing_to_be_the_shadow_of(tmp_path: Path) -> None:
+    config = examples.config(play={"opening_plies": 2, "copies": 2}, gate={"shadow_agreement": 1.0})
+    registry = league_of(tmp_path / "home", STRONG, config=config)
+    assert outcomes(nightly(config, registry=registry)) == [("tictactoe@1", "script:random", "promote", True)]
+    registry.close()

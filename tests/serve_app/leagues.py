@@ -10,8 +10,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from league.config import LeagueConfig
 from league.interface import AgentInterface, Interface
+from league.policies.probes import Probes
 from league.registry.aliases import ANY
-from league.registry.manifest import Manifest, Parity, PolicyManifest, Tensor
+from league.registry.manifest import PROBES, Manifest, Parity, PolicyManifest, Tensor
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
 from league.settings import Storage
@@ -83,9 +84,11 @@ def register(registry: Registry, league: str, policies: dict[str, AgentInterface
     registry.register(_config(league), interface(policies))
 
 
-def publish(registry: Registry, league: str, graphs: dict[str, bytes], source: str) -> VersionRow:
-    """Publish a version of a registered league whose policies are `graphs`."""
-    return registry.publish(league, _builder(registry, league, graphs), source=source)
+def publish(
+    registry: Registry, league: str, graphs: dict[str, bytes], source: str, probes: dict[str, Probes] | None = None
+) -> VersionRow:
+    """Publish a version of a registered league whose policies are `graphs`, with the probes of some of them."""
+    return registry.publish(league, _builder(registry, league, graphs, probes or {}), source=source)
 
 
 def promote(registry: Registry, league: str, version: int) -> None:
@@ -119,7 +122,9 @@ def _config(league: str) -> LeagueConfig:
     return LeagueConfig.from_mapping({"league": league, "environment": {"entry_point": "games.none:none"}})
 
 
-def _builder(registry: Registry, league: str, graphs: dict[str, bytes]) -> Callable[[Path, int], Manifest]:
+def _builder(
+    registry: Registry, league: str, graphs: dict[str, bytes], probes: dict[str, Probes]
+) -> Callable[[Path, int], Manifest]:
     row = registry.league(league)
 
     def build(directory: Path, number: int) -> Manifest:
@@ -127,13 +132,16 @@ def _builder(registry: Registry, league: str, graphs: dict[str, bytes]) -> Calla
         (directory / "training" / "state").write_bytes(b"weights of the trainer")
         for policy, graph in graphs.items():
             (directory / f"{policy}.onnx").write_bytes(graph)
+        for policy, recorded in probes.items():
+            (directory / f"{policy}{PROBES}").write_bytes(recorded.to_bytes())
         return Manifest(
             league=league,
             version=number,
             created_at=datetime.now(UTC),
             interface=row.interface,
             policies={
-                policy: _policy(row.interface.of_policy(policy), policy, graph) for policy, graph in graphs.items()
+                policy: _policy(row.interface.of_policy(policy), policy, graph, policy in probes)
+                for policy, graph in graphs.items()
             },
             environment=row.config.environment,
             environment_digest=row.environment_digest,
@@ -147,7 +155,7 @@ def _builder(registry: Registry, league: str, graphs: dict[str, bytes]) -> Calla
     return build
 
 
-def _policy(spaces: AgentInterface, policy: str, graph: bytes) -> PolicyManifest:
+def _policy(spaces: AgentInterface, policy: str, graph: bytes, has_probes: bool) -> PolicyManifest:
     model = onnx.load_from_string(graph).graph
     inputs, outputs = (tuple(_tensor(value) for value in values) for values in (model.input, model.output))
     return PolicyManifest(
@@ -158,6 +166,7 @@ def _policy(spaces: AgentInterface, policy: str, graph: bytes) -> PolicyManifest
         outputs=outputs,
         state=tuple(tensor for tensor in inputs if tensor.name.startswith("state_in_")),
         parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
+        probes=f"{policy}{PROBES}" if has_probes else None,
     )
 
 

@@ -11,6 +11,9 @@ from league.registry.registry import Registry
 from serve_app.live import Live, logger
 from serve_app.loading import load
 from serve_app.versions import Versions
+from tests.league.policies.graphs import masked_mlp
+from tests.league.policies.test_probes import probes
+from tests.serve_app.leagues import publish
 
 pytestmark = pytest.mark.anyio
 CHAMPION = ("board", "champion")
@@ -95,6 +98,19 @@ async def test_no_damage_goes_live(live: Live, registry: Registry, damage: str) 
     await live.follow({CHAMPION: 2})
     assert number(live) == 1
     assert live.fault("board")
+
+
+@pytest.mark.parametrize(("recorded_of", "answers"), [(3, True), (4, False)], ids=["its own", "another's"])
+async def test_a_version_answers_its_probes_before_it_goes_live(
+    live: Live, registry: Registry, recorded_of: int, answers: bool
+) -> None:
+    await live.follow({CHAMPION: 1})
+    recorded = {"shared": probes(seed=recorded_of)}
+    new = publish(registry, "board", {"shared": masked_mlp(seed=3)}, "run/probed", recorded).number
+    await live.follow({CHAMPION: new})
+    assert number(live) == (new if answers else 1)
+    assert (live.fault("board") is None) == answers
+    assert answers or "probe observations" in str(live.fault("board"))
 
 
 async def test_going_back_clears_the_fault(live: Live, registry: Registry) -> None:

@@ -17,7 +17,9 @@ import pytest
 from league.errors import UnknownLeague
 from league.policies.onnx import OnnxPolicy
 from league.policies.remote import RemotePolicy
+from league.registry.following import await_traffic
 from league.registry.registry import Registry
+from league.registry.rows import Portion
 from league.settings import Storage
 from serve_app import haproxy
 from serve_app.launch import running
@@ -114,6 +116,44 @@ def test_every_replica_answers_and_says_so(url: str, served: Registry) -> None:
         )
         assert found == {row["replica"] for row in client.get("/v1/leagues/board").json()["replicas"]}
         assert client.get("/v1/health/ready").status_code == 200
+
+
+def test_one_scrape_tells_of_all_replicas(url: str, served: Registry) -> None:
+    with httpx.Client(base_url=url) as client:
+        for _ in range(50):
+            client.post(ACTION, json={"observation": BOARD})
+
+        def replicas() -> set[str]:
+            lines = client.get("/metrics").text.splitlines()
+            found = [line for line in lines if line.startswith("league_request_seconds_count{")]
+            return {line.split('replica="')[1].split('"')[0] for line in found}
+
+        until(lambda: len(replicas()) == 2)
+
+
+def test_traffic_is_moved_while_requests_go_on(url: str, served: Registry) -> None:
+    def caller() -> Callable[[], int]:
+        client = httpx.Client(base_url=url, headers={"x-league-key": f"caller-{threading.get_ident()}"})
+
+        def call() -> int:
+            reply = client.post(ACTION, json={"observation": BOARD})
+            assert reply.status_code == 200, reply.text
+            return int(reply.json()["version"])
+
+        return call
+
+    promote(served, "board", 1)
+    with load(caller, callers=4) as seen:
+        for share in (1.0, 0.0, 1.0):
+            canary, shadow = Portion(2, share), Portion(3, 1.0)
+            setting = served.set_traffic("board", canary=canary, shadow=shadow, actor="test", reason="test")
+            await_traffic(served, setting, 30)
+            assert caller()() == (2 if share else 1)
+        off = served.set_traffic("board", canary=None, shadow=None, actor="test", reason="test")
+        await_traffic(served, off, 30)
+    assert seen.failures == []
+    assert seen.versions.keys() == {1, 2}
+    until(lambda: [(one.candidate, one.failed) for one in served.shadowings("board")] == [(3, 0)])
 
 
 def test_the_client_acts_as_the_graph_does(url: str) -> None:

@@ -11,9 +11,11 @@ from league.environments.building import interface
 from league.errors import ParityError
 from league.policies import load
 from league.policies.onnx import OnnxPolicy
+from league.policies.probes import Probes
 from league.registry.manifest import TRAINING
 from league.registry.registry import Registry
 from league.settings import Storage
+from league.spaces import Discrete
 from league.stack import installed
 from tests.training.leagues import solvable, tictactoe
 from training import publish as publishing
@@ -69,6 +71,10 @@ def test_a_version_says_all_of_itself_and_acts_as_the_training_state(registry: R
     assert manifest.stack == installed()
     assert manifest.policies["shared"].parity.observations >= 2000
     artefact = registry.fetch("tictactoe", number)
+    probes = Probes.from_bytes((artefact / "shared.probes.npz").read_bytes(), "probes")
+    assert len(probes) == 32
+    assert len({board.tobytes() for board in probes.observations["observation"]}) > 16
+    probes.check(OnnxPolicy(artefact / "shared.onnx"), Discrete(n=9), "probes")
     assert (artefact / TRAINING / "algorithm_state.pkl").is_file()
     module = load_modules(artefact / TRAINING, LEAGUE, interface(LEAGUE))["shared"]
     policy = OnnxPolicy(artefact / "shared.onnx", manifest.policies["shared"])
@@ -93,6 +99,10 @@ def test_a_policy_with_a_memory_is_loaded_with_its_state(tmp_path: Path) -> None
         source = Checkpoint(tmp_path / "0", source="run/0", steps=0)
         row = publish(source, registry=registry, config=league, interface=described, parent=None, git_commit=None)
         assert [tensor.name for tensor in row.manifest.policies["shared"].state] == ["state_in_0", "state_in_1"]
+        probes = Probes.from_bytes(
+            (registry.fetch("remembering", row.number) / "shared.probes.npz").read_bytes(), "probes"
+        )
+        assert probes.state["state_in_1"].any(), "from the middle of episodes, too"
         policy = load(row.ref, registry=registry)
         batch, state = {"observation": np.array([1, 0])}, None
         seen = []

@@ -1,0 +1,28 @@
+"""GET /metrics: all replicas, for Prometheus, whichever of them is asked."""
+
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.requests import Request
+from starlette.responses import Response
+
+from league.registry.registry import Registry
+from serve_app.exposition import text
+from serve_app.models import Models
+from serve_app.settings import ACKNOWLEDGED_WITHIN
+
+
+class MetricsRoute:
+    """Replicas stand behind one address, so whoever is asked answers for all, from what each wrote last.
+
+    It answers for itself, too, from what it wrote: a counter must not be seen to fall when another is asked next.
+    """
+
+    def __init__(self, models: Models) -> None:
+        self._models = models
+
+    async def metrics(self, _: Request) -> Response:
+        """Prometheus's text format. Raises StorageError."""
+        return Response(await self._models.ask(_metrics), media_type=CONTENT_TYPE_LATEST)
+
+
+def _metrics(registry: Registry) -> bytes:
+    return text(registry.reports(since=ACKNOWLEDGED_WITHIN))

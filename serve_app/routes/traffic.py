@@ -1,0 +1,153 @@
+"""Canary and shadow of a league: how they are set, and what they have shown.
+
+GET   /v1/leagues/{league}/traffic
+POST  /v1/leagues/{league}/traffic    {"canary": {"version": "candidate", "share": 0.05}, "shadow": null, "reason": "…"}
+
+`version` is a number or an alias. null ends a canary or shadow; what is left out stays. As promotions do, it takes a
+key of scope `promote` and an `Idempotency-Key`.
+"""
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from league.histograms import Histogram
+from league.refs import check_slug, parse_version
+from league.registry.registry import Registry
+from league.registry.rows import Portion, Shadowing, Traffic
+from league.registry.traffic import KEEP, Unchanged
+from serve_app.bodies import read_body
+from serve_app.metrics import Metrics, Report
+from serve_app.models import Models
+from serve_app.routes.promotion import Change, call_of, parse
+from serve_app.settings import ACKNOWLEDGED_WITHIN, ServeSettings
+from serve_app.shadow import Shadow
+
+
+class Share(BaseModel):
+    """A version and its share of requests."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    version: int | str
+    share: float = Field(ge=0, le=1)
+
+
+class Setting(Change):
+    """The body of a change."""
+
+    canary: Share | None = None
+    shadow: Share | None = None
+
+
+class TrafficRoutes:
+    """The endpoints."""
+
+    def __init__(self, models: Models, metrics: Metrics, shadow: Shadow, settings: ServeSettings, replica: str) -> None:
+        self._models = models
+        self._metrics = metrics
+        self._shadow = shadow
+        self._settings = settings
+        self._replica = replica
+
+    async def show(self, request: Request) -> JSONResponse:
+        """The setting, who follows it, and statistics of this replica and of all. Raises UnknownLeague."""
+        league = check_slug("league", request.path_params["league"])
+        here = [one for one in self._shadow.shadowings() if one.league == league]
+        mine = {"replica": self._replica} | _statistics(league, [self._metrics.report()], here)
+        document = await self._models.ask(lambda registry: _document(registry, league))
+        return JSONResponse(document | {"here": mine})
+
+    async def put(self, request: Request) -> JSONResponse:
+        """Set canary or shadow. Raises UnknownLeague, UnknownVersion, UnknownAlias, KeyReused or InvalidInput."""
+        league = check_slug("league", request.path_params["league"])
+        body = parse(Setting, await read_body(request.scope, request.receive, self._settings.max_body))
+        canary = _portion(body.canary) if "canary" in body.model_fields_set else KEEP
+        shadow = _portion(body.shadow) if "shadow" in body.model_fields_set else KEEP
+        key, call = call_of(request, body)
+        setting = await self._models.ask(
+            lambda registry: registry.set_traffic(
+                league, canary=canary, shadow=shadow, actor=key.name, reason=body.reason, call=call
+            )
+        )
+        return JSONResponse(setting_document(setting))
+
+
+def setting_document(setting: Traffic) -> dict[str, Any]:
+    """A setting as JSON."""
+    return {
+        "league": setting.league,
+        "setting": setting.id,
+        "canary": _portion_document(setting.canary),
+        "shadow": _portion_document(setting.shadow),
+        "actor": setting.actor,
+        "reason": setting.reason,
+        "at": setting.at and setting.at.isoformat(),
+    }
+
+
+def shadow_document(shadowing: Shadowing) -> dict[str, Any]:
+    """What a shadow has shown, as JSON; times are in milliseconds."""
+    return {
+        "candidate": shadowing.candidate,
+        "champion": shadowing.champion,
+        "requests": shadowing.requests,
+        "observations": shadowing.observations,
+        "agreed": shadowing.agreed,
+        "agreement": shadowing.agreement,
+        "failed": shadowing.failed,
+        "dropped": shadowing.dropped,
+        "skipped": shadowing.skipped,
+        "latency_ms": _quantiles(Histogram(shadowing.latency, shadowing.ns)),
+    }
+
+
+def _portion(share: Share | None) -> Portion | Unchanged | None:
+    if share is None:
+        return None
+    return Portion(parse_version(str(share.version)), share.share)
+
+
+def _portion_document(portion: Portion | None) -> dict[str, Any] | None:
+    return None if portion is None else {"version": portion.version, "share": portion.share}
+
+
+def _document(registry: Registry, league: str) -> dict[str, Any]:
+    setting = registry.traffic(league)
+    said = registry.acknowledgements(league, since=ACKNOWLEDGED_WITHIN)
+    reports = list(registry.reports(since=ACKNOWLEDGED_WITHIN).values())
+    replicas = [{"replica": one.replica, "follows": one.traffic == setting.id, "fault": one.fault} for one in said]
+    statistics = _statistics(league, reports, registry.shadowings(league))
+    return setting_document(setting) | {"replicas": replicas, "all": statistics}
+
+
+def _statistics(league: str, reports: list[Report], shadowings: list[Shadowing]) -> dict[str, Any]:
+    latencies: dict[int, Histogram] = {}
+    canaried: dict[int, int] = {}
+    for report in reports:
+        for (of, _, version, _), value in report.get("league_request_seconds", ()):
+            if of == league:
+                ns = int(1e9 * value["sum"])
+                latencies.setdefault(int(version), Histogram()).merge(value["counts"], ns)
+        for (of, version), count in report.get("league_canary_requests_total", ()):
+            if of == league:
+                canaried[int(version)] = canaried.get(int(version), 0) + count
+    return {
+        "versions": [
+            {
+                "version": version,
+                "requests": latency.count,
+                "as_canary": canaried.get(version, 0),
+                "latency_ms": _quantiles(latency),
+            }
+            for version, latency in sorted(latencies.items())
+        ],
+        "shadows": [shadow_document(one) for one in shadowings],
+    }
+
+
+def _quantiles(histogram: Histogram) -> dict[str, float | None]:
+    found = {name: histogram.quantile(share) for name, share in (("p50", 0.5), ("p95", 0.95), ("p99", 0.99))}
+    return {name: None if value == float("inf") else value for name, value in found.items()}

@@ -1,0 +1,155 @@
+"""What is deployed agrees: with deploy.yaml, with the metrics that there are, and with what operators are told."""
+
+import json
+import re
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from serve_app.exposition import METRICS
+from serve_app.settings import ServeSettings
+
+ROOT = Path(__file__).parent.parent
+DEPLOY = yaml.safe_load((ROOT / "deploy.yaml").read_text())
+SERVICE, BUDGET = yaml.safe_load_all((ROOT / "deploy/kuberay.yaml").read_text())
+SERVED = yaml.safe_load(SERVICE["spec"]["serveConfigV2"])
+CLUSTER = SERVICE["spec"]["rayClusterConfig"]
+HEAD = CLUSTER["headGroupSpec"]["template"]
+(WORKERS,) = CLUSTER["workerGroupSpecs"]
+RULES = [
+    rule
+    for group in yaml.safe_load((ROOT / "deploy/prometheus-rules.yaml").read_text())["groups"]
+    for rule in group["rules"]
+]
+DASHBOARD = json.loads((ROOT / "deploy/grafana/policy-league.json").read_text())
+OPERATIONS = (ROOT / "docs/operations.md").read_text()
+
+
+def exports() -> dict[str, str]:
+    """The environment that deploy.yaml lists."""
+    found = re.findall(r"^#\s+export (\w+)=(\"[^\"]*\"|\S+)", (ROOT / "deploy.yaml").read_text(), flags=re.M)
+    return {name: value.strip('"') for name, value in found}
+
+
+def test_the_cluster_serves_what_one_machine_does() -> None:
+    expected = json.loads(json.dumps(DEPLOY))
+    expected["http_options"]["host"] = "0.0.0.0"
+    expected["applications"][0]["args"] = {"grpc_local_only": False}
+    expected["applications"][0]["deployments"][0]["num_replicas"] = 4
+    assert SERVED == expected
+
+
+@pytest.mark.parametrize("document", [DEPLOY, SERVED], ids=["deploy.yaml", "kuberay.yaml"])
+def test_ray_and_our_settings_take_it(document: Any) -> None:
+    from ray.serve.schema import ServeDeploySchema
+
+    ServeDeploySchema.model_validate(document)
+    settings = ServeSettings.model_validate(document["applications"][0]["args"])
+    deployment = document["applications"][0]["deployments"][0]
+    assert deployment["graceful_shutdown_timeout_s"] >= 40
+    assert settings.timeout < int(exports()["RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S"])
+
+
+@pytest.mark.parametrize("template", [HEAD, WORKERS["template"]], ids=["head", "workers"])
+def test_every_pod_has_the_environment_the_files_and_the_image(template: Any) -> None:
+    (container,) = template["spec"]["containers"]
+    environment = {entry["name"]: entry.get("value") for entry in container["env"]}
+    wanted = exports()
+    assert {name: value for name, value in environment.items() if name in wanted and name != "LEAGUE_HOME"} == {
+        name: value
+        for name, value in wanted.items()
+        if name not in ("LEAGUE_HOME", "RAY_AUTH_MODE")  # the operator sets the latter, with the token
+    }
+    assert CLUSTER["authOptions"] == {"mode": "token"}
+    assert "LEAGUE_DATABASE_URL" in environment, "SQLite is for one machine"
+    (mount,), (volume,) = container["volumeMounts"], template["spec"]["volumes"]
+    assert mount["name"] == volume["name"]
+    assert str(environment["LEAGUE_ARTIFACTS"]).startswith(mount["mountPath"])
+    assert {port["containerPort"] for port in container["ports"]} == {8000, 8001}
+    assert container["image"] == HEAD["spec"]["containers"][0]["image"]
+
+
+def test_the_pinned_ray_is_the_cluster_s() -> None:
+    constraints = (ROOT / "constraints.txt").read_text()
+    assert f"ray=={CLUSTER['rayVersion']}\n" in constraints
+
+
+def test_a_drain_takes_one_pod_and_lets_it_finish() -> None:
+    selector = BUDGET["spec"]["selector"]["matchLabels"]
+    assert selector.items() <= WORKERS["template"]["metadata"]["labels"].items()
+    assert BUDGET["spec"]["maxUnavailable"] < WORKERS["replicas"] == WORKERS["minReplicas"]
+    deployment = SERVED["applications"][0]["deployments"][0]
+    spec = WORKERS["template"]["spec"]
+    assert spec["terminationGracePeriodSeconds"] > deployment["graceful_shutdown_timeout_s"]
+    assert spec["containers"][0]["readinessProbe"]["httpGet"]["path"] == "/v1/health/ready"
+
+
+def queries() -> list[tuple[str, str]]:
+    """(where it is, query) of the dashboard and the alerts."""
+    panels = [(panel["title"], target["expr"]) for panel in DASHBOARD["panels"] for target in panel["targets"]]
+    variables = [
+        (variable["name"], variable["query"])
+        for variable in DASHBOARD["templating"]["list"]
+        if variable["type"] == "query"
+    ]
+    return [*panels, *variables, *((rule["alert"], rule["expr"]) for rule in RULES)]
+
+
+def samples() -> dict[str, tuple[str, ...]]:
+    """Name of each sample in the exposition → its labels."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name, metric in METRICS.items():
+        labels = (*metric.labels, "replica")
+        if metric.kind == "histogram":
+            found |= {f"{name}_bucket": (*labels, "le"), f"{name}_sum": labels, f"{name}_count": labels}
+        else:
+            found[name] = labels
+    return found
+
+
+@pytest.mark.parametrize(("where", "query"), queries())
+def test_each_query_names_metrics_and_labels_that_there_are(where: str, query: str) -> None:
+    known = samples()
+    named = re.findall(r"\b(league_\w+)", query)
+    assert named or "up{" in query
+    assert set(named) <= known.keys(), where
+    for name, selector in re.findall(r"\b(league_\w+)\{([^}]*)\}", query):
+        assert set(re.findall(r"(\w+)\s*=~?\"", selector)) <= set(known[name]), where
+    grouped = chain.from_iterable(re.split(r",\s*", labels) for labels in re.findall(r"by \(([^)]*)\)", query))
+    assert set(grouped) <= set(chain.from_iterable(known[name] for name in named)), where
+
+
+def test_every_metric_is_on_the_dashboard_or_in_an_alert() -> None:
+    shown = " ".join(query for _, query in queries())
+    assert {name for name in METRICS if name not in shown} == set()
+
+
+def test_panels_do_not_overlap() -> None:
+    cells = [
+        (x, y)
+        for panel in DASHBOARD["panels"]
+        for place in [panel["gridPos"]]
+        for x in range(place["x"], place["x"] + place["w"])
+        for y in range(place["y"], place["y"] + place["h"])
+    ]
+    assert len(set(cells)) == len(cells)
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
+
+
+def test_every_alert_is_explained() -> None:
+    explained = re.findall(r"^\| `(League\w+)` \|", OPERATIONS, flags=re.M)
+    assert explained == [rule["alert"] for rule in RULES]
+    assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in RULES)
+
+
+def test_every_metric_is_explained() -> None:
+    assert set(re.findall(r"^\| `(league_\w+)` \|", OPERATIONS, flags=re.M)) == METRICS.keys()
+
+
+def test_every_serving_setting_is_explained_with_its_default() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| `(.*?)` \|", OPERATIONS, flags=re.M))
+    defaults = {name: field.default for name, field in ServeSettings.model_fields.items()}
+    assert {name: yaml.safe_load(value) for name, value in rows.items()} == defaults
