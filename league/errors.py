@@ -8,10 +8,13 @@ LeagueError
 │   ├── IllegalMask             an action mask that is not one, or allows nothing
 │   ├── IllegalAction           an action outside the mask or the space
 │   ├── InvalidReward           a reward that is no finite number
+│   ├── InvalidState            recurrent state that no reply gave, or that is another version's
+│   ├── BodyTooLarge            a request, or a batch in it, beyond the limit
 │   └── EnvironmentMismatch     an environment, script or version that does not belong together
 ├── NotFound
 │   ├── UnknownLeague
 │   ├── UnknownVersion
+│   ├── VersionRetired          a version that is served no more
 │   ├── UnknownAlias
 │   ├── UnknownPolicy
 │   └── UnknownKey
@@ -23,6 +26,11 @@ LeagueError
 │   ├── NameTaken
 │   ├── KeyReused               an Idempotency-Key that stands for another call
 │   └── AlreadyRunning          a second one of what may run once
+├── Unauthenticated           no API key where one is needed, or one that opens nothing
+├── Forbidden                 an API key that is not for this
+├── RateLimited               an API key that calls more often than it may
+├── Overloaded                more requests at once than a server takes
+├── DeadlineExceeded          a request that was not answered in its time
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
 ├── WorkerLost                worker processes that die again and again
@@ -83,6 +91,18 @@ class InvalidReward(InvalidInput):
     code = "invalid_reward"
 
 
+class InvalidState(InvalidInput):
+    """Recurrent state that no reply gave, or that belongs to another policy or version."""
+
+    code = "invalid_state"
+
+
+class BodyTooLarge(InvalidInput):
+    """A body, or a batch in it, beyond the limit."""
+
+    code = "body_too_large"
+
+
 class EnvironmentMismatch(InvalidInput):
     """An environment, script or version that does not fit the league."""
 
@@ -105,6 +125,12 @@ class UnknownVersion(NotFound):
     """The league has no ready version of that number."""
 
     code = "unknown_version"
+
+
+class VersionRetired(NotFound):
+    """A version that was served once and is no more: an episode that is pinned to it cannot go on."""
+
+    code = "version_retired"
 
 
 class UnknownAlias(NotFound):
@@ -171,6 +197,40 @@ class AlreadyRunning(Conflict):
     """Another process does what only one may do."""
 
     code = "already_running"
+
+
+class Unauthenticated(LeagueError):
+    """No API key where one is needed, or one that opens nothing."""
+
+    code = "unauthenticated"
+
+
+class Forbidden(LeagueError):
+    """An API key that is not for this."""
+
+    code = "forbidden"
+
+
+class RateLimited(LeagueError):
+    """An API key that calls more often than it may; `wait` is in seconds."""
+
+    code = "rate_limited"
+
+    def __init__(self, message: str, wait: float = 1.0) -> None:
+        super().__init__(message)
+        self.wait = wait
+
+
+class Overloaded(LeagueError):
+    """More requests at once than a replica takes."""
+
+    code = "overloaded"
+
+
+class DeadlineExceeded(LeagueError):
+    """A request that was not answered in the time that it had."""
+
+    code = "deadline_exceeded"
 
 
 class ArtifactCorrupt(LeagueError):

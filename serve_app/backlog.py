@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Callable
 from time import monotonic
 
-from serve_app.error_handlers import Overloaded
+from league.errors import Overloaded
 
 NEVER = float("-inf")
 

@@ -5,7 +5,8 @@ from typing import Any
 import orjson
 from starlette.types import Receive, Scope
 
-from serve_app.error_handlers import BodyTooLarge, MalformedBody, UnsupportedMediaType
+from league.errors import BodyTooLarge
+from serve_app.error_handlers import MalformedBody, UnsupportedMediaType
 from serve_app.observations import kind
 
 JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")

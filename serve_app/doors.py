@@ -13,19 +13,12 @@ from typing import Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import InvalidInput, LeagueError
+from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
 from serve_app import permissions
 from serve_app.backlog import Backlog
 from serve_app.bodies import IS_READ
 from serve_app.deadlines import Expired, within
-from serve_app.error_handlers import (
-    BodyTooSlow,
-    DeadlineExceeded,
-    ErrorHandlers,
-    Forbidden,
-    RateLimited,
-    Unauthenticated,
-)
+from serve_app.error_handlers import BodyTooSlow, ErrorHandlers
 from serve_app.keyring import Key, Keyring
 from serve_app.permissions import Need
 from serve_app.settings import ServeSettings

@@ -16,12 +16,18 @@ from starlette.responses import Response
 
 from league.errors import (
     ArtifactCorrupt,
+    BodyTooLarge,
     Conflict,
+    DeadlineExceeded,
+    Forbidden,
     InvalidInput,
     LeagueError,
     NotFound,
     NotReady,
+    Overloaded,
+    RateLimited,
     StorageError,
+    Unauthenticated,
 )
 
 logger = logging.getLogger("ray.serve.policy_league")
@@ -33,56 +39,16 @@ class MalformedBody(InvalidInput):
     code = "malformed_body"
 
 
-class BodyTooLarge(InvalidInput):
-    """A body, or a batch in it, beyond the limit."""
-
-    code = "body_too_large"
-
-
 class UnsupportedMediaType(InvalidInput):
     """A body that says that it is not JSON."""
 
     code = "unsupported_media_type"
 
 
-class Overloaded(LeagueError):
-    """More requests at once than a replica takes."""
-
-    code = "overloaded"
-
-
-class Unauthenticated(LeagueError):
-    """No API key where one is needed, or one that opens nothing."""
-
-    code = "unauthenticated"
-
-
-class Forbidden(LeagueError):
-    """An API key that is not for this."""
-
-    code = "forbidden"
-
-
-class RateLimited(LeagueError):
-    """An API key that calls more often than it may; `wait` is in seconds."""
-
-    code = "rate_limited"
-
-    def __init__(self, message: str, wait: float = 1.0) -> None:
-        super().__init__(message)
-        self.wait = wait
-
-
 class BodyTooSlow(LeagueError):
     """A body that has not arrived in time."""
 
     code = "body_too_slow"
-
-
-class DeadlineExceeded(LeagueError):
-    """A request that was not answered in the time that it had."""
-
-    code = "deadline_exceeded"
 
 
 STATUSES: dict[type[LeagueError], int] = {

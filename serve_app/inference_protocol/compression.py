@@ -6,7 +6,8 @@ A body counts against the limit as it is after decompression, which stops there:
 import asyncio
 import zlib
 
-from serve_app.error_handlers import BodyTooLarge, MalformedBody, UnsupportedMediaType
+from league.errors import BodyTooLarge
+from serve_app.error_handlers import MalformedBody, UnsupportedMediaType
 
 WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 """Of zlib, which tells the formats apart by them."""

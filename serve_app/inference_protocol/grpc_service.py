@@ -7,10 +7,9 @@ import grpc
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import Message
 
-from league.errors import ArtifactCorrupt, NotFound, NotReady, StorageError
+from league.errors import ArtifactCorrupt, BodyTooLarge, NotFound, NotReady, StorageError
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.doors import Doors
-from serve_app.error_handlers import BodyTooLarge
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.catalogue import Catalogue, Document
 from serve_app.inference_protocol.grpc_messages import read_request, write_response

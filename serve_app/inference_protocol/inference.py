@@ -9,11 +9,10 @@ from weakref import WeakKeyDictionary
 
 from numpy.typing import NDArray
 
-from league.errors import InvalidInput
+from league.errors import InvalidInput, Overloaded
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.policies.policy import Actions
 from league.refs import CHAMPION
-from serve_app.error_handlers import Overloaded
 from serve_app.inference_protocol.signature import Signature, signature_of
 from serve_app.inference_protocol.statistics import Statistics
 from serve_app.inference_protocol.tensors import Tensor, read_inputs

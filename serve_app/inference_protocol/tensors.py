@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from league.errors import ObservationError
+from league.errors import BodyTooLarge, ObservationError
 from league.spaces import ACTION_MASK, check, check_mask
-from serve_app.error_handlers import BodyTooLarge
 from serve_app.inference_protocol.datatypes import from_bytes
 from serve_app.inference_protocol.signature import Port, Signature
 

@@ -20,12 +20,11 @@ import orjson
 from numpy.typing import NDArray
 from starlette.types import Receive, Scope, Send
 
-from league.errors import InvalidInput, ObservationError
+from league.errors import BodyTooLarge, InvalidInput, ObservationError, Overloaded
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from league.seeds import generator
 from serve_app.bodies import parse_object, read_body
-from serve_app.error_handlers import BodyTooLarge, Overloaded
 from serve_app.loading import LoadedPolicy
 from serve_app.models import Models
 from serve_app.observations import kind, read_state, refuse_strings

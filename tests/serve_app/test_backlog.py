@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
+from league.errors import Overloaded
 from serve_app.backlog import Backlog
-from serve_app.error_handlers import Overloaded
 
 pytestmark = pytest.mark.anyio
 LIMIT, PATIENCE = 3, 0.1

@@ -12,10 +12,10 @@ import httpx
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
+from league.errors import Overloaded
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Server
-from serve_app.error_handlers import Overloaded
 from serve_app.settings import ServeSettings
 from tests.serve_app.conftest import QUICK
 from tests.serve_app.leagues import everything

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from serve_app.error_handlers import BodyTooLarge, MalformedBody
+from league.errors import BodyTooLarge
+from serve_app.error_handlers import MalformedBody
 from serve_app.inference_protocol.compression import WORTHWHILE, compressed, decompressed
 
 
