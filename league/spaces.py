@@ -174,6 +174,10 @@ def check(name: str, array: NDArray, leaf: Leaf) -> NDArray:
 
 def check_mask(mask: NDArray) -> None:
     """Raise IllegalMask unless each row of `mask` (k, n) holds only 0 and 1, and at least one 1."""
+    if len(mask) == 1 and mask.itemsize == 1:
+        row = mask.tobytes()
+        if b"\1" in row and not row.strip(b"\0\1"):  # the common case, at a tenth of the cost
+            return
     if ((mask != 0) & (mask != 1)).any():
         raise IllegalMask("action_mask holds something other than 0 and 1")
     if not mask.any(axis=-1).all():

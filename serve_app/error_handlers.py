@@ -1,7 +1,7 @@
 """Errors become HTTP answers here, once: a status, a stable `code`, and a sentence.
 
-InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415) · Unauthenticated 401 · Forbidden 403 · NotFound 404
-BodyTooSlow 408 · Conflict 409 · Overloaded, RateLimited 429 with Retry-After · DeadlineExceeded 504
+InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415) · Unauthenticated 401 · Forbidden 403
+NotFound 404 (VersionRetired 410) · BodyTooSlow 408 · Conflict 409 · Overloaded, RateLimited 429 with Retry-After · DeadlineExceeded 504
 NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · anything else 500
 """
 
@@ -28,6 +28,7 @@ from league.errors import (
     RateLimited,
     StorageError,
     Unauthenticated,
+    VersionRetired,
 )
 
 logger = logging.getLogger("ray.serve.policy_league")
@@ -58,6 +59,7 @@ STATUSES: dict[type[LeagueError], int] = {
     Unauthenticated: 401,
     Forbidden: 403,
     NotFound: 404,
+    VersionRetired: 410,
     BodyTooSlow: 408,
     Conflict: 409,
     Overloaded: 429,

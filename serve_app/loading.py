@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from league.errors import ArtifactCorrupt, InvalidInput, UnknownPolicy
+from league.errors import ArtifactCorrupt, InvalidInput, UnknownPolicy, VersionRetired
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.registry.manifest import PolicyManifest
@@ -49,13 +49,21 @@ class LoadedVersion:
             raise UnknownPolicy(f"{self.league}@{self.number} {asked}; known: {', '.join(self.policies)}")
         return self.policies[name]
 
+    def model(self, policy: LoadedPolicy) -> str:
+        """`{league}.{policy}`, the name of one of its policies."""
+        return f"{self.league}.{next(name for name, one in self.policies.items() if one is policy)}"
+
 
 def load(registry: Registry, league: str, number: int, inline: float) -> LoadedVersion:
     """Load a version. Blocks; `inline` is the time in seconds that inference may take on the event loop.
 
-    Raises UnknownLeague, UnknownVersion, ArtifactCorrupt or StorageError.
+    Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
     """
     version = registry.version(league, number)
+    if registry.artifacts.is_purged(league, number):
+        raise VersionRetired(
+            f"{version.ref} was retired: its files were removed, and a new episode needs another version"
+        )
     registry.artifacts.verify(league, number, version.sha256)
     policies = {}
     for name, manifest in version.manifest.policies.items():

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
 
-from league.errors import NotReady, UnknownAlias
+from league.errors import NotReady, UnknownAlias, VersionRetired
 from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
 from league.registry.registry import Registry
 from serve_app.live import Live
@@ -32,8 +32,8 @@ class Models:
     async def find(self, model: str, version: str = CHAMPION) -> tuple[LoadedVersion, LoadedPolicy]:
         """What `model` (`{league}` or `{league}.{policy}`) is at `version`, a number or an alias.
 
-        Raises InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, ArtifactCorrupt or
-        StorageError; NotReady for a league without a champion.
+        Raises InvalidReference, UnknownLeague, UnknownVersion, VersionRetired, UnknownAlias, UnknownPolicy,
+        ArtifactCorrupt or StorageError; NotReady for a league without a champion.
         """
         ref, asked = policy_ref(model), version_of(version)
         if isinstance(asked, int):
@@ -58,4 +58,7 @@ class Models:
             if alias != CHAMPION:
                 raise
             raise NotReady(f"league {league} has no champion yet: promote a version first") from error
-        return await self._versions.get(league, row.number)
+        try:
+            return await self._versions.get(league, row.number)
+        except VersionRetired as error:
+            raise NotReady(f"{league}@{alias} names a version that was retired: {row.number}") from error

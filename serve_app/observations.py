@@ -1,4 +1,4 @@
-"""JSON values of an observation space ↔ the arrays that a policy's graph takes."""
+"""JSON values of an observation space → the arrays that a policy's graph takes."""
 
 from collections.abc import Iterable, KeysView, Sequence
 from typing import Any
@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from league.errors import ObservationError
 from league.spaces import ACTION_MASK, Leaf, Space, check, check_mask, inputs, paths
+from serve_app.encoded import decode, is_encoded
 
 JSON_KINDS = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", int: "a number", float: "a number"}
 
 
 class ObservationReader:
-    """Reads observations of one space: nested lists, in objects where the space is a Dict."""
+    """Reads observations of one space: leaves as nested lists or base64, in objects where the space is a Dict."""
 
     def __init__(self, space: Space) -> None:
         keys = paths(space)
@@ -28,16 +29,19 @@ class ObservationReader:
         """How many keys the objects of one observation have."""
         return sum(len(keys) for keys in self._objects.values())
 
-    def read(self, observations: Sequence[Any]) -> dict[str, NDArray]:
+    def read(self, observations: Sequence[Any], is_plain: bool = False) -> dict[str, NDArray]:
         """A batch for the graph, checked. Raises ObservationError or IllegalMask.
 
-        No value may be a string: see `refuse_strings`.
+        is_plain: no value is a string, so that nothing is base64. NumPy must see no string: see `refuse_strings`.
         """
         for observation in observations:
             self._check_objects(observation)
         arrays = {}
         for name, path, leaf in self.leaves:
-            arrays[name] = check(name, _array(name, [_at(value, path) for value in observations], leaf), leaf)
+            rows = [_at(value, path) for value in observations]
+            if not is_plain:
+                rows = [_decoded(name, row, leaf) for row in rows]
+            arrays[name] = check(name, _array(name, rows, leaf), leaf)
         if self.is_masked:
             check_mask(arrays[ACTION_MASK])
         return arrays
@@ -107,6 +111,14 @@ def _objects(leaf_paths: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], Key
 def _at(value: Any, path: tuple[str, ...]) -> Any:
     for key in path:
         value = value[key]
+    return value
+
+
+def _decoded(name: str, value: Any, leaf: Leaf) -> Any:
+    """An array if the leaf is base64, else what it is, if there is no string in it."""
+    if is_encoded(value):
+        return decode(name, value, leaf)
+    refuse_strings(value)
     return value
 
 

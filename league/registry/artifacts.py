@@ -66,6 +66,15 @@ class ArtifactStore:
             with disk_faults(directory), suppress(FileNotFoundError):
                 shutil.rmtree(directory)
 
+    def is_purged(self, league: str, number: int) -> bool:
+        """Whether the whole directory of a version is gone, while that of its league is there: it was removed.
+
+        Where the league's is gone too, the disk may just not be mounted.
+        """
+        directory = self.path(league, number)
+        with disk_faults(directory):
+            return directory.parent.is_dir() and not directory.is_dir()
+
     def verify(self, league: str, number: int, sha256: str) -> Path:
         """The directory of a version whose every file is as it was published. Raises ArtifactCorrupt."""
         directory = self.path(league, number)

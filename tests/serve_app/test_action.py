@@ -107,8 +107,9 @@ def test_other_spaces(unchanging: TestClient) -> None:
     assert act(unchanging, "nested", observations=[nested])["actions"] == [0]
 
 
-def test_state_goes_in_and_comes_out(unchanging: TestClient) -> None:
-    state, actions = None, []
+def test_state_as_arrays_goes_in_and_comes_out(unchanging: TestClient) -> None:
+    state: dict[str, Any] = {}
+    actions = []
     for _ in range(4):
         reply = act(unchanging, "memory", observation=[1], state=state)
         state = reply["state"]
@@ -116,7 +117,9 @@ def test_state_goes_in_and_comes_out(unchanging: TestClient) -> None:
     assert (actions, state) == ([0, 0, 1, 1], {"state_in_0": [[4.0]]})
     assert refused(unchanging, {"observation": [1], "state": {"state_in_0": [[1], [2]]}}, model="memory")
     assert refused(unchanging, {"observation": [1], "state": {"other": 1}}, model="memory")
-    assert "not recurrent" in refused(unchanging, {"observation": BOARD, "state": {}})["message"]
+    assert "state" not in act(unchanging, observation=BOARD, state={})
+    error = refused(unchanging, {"observation": BOARD, "state": {"state_in_0": [[1]]}})
+    assert (error["code"], "not recurrent" in error["message"]) == ("invalid_state", True)
 
 
 def test_exploring_with_a_seed_is_reproducible(unchanging: TestClient) -> None:

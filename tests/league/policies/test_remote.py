@@ -73,7 +73,9 @@ def test_a_batch_is_sent_row_by_row(url: str) -> None:
         answer = policy.act(BOARD)
     assert (answer.actions.tolist(), answer.actions.dtype, answer.state) == ([3, 4], np.int64, None)
     board = {"observation": np.zeros((6, 7, 2), int).tolist(), "action_mask": [1] * 7}
-    assert Handler.asked == [("/v1/policies/board.left/action?version=7", {"observations": [board, board]})]
+    assert Handler.asked == [
+        ("/v1/policies/board.left/action?version=7", {"observations": [board, board], "state": {}})
+    ]
 
 
 def test_leaves_go_back_to_where_their_names_say(url: str) -> None:
