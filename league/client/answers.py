@@ -44,6 +44,21 @@ class BatchAnswer:
     probabilities: list[Probabilities] | None = None
     state: list[str] | None = None
 
+    def answer(self, row: int) -> Answer:
+        """What was answered to one of the observations.
+
+        Drawn from one seed for all, its action comes again only in a batch where it has the same place.
+        """
+        return Answer(
+            self.actions[row],
+            self.version,
+            self.sha256,
+            self.replica,
+            self.seed[row] if isinstance(self.seed, list) else self.seed,
+            None if self.probabilities is None else self.probabilities[row],
+            None if self.state is None else self.state[row],
+        )
+
 
 def answer(document: Mapping[str, Any], replica: str, seed: int | None) -> Answer:
     """Read a reply to one observation."""

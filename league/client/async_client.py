@@ -12,7 +12,7 @@ from league.client import calls
 from league.client.answers import Answer, BatchAnswer
 from league.client.calls import ANY, Call, Document, Promotion
 from league.client.encoding import Encoding
-from league.client.endpoint import URL, Endpoint
+from league.client.endpoint import LIMITS, URL, Endpoint
 from league.client.episode import AsyncEpisode
 from league.client.models import parse_model
 from league.client.patience import LOOK, Attempts, Outcome
@@ -39,7 +39,7 @@ class AsyncClient:
         self.endpoint = Endpoint(url, key, timeout)
         self.patience = patience
         self.encoding: Encoding = encoding
-        self._http = httpx.AsyncClient()
+        self._http = httpx.AsyncClient(limits=LIMITS, verify=self.endpoint.is_encrypted)
 
     async def act(
         self,

@@ -19,6 +19,8 @@ API_KEY = "LEAGUE_API_KEY"
 """The environment variable that holds the key of those who give none."""
 LIMIT = "x-request-timeout-ms"
 """The header by which a server gives up when its client does."""
+LIMITS = httpx.Limits(max_connections=1000, max_keepalive_connections=100, keepalive_expiry=30.0)
+"""Of one client; the server keeps a connection for longer, so that it is not the one to hang up."""
 
 
 class Endpoint:
@@ -39,6 +41,8 @@ class Endpoint:
         # What httpx would work out for every request, once: it is half of what a request costs the client.
         self._headers = httpx.Headers({"host": host, "accept-encoding": "gzip", **self.headers})
         self._post_headers = httpx.Headers({**self._headers, "content-type": "application/json"})
+        self.is_encrypted = base.scheme == "https"
+        """Whether certificates, which take a while to load, are looked at."""
         self._extensions = {"timeout": httpx.Timeout(timeout).as_dict()}
 
     @property

@@ -52,11 +52,10 @@ class Course:
         self.steps += 1
         return answer.action
 
-    def retired(self, error: Exception) -> VersionRetired:
-        """What is to be said when the version that began the episode is gone."""
-        return VersionRetired(
-            f"the episode cannot go on after {self.steps} actions of {self.model}, which is served no more: {error}"
-        )
+
+def retired(model: Model, steps: int, error: Exception) -> VersionRetired:
+    """What is said when the version that began an episode is gone."""
+    return VersionRetired(f"the episode cannot go on after {steps} actions of {model}: {error}")
 
 
 class _Pinned:
@@ -102,7 +101,7 @@ class Episode(_Pinned):
         except GONE as error:
             if self.version is None:
                 raise
-            raise self._course.retired(error) from error
+            raise retired(self._course.model, self.steps, error) from error
         return self._course.took(answer)
 
     def __enter__(self) -> Self:
@@ -129,7 +128,7 @@ class AsyncEpisode(_Pinned):
         except GONE as error:
             if self.version is None:
                 raise
-            raise self._course.retired(error) from error
+            raise retired(self._course.model, self.steps, error) from error
         return self._course.took(answer)
 
     async def __aenter__(self) -> Self:
