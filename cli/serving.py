@@ -89,11 +89,19 @@ def act(
 def _ask(
     ref: CheckpointRef, policy: str | None, value: Any, explore: bool, seed: int | None, url: str
 ) -> dict[str, Any]:
-    from league.policies.remote import RemotePolicy
+    import numpy as np
 
-    body = {"observation": value, "explore": explore, "seed": seed}
-    with RemotePolicy(url, str(PolicyRef(ref.league, policy)), version=ref.version) as remote:
-        return remote.post(body)
+    from league.client import Client
+
+    model = str(PolicyRef(ref.league, policy))
+    with Client(url) as client:
+        answer = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
+    return {
+        "action": np.asarray(answer.action).tolist(),
+        "model": model,
+        "version": answer.version,
+        "sha256": answer.sha256,
+    }
 
 
 def _act_here(

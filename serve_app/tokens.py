@@ -52,7 +52,9 @@ def write_tokens(model: str, version: int, sha256: str, state: dict[str, NDArray
 def read_token(text: Any) -> Token:
     """Raises InvalidState, unless it is a token, whole."""
     if type(text) is not str:
-        raise InvalidState("state must be null, or of an earlier reply: a string for each observation")
+        raise InvalidState(
+            "state must be null or the state of an earlier reply, which is a string for each observation"
+        )
     try:
         data = binascii.a2b_base64(text.translate(FROM_URL) + "=" * (-len(text) % 4), strict_mode=True)
         found, version, manifest, length = HEAD.unpack_from(data)

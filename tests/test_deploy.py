@@ -39,7 +39,7 @@ def test_the_cluster_serves_what_one_machine_does() -> None:
     expected["http_options"]["host"] = "0.0.0.0"
     expected["applications"][0]["args"] = {"grpc_local_only": False}
     expected["applications"][0]["deployments"][0]["num_replicas"] = 4
-    assert SERVED == expected
+    assert expected == SERVED
 
 
 @pytest.mark.parametrize("document", [DEPLOY, SERVED], ids=["deploy.yaml", "kuberay.yaml"])

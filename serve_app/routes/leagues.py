@@ -67,6 +67,7 @@ def _replica(said: Acknowledgement) -> dict[str, Any]:
         "replica": said.replica,
         "version": said.version,
         "sha256": said.sha256,
+        "aliases": said.aliases,
         "fault": said.fault,
         "seen_at": said.seen_at.isoformat(),
     }

@@ -14,6 +14,7 @@ import httpx
 import numpy as np
 import pytest
 
+from league.client import Client
 from league.errors import UnknownLeague
 from league.policies.onnx import OnnxPolicy
 from league.policies.remote import RemotePolicy
@@ -223,8 +224,8 @@ def test_the_death_of_a_replica_costs_our_client_no_request(url: str, served: Re
     victim = processes(served.storage, "ServeReplica")[0]
 
     def caller() -> Callable[[], int]:
-        policy = RemotePolicy(url, "board")
-        return lambda: int(policy.post({"observation": BOARD})["version"])
+        client = Client(url)
+        return lambda: client.act("board", BOARD).version
 
     with load(caller, callers=8) as seen:
         until(lambda: seen.versions.total() > 200)

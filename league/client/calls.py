@@ -1,0 +1,127 @@
+"""The calls of a client, each as a request and how its reply is read: no connection, so both clients share them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+from uuid import uuid4
+
+from league.client.answers import Answer, BatchAnswer, answer, batch_answer
+from league.client.encoding import to_json
+from league.client.models import Model
+from league.client.questions import BatchQuestion, Question
+from league.errors import AliasMoved, InvalidInput
+from league.refs import CheckpointRef, check_alias, check_slug
+
+T = TypeVar("T")
+
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Call(Generic[T]):
+    """A request that may be repeated. read: the reply's document and replica → what the caller gets."""
+
+    path: str
+    read: Callable[[Document, str], T]
+    body: bytes | None = None
+    """Of a POST; None is a GET."""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Promotion:
+    """A movement of an alias, as the registry recorded it. kind: `promotion` or `rollback`."""
+
+    league: str
+    alias: str
+    kind: str
+    version: int
+    previous: int | None
+    actor: str
+    reason: str
+    at: str
+    event: int
+
+
+def act(model: Model, question: Question) -> Call[Answer]:
+    """Ask for one action."""
+    return Call(
+        f"{model.path}/action{model.query}",
+        lambda reply, replica: answer(reply, replica, question.seed),
+        to_json(question.document),
+    )
+
+
+def act_batch(model: Model, question: BatchQuestion) -> Call[BatchAnswer]:
+    """Ask for the actions of a batch."""
+    return Call(
+        f"{model.path}/action{model.query}",
+        lambda reply, replica: batch_answer(reply, replica, question.seed),
+        to_json(question.document),
+    )
+
+
+def leagues() -> Call[list[Document]]:
+    """Ask for all leagues."""
+    return Call("/v1/leagues", lambda reply, _: reply["leagues"])
+
+
+def league(slug: str) -> Call[Document]:
+    """Ask for one league."""
+    return Call(f"/v1/leagues/{check_slug('league', slug)}", lambda reply, _: reply)
+
+
+def versions(slug: str) -> Call[list[Document]]:
+    """Ask for the versions of a league."""
+    return Call(f"/v1/leagues/{check_slug('league', slug)}/versions", lambda reply, _: reply["versions"])
+
+
+def health(what: str) -> Call[str]:
+    """Ask a replica whether it is `live` or `ready`; returns its name."""
+    return Call(f"/v1/health/{what}", lambda reply, _: reply["replica"])
+
+
+ANY: Any = object()
+"""An alias may point anywhere before it is moved."""
+
+
+def promote(ref: str, alias: str, expected: int | None, reason: str | None, key: str | None) -> Call[Promotion]:
+    """Point an alias at a version, `connect_four@3`. Raises InvalidReference or InvalidInput."""
+    version = CheckpointRef.parse(ref)
+    if not isinstance(version.version, int):
+        raise InvalidInput(f"{ref} is an alias, expected the number of a version to promote")
+    document: Document = {"version": version.version}
+    if expected is not ANY:
+        document["expected"] = expected
+    path = f"/v1/leagues/{version.league}/aliases/{check_alias(alias)}"
+    return _change(path, document, reason, key)
+
+
+def rollback(slug: str, reason: str | None, key: str | None) -> Call[Promotion]:
+    """Go back to the champion before."""
+    return _change(f"/v1/leagues/{check_slug('league', slug)}/rollback", {}, reason, key)
+
+
+def late(told: Document, alias: str, version: int) -> list[str]:
+    """The replicas that do not serve a version as `alias` yet, each with why, as a league's document tells; a sentence
+    if there is no replica. Raises AliasMoved if the alias points elsewhere by now."""
+    now = told["aliases"].get(alias)
+    if now != version:
+        raise AliasMoved(f"{told['league']}@{alias} has moved on to version {now} meanwhile")
+    if not told["replicas"]:
+        return ["no replica has said that it serves anything"]
+    behind = [said for said in told["replicas"] if said["aliases"].get(alias) != version]
+    return [f"{said['replica']} serves {said['aliases'].get(alias)} ({said['fault'] or 'no fault'})" for said in behind]
+
+
+def not_everywhere(moved: Promotion, seconds: float, behind: list[str]) -> str:
+    """What is said when waiting for replicas was in vain."""
+    where = f"{moved.league}@{moved.alias} is version {moved.version}"
+    return f"{where}, but after {seconds:g} s not every replica serves it: {'; '.join(behind)}"
+
+
+def _change(path: str, document: Document, reason: str | None, key: str | None) -> Call[Promotion]:
+    if reason is not None:
+        document["reason"] = reason
+    headers = {"idempotency-key": key or str(uuid4())}
+    return Call(path, lambda reply, _: Promotion(**reply), to_json(document), headers)

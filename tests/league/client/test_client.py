@@ -1,0 +1,282 @@
+"""Both clients against a real replica: they send, read and refuse alike."""
+
+import asyncio
+import inspect
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from league.client import AsyncClient, Client
+from league.errors import (
+    AliasMoved,
+    BodyTooLarge,
+    Forbidden,
+    InvalidInput,
+    InvalidReference,
+    KeyReused,
+    NotReady,
+    ObservationError,
+    RateLimited,
+    RemoteError,
+    Unauthenticated,
+    UnknownLeague,
+    UnknownVersion,
+)
+from league.policies.onnx import OnnxPolicy
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.league.client.conftest import listening
+from tests.league.policies.graphs import masked_mlp
+from tests.serve_app.leagues import everything
+
+BOARD = {"observation": np.zeros((6, 7, 2), np.int8), "action_mask": np.ones(7, np.int8)}
+
+
+class Awaited:
+    """An AsyncClient whose every method waits for its result: what the tests of both clients call."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        self._runner = asyncio.Runner()
+        self._client = AsyncClient(*args, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._client, name)
+        return self._waiting(found) if inspect.iscoroutinefunction(found) else found
+
+    def close(self) -> None:
+        self._runner.run(self._client.close())
+        self._runner.close()
+
+    def _waiting(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args, **options: self._runner.run(function(*args, **options))
+
+
+Connect = Callable[..., Client]
+
+
+@pytest.fixture(params=[Client, Awaited], ids=["sync", "async"])
+def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
+    """Makes clients of either kind."""
+    made = []
+
+    def connected(*args: Any, **options: Any) -> Client:
+        made.append(request.param(*args, **options))
+        return made[-1]
+
+    yield connected
+    for client in made:
+        client.close()
+
+
+def test_the_two_clients_are_called_alike() -> None:
+    for name, method in inspect.getmembers(Client, inspect.isfunction):
+        if not name.startswith("_"):
+            assert arguments(getattr(AsyncClient, name)) == arguments(method), name
+    assert arguments(AsyncClient) == arguments(Client)
+
+
+def arguments(called: Callable[..., Any]) -> list[str]:
+    return [str(parameter) for parameter in inspect.signature(called).parameters.values()]
+
+
+def boards(count: int) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(0)
+    mask = random.integers(0, 2, (count, 7), dtype=np.int8)
+    mask[:, 0] = 1
+    return {"observation": random.integers(0, 2, (count, 6, 7, 2), dtype=np.int8), "action_mask": mask}
+
+
+@pytest.mark.parametrize("encoding", ["base64", "lists", "png"])
+def test_a_batch_is_answered_as_the_graph_does(connect: Connect, url: str, encoding: Any) -> None:
+    batch = boards(8)
+    expected = OnnxPolicy(masked_mlp(seed=1)).act(batch).actions.tolist()
+    client = connect(url, encoding=encoding)
+    answer = client.act_batch("board@2", batch)
+    assert (answer.actions, answer.version, answer.replica, answer.state) == (expected, 2, "replica-1", None)
+    one = [client.act("board@2", {name: array[row] for name, array in batch.items()}) for row in range(8)]
+    assert [each.action for each in one] == expected
+    assert {type(each.action) for each in one} == {int}
+    assert {each.sha256 for each in one} == {answer.sha256}
+
+
+def test_actions_are_as_the_environment_takes_them(connect: Connect, url: str) -> None:
+    client = connect(url)
+    vector = client.act("vector", np.array([0.5, -2 / 3], np.float32)).action
+    assert (vector.dtype, vector.shape) == (np.float32, (2,))
+    assert type(client.act("choice", np.int64(2)).action) is int
+    nested = {"mode": np.int64(2), "sense": {"speed": np.array([1.0, 2.0], np.float32)}}
+    assert client.act("nested", nested).action == 1
+    assert client.act("nested", {"mode": 2, "sense": {"speed": [-1.0, -2.0]}}).action == 0
+
+
+@pytest.mark.parametrize("encoding", ["base64", "png", "lists"])
+def test_images_arrive_as_they_are(connect: Connect, url: str, encoding: Any) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (84, 84, 4), dtype=np.uint8)
+    action = connect(url, encoding=encoding).act("pistons", frame).action
+    np.testing.assert_allclose(action, [frame.mean() / 1000], rtol=1e-5)
+
+
+def test_an_array_of_another_dtype_is_refused_as_base64_and_converted_as_lists(connect: Connect, url: str) -> None:
+    observation = np.array([0.5, -0.25])
+    with pytest.raises(ObservationError, match="float64"):
+        connect(url).act("vector", observation)
+    assert connect(url, encoding="lists").act("vector", observation).action.shape == (2,)
+    swapped = np.array([0.5, -0.25], ">f4")
+    np.testing.assert_array_equal(connect(url).act("vector", swapped).action, swapped)
+
+
+def test_what_is_drawn_comes_again_with_its_seed(connect: Connect, url: str) -> None:
+    client = connect(url)
+    first = client.act("board", BOARD, explore=True)
+    assert first.seed is not None
+    assert client.act("board", BOARD, explore=True, seed=first.seed).action == first.action
+    drawn = {client.act("board", BOARD, explore=True).action for _ in range(30)}
+    assert len(drawn) > 1, "each call has a seed of its own"
+    batch = boards(5)
+    again = [client.act_batch("board", batch, explore=True, seed=[1, 2, 3, 4, 5]).actions for _ in range(2)]
+    assert again[0] == again[1]
+    assert client.act("board", BOARD).seed is None
+
+
+def test_probabilities_come_if_they_are_asked_for(connect: Connect, url: str) -> None:
+    client = connect(url)
+    mask = np.array([1, 0, 1, 1, 1, 1, 1], np.int8)
+    answer = client.act("board", BOARD | {"action_mask": mask}, probabilities=True)
+    assert answer.probabilities.shape == (7,)
+    assert answer.probabilities[1] == 0
+    np.testing.assert_allclose(answer.probabilities.sum(), 1)
+    assert answer.action == answer.probabilities.argmax()
+    gaussian = client.act_batch("vector", np.zeros((3, 2), np.float32), probabilities=True).probabilities
+    assert [(one["mean"].shape, one["std"].shape) for one in gaussian] == [((2,), (2,))] * 3
+    assert client.act("board", BOARD).probabilities is None
+
+
+def test_recurrent_state_is_a_token_for_the_next_call(connect: Connect, url: str) -> None:
+    client = connect(url)
+    observation = np.zeros(1, np.float32)
+    first = client.act("memory", observation)
+    second = client.act("memory", observation, state=first.state)
+    assert isinstance(first.state, str)
+    assert second.state != first.state
+    batch = client.act_batch("memory", np.zeros((2, 1), np.float32), state=[first.state, None])
+    assert batch.state == [second.state, first.state]
+    assert batch.answer(0).action == second.action
+
+
+@pytest.mark.parametrize(
+    ("model", "observation", "expected"),
+    [
+        ("nobody", BOARD, UnknownLeague),
+        ("board@99", BOARD, UnknownVersion),
+        ("headless", BOARD, NotReady),
+        ("Board", BOARD, InvalidReference),
+        ("board@", BOARD, InvalidReference),
+        ("board", np.zeros((6, 7, 2), np.int8), ObservationError),
+        ("board", BOARD | {"observation": np.array(["a"])}, InvalidInput),
+        ("board", BOARD | {"observation": object()}, InvalidInput),
+        ("choice", np.zeros((600, 1024), np.int8), BodyTooLarge),
+    ],
+)
+def test_what_cannot_be_answered_is_raised_by_its_code(
+    connect: Connect, url: str, model: str, observation: Any, expected: type[Exception]
+) -> None:
+    with pytest.raises(expected) as raised:
+        connect(url, patience=0.2).act(model, observation)
+    assert type(raised.value) is expected
+
+
+@pytest.mark.parametrize("batch", [[], {"observation": np.zeros((2, 1)), "action_mask": np.zeros((3, 1))}, "abc", 7])
+def test_what_is_no_batch_is_refused(connect: Connect, url: str, batch: Any) -> None:
+    with pytest.raises(InvalidInput):
+        connect(url).act_batch("board", batch)
+
+
+def test_what_there_is_to_ask_for(connect: Connect, url: str) -> None:
+    client = connect(url)
+    assert {league["league"]: league["champion"] for league in client.leagues()}["board"] == 1
+    assert [version["version"] for version in client.versions("board")] == [1, 2, 3]
+    assert client.aliases("board") == {"champion": 1}
+    assert client.league("duo")["agents"] == {"agent_left": "left", "agent_right": "right"}
+    assert client.is_live()
+    client.wait_until_ready()
+
+
+def test_a_server_that_is_not_there(connect: Connect) -> None:
+    client = connect("http://127.0.0.1:9", patience=0.05)
+    assert not client.is_live()
+    with pytest.raises(NotReady, match=r"was not ready within 0\.1 s"):
+        client.wait_until_ready(0.1)
+    with pytest.raises(RemoteError, match=r"127\.0\.0\.1:9/v1/leagues cannot be reached"):
+        client.leagues()
+
+
+@pytest.mark.parametrize("options", [{"url": "127.0.0.1:8000"}, {"timeout": 0.0}, {"key": "é"}])
+def test_what_no_client_can_be_made_of(connect: Connect, options: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInput):
+        connect(**options)
+
+
+@pytest.fixture
+def guarded(registry: Registry) -> Iterator[str]:
+    """A replica that asks for keys, of leagues that may change."""
+    registry.create_key("somebody", ["act"])
+    with listening(registry.storage) as url:
+        yield url
+
+
+@pytest.fixture
+def registry(tmp_path: Any) -> Iterator[Registry]:
+    registry = everything(Storage.at(tmp_path / "home"))
+    yield registry
+    registry.close()
+
+
+def test_keys_open_what_they_are_for(
+    connect: Connect, guarded: str, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, token = registry.create_key("player", ["act"])
+    with pytest.raises(Unauthenticated):
+        connect(guarded).act("board", BOARD)
+    monkeypatch.setenv("LEAGUE_API_KEY", token)
+    client = connect(guarded)
+    client.wait_until_ready()
+    assert client.act("board", BOARD).version == 1
+    with pytest.raises(Forbidden, match="scope promote: player is for act"):
+        client.promote("board@2")
+
+
+def test_a_key_s_rate_is_waited_for_as_long_as_there_is_patience(
+    connect: Connect, guarded: str, registry: Registry
+) -> None:
+    _, token = registry.create_key("slow", ["act"], rate=1.0)
+    hasty = connect(guarded, key=token, patience=0.0)
+    with pytest.raises(RateLimited) as raised:
+        deque((hasty.act("board", BOARD) for _ in range(5)), maxlen=0)
+    assert raised.value.wait == 1
+    patient = connect(guarded, key=token, patience=30.0)
+    assert [patient.act("board", BOARD).version for _ in range(2)] == [1, 1]
+
+
+def test_promotions_are_applied_once_and_followed_everywhere(
+    connect: Connect, guarded: str, registry: Registry
+) -> None:
+    _, token = registry.create_key("operator", ["act", "read", "promote"])
+    client = connect(guarded, key=token)
+    moved = client.promote("board@2", expected=1, reason="better", wait=30)
+    assert (moved.version, moved.previous, moved.actor, moved.reason) == (2, 1, "operator", "better")
+    assert client.act("board", BOARD).version == 2
+    with pytest.raises(AliasMoved):
+        client.promote("board@3", expected=1)
+    same = [client.promote("board@3", idempotency_key="once") for _ in range(2)]
+    assert same[0] == same[1]
+    with pytest.raises(KeyReused):
+        client.promote("board@1", idempotency_key="once")
+    back = client.rollback("board", wait=30)
+    assert (back.kind, back.version) == ("rollback", 2)
+    assert client.promote("board@1", alias="candidate", expected=None, wait=30).alias == "candidate"
+    assert client.act("board@candidate", BOARD).version == 1
+    with pytest.raises(InvalidInput, match="expected the number"):
+        client.promote("board@candidate")
