@@ -156,12 +156,12 @@ def test_probabilities_come_if_they_are_asked_for(connect: Connect, url: str) ->
 
 def test_recurrent_state_is_a_token_for_the_next_call(connect: Connect, url: str) -> None:
     client = connect(url)
-    observation = np.zeros(1, np.float32)
+    observation = np.ones(1, np.float32)
     first = client.act("memory", observation)
     second = client.act("memory", observation, state=first.state)
     assert isinstance(first.state, str)
     assert second.state != first.state
-    batch = client.act_batch("memory", np.zeros((2, 1), np.float32), state=[first.state, None])
+    batch = client.act_batch("memory", np.ones((2, 1), np.float32), state=[first.state, None])
     assert batch.state == [second.state, first.state]
     assert batch.answer(0).action == second.action
 
