@@ -34,12 +34,14 @@ class Listening:
 
 
 @contextmanager
-def listening(storage: Storage, settings: ServeSettings = QUICK, **options: Any) -> Iterator[Listening]:
-    """A replica in a thread of its own, on a free port of this machine. options: of uvicorn."""
+def listening(
+    storage: Storage, settings: ServeSettings = QUICK, replica: str = "replica-1", port: int = 0, **options: Any
+) -> Iterator[Listening]:
+    """A replica in a thread of its own, on a port of this machine, by default a free one. options: of uvicorn."""
     install(settings.max_body)
-    server = Server(Registry.open(storage), settings, "replica-1")
+    server = Server(Registry.open(storage), settings, replica)
     config = uvicorn.Config(
-        server.application(), port=0, log_config=None, log_level="critical", access_log=False, **options
+        server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
     )
     runner = uvicorn.Server(config)
     thread = threading.Thread(target=runner.run, daemon=True)
