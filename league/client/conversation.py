@@ -17,7 +17,7 @@ from league.client.encoding import to_json
 from league.client.endpoint import Endpoint
 from league.client.faults import fault
 from league.client.models import Model
-from league.client.patience import Attempts, Outcome, told
+from league.client.patience import Attempts, Outcome
 from league.client.questions import BatchQuestion, Question
 from league.errors import BodyTooLarge, LeagueError, RemoteError, Unauthenticated
 from league.refs import CHAMPION
@@ -71,12 +71,12 @@ class Conversation:
     def message(self, question: Question | BatchQuestion, reset: bool | list[bool]) -> str:
         """What to send now. It differs after a reconnection."""
         document = dict(question.document)
-        if reset:
-            document["reset"] = reset
         if self._has_state:
             document["return_state"] = True
         if self._is_new and self._state is not None and reset is not True:
             document["state"] = self._resumed(reset)
+        elif reset:
+            document["reset"] = reset
         return to_json(document).decode()
 
     def read(self, question: Question | BatchQuestion, message: str | bytes) -> Outcome | None:
@@ -115,7 +115,7 @@ class Conversation:
         if (pause := attempts.pause(outcome)) is not None:
             return pause
         if isinstance(outcome, httpx.Response):
-            raise fault(outcome.status_code, told(outcome), outcome.text, self.url)
+            raise fault(outcome, self.url)
         raise RemoteError(f"{self.url}: {outcome}") from outcome
 
     def _resumed(self, reset: bool | list[bool]) -> Any:

@@ -9,7 +9,7 @@ import httpx
 from league.client.calls import Call
 from league.client.faults import fault
 from league.client.patience import Outcome, told
-from league.errors import InvalidInput, LeagueError, RemoteError
+from league.errors import InvalidInput, RemoteError
 
 T = TypeVar("T")
 
@@ -71,8 +71,7 @@ class Endpoint:
         document = told(outcome)
         if outcome.status_code == 200 and document is not None:
             return call.read(document, outcome.headers.get("x-league-replica", ""))
-        error: LeagueError = fault(outcome.status_code, document, outcome.text, where)
-        raise error
+        raise fault(outcome, where)
 
 
 def _checked(url: str) -> str:
