@@ -62,11 +62,14 @@ class Conversation:
         return self._model.version if isinstance(self._model.version, int) else None
 
     def opened(self, headers: Mapping[str, str]) -> None:
-        """The server has accepted: from now on it is asked for the version that it named."""
+        """The server has accepted: from now on it is asked for the version that it named. Raises RemoteError."""
+        version = headers.get("x-league-version", "")
+        if not version.isdecimal():
+            raise RemoteError(f"{self.url} is no stream of a policy server: its handshake names no version")
         self._replica = headers.get("x-league-replica", "")
         self._is_new = True
         if not self._follow:
-            self._model = self._model.at(int(headers["x-league-version"]))
+            self._model = self._model.at(int(version))
 
     def message(self, question: Question | BatchQuestion, reset: bool | list[bool]) -> str:
         """What to send now. It differs after a reconnection."""
@@ -81,8 +84,11 @@ class Conversation:
 
     def read(self, question: Question | BatchQuestion, message: str | bytes) -> Outcome | None:
         """Take a message: None if it is no answer to ours; else an outcome, after which `last` is the answer if its
-        status is 200."""
-        document = orjson.loads(message)
+        status is 200. Raises RemoteError."""
+        try:
+            document = orjson.loads(message)
+        except orjson.JSONDecodeError as error:
+            raise RemoteError(f"{self.url} answered what is no JSON: {message[:200]!r}") from error
         if "closing" in document:
             return None
         if "code" in document:

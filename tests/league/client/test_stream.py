@@ -201,6 +201,25 @@ def test_no_patience_is_no_second_attempt(connect: Connect, slow: tuple[Slow, st
         assert len(handler.heard) == 1
 
 
+@pytest.mark.parametrize(("head", "said"), [({}, "{}"), ({"x-league-version": "1"}, "<html>")], ids=["head", "words"])
+def test_somebody_else_s_server(connect: Connect, head: dict[str, str], said: str) -> None:
+    def greeted(_: ServerConnection, __: Any, response: Any) -> None:
+        response.headers.update(head)
+
+    def answered(connection: ServerConnection) -> None:
+        for _ in connection:
+            connection.send(said)
+
+    with serve(answered, "127.0.0.1", 0, process_response=greeted) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        url = f"http://127.0.0.1:{server.socket.getsockname()[1]}"
+        with pytest.raises(RemoteError, match=r"names no version|no JSON"), connect(url).stream("board") as stream:
+            stream.act(BOARD)
+        server.shutdown()
+    thread.join()
+
+
 def test_an_action_that_is_cancelled_leaves_no_answer_behind(slow: tuple[Slow, str]) -> None:
     handler, url = slow
 
