@@ -128,7 +128,7 @@ class Server:
         )
 
     def _in_flight(self) -> dict[str, int]:
-        return {"action": self.action.in_flight, "infer": self.inference.in_flight}
+        return {"action": self.action.in_flight, "infer": self.inference.in_flight, "stream": self.stream.open}
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
