@@ -1,4 +1,8 @@
-"""Requests that arrive at four times the rate that a server can take: not as fast as it answers, but by the clock."""
+"""Requests that arrive at four times the rate that a server can take: not as fast as it answers, but by the clock.
+
+Four times the clients of the measurement of capacity share that rate; a client whose request is not answered yet at its
+next turn leaves that turn out, as a game server does.
+"""
 
 import asyncio
 import time
@@ -99,16 +103,18 @@ def overload(url: str, seconds: float) -> Overload:
 
 
 async def _offer(url: str, request: bytes, seen: Overload, seconds: float) -> None:
-    """Send as the clock says, each request on a connection that waits for no answer; open more where there is none."""
+    """Send as the clock says, each request on a connection that waits for no answer."""
     parts = urlsplit(url)
     loop, idle = asyncio.get_running_loop(), deque[Caller]()
-    start = time.perf_counter()
+    for _ in range(TIMES * CONNECTIONS):
+        await loop.create_connection(lambda: Caller(request, seen, idle), parts.hostname, parts.port)
+    start, turns = time.perf_counter(), 0
     while (passed := time.perf_counter() - start) < seconds:
-        for _ in range(int(TIMES * seen.capacity * passed) - seen.offered):
-            if not idle:
-                await loop.create_connection(lambda: Caller(request, seen, idle), parts.hostname, parts.port)
+        due = int(TIMES * seen.capacity * passed) - turns
+        for _ in range(min(due, len(idle))):
             idle.popleft().ask()
             seen.offered += 1
+        turns += due
         await asyncio.sleep(0.001)
     deadline = time.perf_counter() + DRAIN
     while seen.answered + seen.refused + seen.other < seen.offered and time.perf_counter() < deadline:
