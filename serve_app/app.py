@@ -70,7 +70,8 @@ class PolicyServer:
 
     def __init__(self, settings: ServeSettings) -> None:
         replica = serve.get_replica_context().replica_id.unique_id
-        registry = Registry.open(Storage.from_environment())
+        # A replica that starts while the database is elsewhere must not put an empty one into its place.
+        registry = Registry.open(Storage.from_environment(), create=False)
         self._server = Server(registry, settings, replica, machine=_node_address(), is_exposed=serves_other_machines())
 
     def __serve_build_asgi_app__(self) -> Starlette:

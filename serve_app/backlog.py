@@ -12,42 +12,43 @@ from time import monotonic
 
 from league.errors import Overloaded
 
-NEVER = float("-inf")
+NEVER = float("inf")
 
 
 class Backlog:
     """The requests of one turn of the event loop. limit: those that it takes, once its queue stays too long."""
 
-    __slots__ = ("_clock", "_limit", "_long_at", "_long_since", "_patience", "_waiting")
+    __slots__ = ("_begun", "_clock", "_limit", "_long_at", "_long_since", "_patience", "_waiting")
 
     def __init__(self, limit: int, patience: float, clock: Callable[[], float] = monotonic) -> None:
         self._limit = limit
         self._patience = patience
         self._clock = clock
         self._waiting = 0
-        self._long_since = self._long_at = NEVER
+        self._begun = 0.0
+        self._long_at, self._long_since = -NEVER, NEVER
 
     def admit(self) -> None:
         """Let a request begin. Raises Overloaded."""
         if not self._waiting:
-            # What is called soon is called in the next turn, before what arrives meanwhile.
-            asyncio.get_running_loop().call_soon(self._end_turn)
+            self._begin_turn()
         self._waiting += 1
-        if self._waiting > self._limit and self._is_standing():
+        # Whether the queue was too long in every turn for more than `patience` seconds, however long a turn takes.
+        if self._waiting > self._limit and self._begun - self._long_since > self._patience:
             raise Overloaded(f"more than {self._limit} requests wait here already")
 
-    def _is_standing(self) -> bool:
-        """Whether the queue has been too long in every turn of the last `patience` seconds."""
-        now = self._clock()
-        return now - self._long_at <= self._patience < now - self._long_since
+    def _begin_turn(self) -> None:
+        # What is called soon is called in the next turn, before what arrives meanwhile.
+        asyncio.get_running_loop().call_soon(self._end_turn)
+        self._begun = self._clock()
+        if self._begun - self._long_at > self._patience:
+            self._long_since = NEVER  # nobody waited in between
 
     def _end_turn(self) -> None:
         is_long = self._waiting > self._limit
         self._waiting = 0
         if not is_long:
-            self._long_at = NEVER
+            self._long_since = NEVER
             return
-        now = self._clock()
-        if now - self._long_at > self._patience:
-            self._long_since = now
-        self._long_at = now
+        self._long_at = self._clock()
+        self._long_since = min(self._long_since, self._long_at)

@@ -57,3 +57,9 @@ async def test_one_turn_that_takes_long_is_not_a_queue_that_stays() -> None:
     loop = Loop()
     assert await loop.turn(10, 5.0) == 10
     assert await loop.turn(10, 0.01) == 10
+
+
+async def test_turns_that_take_longer_than_patience_are_cut_too() -> None:
+    loop = Loop()
+    assert [await loop.turn(10, 3 * PATIENCE) for _ in range(2)] == [10] * 2
+    assert [await loop.turn(10, 3 * PATIENCE) for _ in range(20)] == [LIMIT] * 20
