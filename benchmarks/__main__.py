@@ -5,7 +5,19 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-ORDER = ("stepping", "sampling", "learning", "parity", "serving", "promotions", "fresh_machine", "strength")
+ORDER = (
+    "stepping",
+    "sampling",
+    "learning",
+    "parity",
+    "serving",
+    "formats",
+    "promotions",
+    "shadowing",
+    "footprint",
+    "fresh_machine",
+    "strength",
+)
 
 
 def main() -> int:

@@ -11,8 +11,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from random import random
 from typing import cast
 from urllib.parse import urlsplit
 
@@ -41,16 +42,22 @@ OnReply = Callable[[int, bytes, float], bool]
 """(status, body, time.perf_counter() at sending) → whether to send again. Status 0: the connection was dropped."""
 
 
+JSON = {"Content-Type": "application/json"}
 LENGTH = b"content-length: "
 LAST_CHUNK = b"0\r\n\r\n"
 
 
 class Connection(asyncio.Protocol):
-    """Sends `request` again as soon as its reply is whole, and reports each reply."""
+    """Sends `request` again as soon as its reply is whole, or every `interval` seconds, and reports each reply.
 
-    def __init__(self, request: bytes, on_reply: OnReply) -> None:
+    A request that is due while the one before is not answered yet counts as sent when it was due: a server that is late
+    answers for all that wait (Tene's coordinated omission).
+    """
+
+    def __init__(self, request: bytes, on_reply: OnReply, interval: float = 0.0) -> None:
         self.request = request
         self.on_reply = on_reply
+        self.interval = interval
         self.closed = asyncio.get_running_loop().create_future()
         self.received = b""
         self.sent_at = 0.0
@@ -58,11 +65,22 @@ class Connection(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
-        self.send()
+        self.due = time.perf_counter() + random() * self.interval
+        self.send_when_due()
 
-    def send(self) -> None:
+    def send_when_due(self) -> None:
+        early = self.due - time.perf_counter()
+        if early > 0:
+            asyncio.get_running_loop().call_later(early, self.send)
+        else:
+            self.send(self.due if self.interval else None)
+
+    def send(self, sent_at: float | None = None) -> None:
+        if self.transport.is_closing():
+            return
         self.waiting = True
-        self.sent_at = time.perf_counter()
+        self.sent_at = sent_at or time.perf_counter()
+        self.due += self.interval
         self.transport.write(self.request)
 
     def data_received(self, data: bytes) -> None:
@@ -75,7 +93,7 @@ class Connection(asyncio.Protocol):
             return
         reply, self.received, self.waiting = self.received, b"", False
         if self.on_reply(int(reply[9:12]), reply[end + 4 :], self.sent_at) and b"connection: close" not in head:
-            self.send()
+            self.send_when_due()
         else:
             self.transport.close()
 
@@ -93,27 +111,39 @@ class Connection(asyncio.Protocol):
         self.closed.set_result(None)
 
 
-def post(url: str, body: bytes) -> bytes:
-    """The bytes of a POST of JSON to `url`."""
+def post(url: str, body: bytes, headers: Mapping[str, str] = JSON) -> bytes:
+    """The bytes of a POST to `url`."""
     parts = urlsplit(url)
     path = parts.path + (f"?{parts.query}" if parts.query else "")
-    head = (
-        f"POST {path} HTTP/1.1\r\nHost: {parts.netloc}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
-    )
-    return head.encode() + b"\r\n\r\n" + body
+    lines = [f"POST {path} HTTP/1.1", f"Host: {parts.netloc}", f"Content-Length: {len(body)}"]
+    lines += [f"{name}: {value}" for name, value in headers.items()]
+    return "\r\n".join(lines).encode() + b"\r\n\r\n" + body
 
 
-async def drive(url: str, body: bytes, connections: int, on_reply: OnReply, going: Callable[[], bool]) -> None:
-    """Keep `connections` busy until `going()` is false; a dropped connection is opened again."""
+async def drive(
+    url: str,
+    body: bytes,
+    connections: int,
+    on_reply: OnReply,
+    going: Callable[[], bool],
+    *,
+    rate: float = 0.0,
+    headers: Mapping[str, str] = JSON,
+) -> None:
+    """Keep `connections` busy until `going()` is false; a dropped connection is opened again.
+
+    rate: requests per second of all connections together; 0: as fast as they are answered.
+    """
     parts = urlsplit(url)
-    request = post(url, body)
+    request = post(url, body, headers)
+    interval = connections / rate if rate else 0.0
 
     async def keep() -> None:
         loop = asyncio.get_running_loop()
         while going():
             try:
                 _, connection = await loop.create_connection(
-                    lambda: Connection(request, on_reply), parts.hostname, parts.port
+                    lambda: Connection(request, on_reply, interval), parts.hostname, parts.port
                 )
             except OSError:
                 on_reply(0, b"", time.perf_counter())
@@ -124,7 +154,9 @@ async def drive(url: str, body: bytes, connections: int, on_reply: OnReply, goin
     await asyncio.gather(*(keep() for _ in range(connections)))
 
 
-async def run(url: str, body: bytes, connections: int, seconds: float, warm_up: float) -> Load:
+async def run(
+    url: str, body: bytes, connections: int, seconds: float, warm_up: float, rate: float, headers: Mapping[str, str]
+) -> Load:
     """Load `url` for `warm_up + seconds`; the warm-up is not counted."""
     statuses: Counter[str] = Counter()
     latencies: list[float] = []
@@ -138,7 +170,7 @@ async def run(url: str, body: bytes, connections: int, seconds: float, warm_up: 
             latencies.append(now - sent_at)
         return now < stop
 
-    await drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop)
+    await drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop, rate=rate, headers=headers)
     times = np.array(latencies or [np.nan]) * 1e3
     p50, p99 = np.percentile(times, [50, 99])
     requests = statuses.total()
@@ -147,10 +179,20 @@ async def run(url: str, body: bytes, connections: int, seconds: float, warm_up: 
     )
 
 
-def measure(url: str, body: bytes, *, connections: int, seconds: float, warm_up: float = 1.0) -> Load:
+def measure(
+    url: str,
+    body: bytes,
+    *,
+    connections: int,
+    seconds: float,
+    warm_up: float = 1.0,
+    rate: float = 0.0,
+    headers: Mapping[str, str] = JSON,
+) -> Load:
     """Run the generator in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.load", url]
     command += ["--connections", str(connections), "--seconds", str(seconds), "--warm-up", str(warm_up)]
+    command += ["--rate", str(rate), "--headers", json.dumps(dict(headers))]
     done = subprocess.run(command, input=body, stdout=subprocess.PIPE, check=True)
     return Load(**json.loads(done.stdout))
 
@@ -161,11 +203,23 @@ def main() -> None:
     parser.add_argument("--connections", type=int, default=32)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--warm-up", type=float, default=1.0)
-    arguments = parser.parse_args()
+    parser.add_argument("--rate", type=float, default=0.0, help="requests per second; 0: as fast as they are answered")
+    parser.add_argument("--headers", type=json.loads, default=JSON, help="as a JSON object")
+    options = parser.parse_args()
     import uvloop
 
     body = sys.stdin.buffer.read()
-    load = uvloop.run(run(arguments.url, body, arguments.connections, arguments.seconds, arguments.warm_up))
+    load = uvloop.run(
+        run(
+            options.url,
+            body,
+            options.connections,
+            options.seconds,
+            options.warm_up,
+            options.rate,
+            options.headers,
+        )
+    )
     print(json.dumps(asdict(load)))
 
 

@@ -34,11 +34,11 @@ BODY = json.dumps({"observation": {"observation": PLANES.tolist(), "action_mask"
 class MaskedMLP(nn.Module):
     """Board and mask, int8 → the greedy legal column, and the masked logits."""
 
-    def __init__(self, observations: int, actions: int) -> None:
+    def __init__(self, observations: int, actions: int, hidden: tuple[int, ...] = HIDDEN) -> None:
         super().__init__()
-        sizes = (observations, *HIDDEN)
-        layers = [part for size in zip(sizes, HIDDEN, strict=False) for part in (nn.Linear(*size), nn.Tanh())]
-        self.network = nn.Sequential(*layers, nn.Linear(HIDDEN[-1], actions))
+        sizes = (observations, *hidden)
+        layers = [part for size in zip(sizes, hidden, strict=False) for part in (nn.Linear(*size), nn.Tanh())]
+        self.network = nn.Sequential(*layers, nn.Linear(hidden[-1], actions))
 
     def forward(self, observation: Tensor, action_mask: Tensor) -> tuple[Tensor, Tensor]:
         logits = self.network(observation.flatten(1).float())
@@ -46,25 +46,25 @@ class MaskedMLP(nn.Module):
         return masked.argmax(1), masked
 
 
-def publish(home: Path, versions: int) -> Registry:
-    """A registry in `home` whose league has so many versions, the first its champion."""
+def publish(home: Path, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Registry:
+    """A registry in `home` whose league has so many versions, the first its champion. hidden: units of the network."""
     config = LeagueConfig.load(ROOT / "configs" / "connect_four.yaml")
     registry = Registry.open(Storage.at(home))
     registry.register(config, interface(config))
     for seed in range(versions):
-        registry.publish(LEAGUE, _builder(registry, seed), source=f"random/{seed}")
+        registry.publish(LEAGUE, _builder(registry, seed, hidden), source=f"random/{seed}")
     registry.set_alias(LEAGUE, "champion", 1, expected=ANY, actor="benchmark", reason="something must answer")
     return registry
 
 
-def _builder(registry: Registry, seed: int) -> Callable[[Path, int], Manifest]:
+def _builder(registry: Registry, seed: int, hidden: tuple[int, ...]) -> Callable[[Path, int], Manifest]:
     row = registry.league(LEAGUE)
     (policy,) = row.interface.policy_ids
     spaces = row.interface.of_policy(policy)
 
     def build(directory: Path, number: int) -> Manifest:
         torch.manual_seed(seed)
-        _export(MaskedMLP(PLANES.size, 7).eval(), directory / f"{policy}.onnx")
+        _export(MaskedMLP(PLANES.size, 7, hidden).eval(), directory / f"{policy}.onnx")
         return Manifest(
             league=LEAGUE,
             version=number,

@@ -9,6 +9,7 @@ from cli.demo import demo
 from cli.doctor import doctor
 from cli.environments import check_env
 from cli.evaluation import evaluate, nightly
+from cli.keys import app as keys
 from cli.output import errors
 from cli.replay import replay
 from cli.serving import act, serve
@@ -46,6 +47,7 @@ for command in (
     act,
 ):
     app.command()(command)
+app.add_typer(keys)
 
 CALLERS_MISTAKE = 2
 FAULT = 1

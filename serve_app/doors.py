@@ -8,10 +8,10 @@ Behind HAProxy a replica still has ports of its own, which whoever reaches them 
 replica. A deadline is for HTTP alone: gRPC has one of its own, and a stream lasts.
 """
 
-from collections.abc import Iterable
+from collections.abc import Awaitable, Iterable
 from typing import Any
 
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
 from serve_app import permissions
@@ -144,17 +144,34 @@ class Guarded:
                 await self._application(scope, receive, send)
                 return
             timeout = self._timeout if patience is None else min(_seconds(patience), self._timeout)
-            await within(timeout, self._application(scope, receive, send))
+            reply = Reply(send)
+            await within(timeout, self._application(scope, receive, reply.send))
         except LeagueError as error:
             await self._refuse(error, scope, receive, send)
         except Expired:
-            await self._refuse(_too_late(scope, timeout), scope, receive, send)
+            if not reply.is_begun:  # else the client does not read it, and the server hangs up
+                await self._refuse(_too_late(scope, timeout), scope, receive, send)
 
     async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
             return
         await self._errors.response(_path(scope), error)(scope, receive, send)
+
+
+class Reply:
+    """Knows whether a reply was begun, to which nothing else can be said."""
+
+    __slots__ = ("_send", "is_begun")
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self.is_begun = False
+
+    def send(self, message: Message) -> Awaitable[None]:
+        """ASGI's send."""
+        self.is_begun = True
+        return self._send(message)
 
 
 def _take(key: Key) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import typer
 import yaml
+from typer.core import TyperGroup
 
 from cli.main import app
 from league.config import LeagueConfig, PPOConfig
@@ -33,7 +34,11 @@ def shell_lines() -> list[tuple[str, str]]:
 def test_each_command_shown_exists_with_its_options(page: str, line: str) -> None:
     _, name, *arguments = shlex.split(line, comments=True)
     assert name in COMMANDS, f"{page}: {line}"
-    known = {option for parameter in COMMANDS[name].params for option in parameter.opts}
+    command = COMMANDS[name]
+    if isinstance(command, TyperGroup):
+        assert arguments[0] in command.commands, f"{page}: {line}"
+        command = command.commands[arguments.pop(0)]
+    known = {option for parameter in command.params for option in parameter.opts}
     for argument in arguments:
         if argument.startswith("--"):
             assert argument.partition("=")[0] in known, f"{page}: {line}"

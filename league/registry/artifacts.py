@@ -84,7 +84,9 @@ class ArtifactStore:
             for name in sorted(present - set(manifest.files)):
                 raise ArtifactCorrupt(f"{directory / name} does not belong to {league}@{number}")
             for name, digest in manifest.files.items():
-                _check(directory / name, digest, _sha256(directory / name) if name in present else None)
+                path = directory / name
+                # A pipe or a device, which a link may lead to, would be read for ever.
+                _check(path, digest, _sha256(path) if name in present and path.is_file() else None)
         return directory
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
@@ -120,7 +122,7 @@ def _verified(path: Path, digest: str) -> bytes:
 
 def _check(path: Path, expected: str, found: str | None) -> None:
     if found is None:
-        raise ArtifactCorrupt(f"{path} is missing")
+        raise ArtifactCorrupt(f"{path} is missing, or no regular file")
     if found != expected:
         raise ArtifactCorrupt(f"{path} was changed: its SHA-256 is {found[:12]}…, expected {expected[:12]}…")
 

@@ -101,9 +101,10 @@ class RestRoutes:
 
     async def _index(self, request: Request) -> Response:
         body = await read_bytes(request.scope, request.receive, self._settings.max_body)
-        only_ready = parse_object(body).get("ready", False) if body else False
-        if type(only_ready) is not bool:
-            raise InvalidInput("ready must be true or false")
+        asked = parse_object(body) if body else {}
+        only_ready = asked.pop("ready", False)
+        if asked or type(only_ready) is not bool:
+            raise InvalidInput('the body must be {"ready": true}, {"ready": false} or empty')
         return _json(await self._catalogue.index(only_ready))
 
 

@@ -1,6 +1,7 @@
 """Who is let in, over every way that leads in, and what the others are told."""
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -200,7 +201,29 @@ def test_a_time_limit_that_is_none(unchanging: TestClient, value: str) -> None:
 
 
 def test_a_time_limit_that_is_kept_changes_nothing(unchanging: TestClient) -> None:
-    assert unchanging.post(ACTION, json=BODY, headers={"x-request-timeout-ms": "1"}).status_code == 200
+    assert unchanging.post(ACTION, json=BODY, headers={"x-request-timeout-ms": "4000"}).status_code == 200
+
+
+@pytest.mark.anyio
+async def test_a_reply_that_nobody_reads_is_not_begun_twice(tmp_path: Path) -> None:
+    registry = everything(Storage.at(tmp_path / "home"))
+    server = Server(registry, ServeSettings.model_validate(QUICK.model_dump() | {"timeout": 0.05}), "replica-1")
+    application = server.application()
+    said: list[str] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": json.dumps(BODY).encode(), "more_body": False}
+
+    async def send(message: Any) -> None:
+        said.append(message["type"])
+        if message["type"] == "http.response.body":
+            await asyncio.Event().wait()
+
+    scope = {"type": "http", "method": "POST", "path": ACTION, "query_string": b"", "headers": []}
+    async with application.router.lifespan_context(application):
+        await application(scope, receive, send)
+    assert said == ["http.response.start", "http.response.body"]
+    assert server.action.in_flight == 0
 
 
 @pytest.mark.anyio

@@ -22,6 +22,7 @@ EXPECTED = {
     "UnsupportedMediaType": 415,
     "Overloaded": 429,
     "InvalidInput": 400,
+    "VersionRetired": 410,
     "NotFound": 404,
     "Conflict": 409,
     "NotReady": 503,

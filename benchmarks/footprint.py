@@ -1,0 +1,151 @@
+"""What does a version cost a replica: time to load, memory to hold, and does memory stay flat over swaps?
+
+One replica behind HAProxy. A version of a network of 1 MB is asked for by number for the first time, and again: the
+difference is finding it in the registry, verifying, loading and warming. A replica that was killed comes back: from the
+start of its process to its first acknowledgement. A hundred versions of the 2×256 network held at once; and promotions
+of versions in turn with no room to keep those that are not live, so that each of them is loaded anew.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+
+import httpx
+import psutil
+import yaml
+
+from benchmarks.processes import of_replicas
+from benchmarks.served_league import BODY, LEAGUE, publish
+from league.registry.registry import Registry
+from serve_app.launch import DEPLOY_YAML, running
+
+LARGE = (448, 448)
+"""Units of a network of 1 MB."""
+TO_LOAD = 20.0
+"""Milliseconds."""
+TO_START = 3.0
+"""Seconds."""
+POLICIES, MORE = 100, 150.0
+"""MB, at most, that so many policies add."""
+SWAPS, GROWTH = 10_000, 0.02
+WARM = 0.1
+"""Share of the swaps after which memory is looked at first: allocators have found their size then."""
+
+
+def main() -> int:
+    """Print what was measured; 1 if a target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--swaps", type=int, default=SWAPS)
+    parser.add_argument("--quick", action="store_true", help="few of each: shows that it works, no more")
+    options = parser.parse_args()
+    times, policies, swaps = (3, 10, 100) if options.quick else (20, POLICIES, options.swaps)
+    met = [_loading(times), _starting(1 if options.quick else 5), _holding(policies), _swapping(swaps)]
+    return int(not all(met))
+
+
+def _loading(times: int) -> bool:
+    with _served(times + 1, LARGE) as (url, registry):
+        size = registry.artifacts.path(LEAGUE, 1) / "shared.onnx"
+        taken = []
+        with httpx.Client(base_url=url) as client:
+            for number in range(2, times + 2):
+                first, again = _act(client, number), min(_act(client, number) for _ in range(3))
+                taken.append((first - again) * 1e3)
+        print(f"load and warm {size.stat().st_size / 1e6:.2f} MB: median {median(taken):.1f} ms, ", end="")
+        print(f"longest {max(taken):.1f} ms   (median at most {TO_LOAD:g} ms)", flush=True)
+    return median(taken) <= TO_LOAD
+
+
+def _act(client: httpx.Client, number: int) -> float:
+    begun = time.perf_counter()
+    client.post(f"/v1/policies/{LEAGUE}/action?version={number}", content=BODY).raise_for_status()
+    return time.perf_counter() - begun
+
+
+def _starting(times: int) -> bool:
+    taken = []
+    with _served(1) as (_, registry):
+        for _ in range(times):
+            (old,) = of_replicas()
+            known = {said.replica for said in registry.acknowledgements(LEAGUE)}
+            old.kill()
+            taken.append(_ready(registry, known))
+    print(f"replica ready after its process started: median {median(taken):.2f} s, longest {max(taken):.2f} s", end="")
+    print(f"   (median at most {TO_START:g} s)", flush=True)
+    return median(taken) <= TO_START
+
+
+def _ready(registry: Registry, known: set[str]) -> float:
+    """Seconds from the start of a new replica's process to its first acknowledgement."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if {said.replica for said in registry.acknowledgements(LEAGUE)} - known:
+            now = time.time()
+            return now - max(process.create_time() for process in of_replicas())
+        time.sleep(0.005)
+    raise TimeoutError("no replica came back within 60 s")
+
+
+def _holding(policies: int) -> bool:
+    with _served(policies, cached_versions=policies) as (url, _), httpx.Client(base_url=url) as client:
+        (replica,) = of_replicas()
+        _act(client, 1)
+        before = _resident(replica)
+        for number in range(1, policies + 1):
+            _act(client, number)
+        more = _resident(replica) - before
+    print(f"{policies} policies in one replica: {before:.0f} MB with one, {more:+.0f} MB   (at most +{MORE:g} MB)")
+    return more <= MORE
+
+
+def _swapping(swaps: int) -> bool:
+    with _served(4, cached_versions=1, poll=0.002) as (_, registry):
+        (replica,) = of_replicas()
+        sizes, begun = [], time.monotonic()
+        for done in range(1, swaps + 1):
+            _promote(registry, 1 + done % 4)
+            if done in (int(swaps * WARM), swaps):
+                sizes.append(_resident(replica))
+        rate = swaps / (time.monotonic() - begun)
+    growth = sizes[1] / sizes[0] - 1
+    print(f"{swaps:,} swaps, each loaded anew, {rate:.0f}/s: {sizes[0]:.1f} MB after a tenth of them, ", end="")
+    print(f"{sizes[1]:.1f} MB at the end, {growth:+.2%}   (at most {GROWTH:+.0%})")
+    return growth <= GROWTH
+
+
+def _promote(registry: Registry, version: int) -> None:
+    expected = registry.aliases(LEAGUE)["champion"]
+    registry.set_alias(LEAGUE, "champion", version, expected=expected, actor="benchmark", reason="in turn")
+    deadline = time.monotonic() + 30
+    while not any(said.version == version for said in registry.acknowledgements(LEAGUE)):
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"version {version} did not reach the replica within 30 s")
+        time.sleep(0.001)
+
+
+def _resident(process: psutil.Process) -> float:
+    """MB."""
+    return float(process.memory_info().rss) / 1e6
+
+
+@contextmanager
+def _served(versions: int, hidden: tuple[int, int] = (256, 256), **settings: float) -> Iterator[tuple[str, Registry]]:
+    """One replica with other settings."""
+    document = yaml.safe_load(DEPLOY_YAML.read_text())
+    document["applications"][0]["args"] |= settings
+    with tempfile.TemporaryDirectory() as scratch:
+        registry = publish(Path(scratch) / "home", versions=versions, hidden=hidden)
+        deploy = Path(scratch) / "deploy.yaml"
+        deploy.write_text(yaml.safe_dump(document))
+        with running(registry.storage, replicas=1, deploy=deploy) as url:
+            yield url, registry
+        registry.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,222 @@
+"""In which form are actions fetched the fastest: HTTP or a stream, JSON or binary, one or many, REST or gRPC?
+
+One replica behind HAProxy, the 2×256 network for connect four, and pistonball's convolutional network. HTTP with 32
+connections against a stream with 16, each with one request in flight; a batch of 256 in binary; the same request over
+REST and gRPC, by the stock tritonclient; one picture as JSON, PNG and binary, beside the time that inference alone
+takes in this process. Rounds alternate between what is compared, and the medians of the rounds are told.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import orjson
+import tritonclient.grpc as over_grpc
+import tritonclient.http as over_http
+from numpy.typing import NDArray
+
+from benchmarks import load, stream_load
+from benchmarks.learned import local_ray
+from benchmarks.parity import CONFIGS, prepare, situations
+from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
+from league.client.encoding import encoded
+from league.policies import load as load_policy
+from league.registry.manifest import TRAINING
+from league.registry.registry import Registry
+from league.registry.rows import VersionRow
+from serve_app import haproxy
+from serve_app.launch import running
+from serve_app.stream_framing import request
+from training.publish import load_modules
+
+CONNECTIONS, STREAMS = 32, 16
+BATCH = 256
+FASTER, SOONER = 2.5, 0.6
+"""The stream's rate and its latency, against HTTP's."""
+ACTIONS = 150_000
+"""A second, in batches of 256."""
+BESIDE_INFERENCE = 1.3
+"""Times the time of inference alone, for a picture in binary."""
+BINARY = {"Content-Type": "application/octet-stream"}
+DATATYPES = {"int8": "INT8", "uint8": "UINT8"}
+
+
+def main() -> int:
+    """Print what was measured; 1 if a target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--quick", action="store_true", help="one short round: shows that it works, no more")
+    options = parser.parse_args()
+    rounds, seconds = (1, 1.0) if options.quick else (options.rounds, options.seconds)
+    with tempfile.TemporaryDirectory() as scratch:
+        registry = publish(Path(scratch) / "home", versions=1)
+        with local_ray(1):
+            pictures = prepare(CONFIGS / "pistonball.yaml", registry, updates=0)
+        seen = _picture(registry, pictures)
+        (grpc_port,) = haproxy.free_ports(1, "127.0.0.1")
+        with running(registry.storage, replicas=1, grpc_port=grpc_port) as url:
+            met = [
+                _streams(url, rounds, seconds),
+                _batches(url, rounds, seconds),
+                _protocols(url.removeprefix("http://"), f"127.0.0.1:{grpc_port}", rounds, seconds),
+                _pictures(url, registry, pictures, seen, rounds, seconds),
+            ]
+        registry.close()
+    return int(not all(met))
+
+
+def _streams(url: str, rounds: int, seconds: float) -> bool:
+    policy = f"{url}/v1/policies/{LEAGUE}"
+    message = request([PLANES[None], np.ones((1, 7), np.int8)], 1)
+    asks: dict[str, Callable[[int], load.Load | stream_load.StreamLoad]] = {
+        "HTTP, JSON": lambda n: load.measure(f"{policy}/action", BODY, connections=n, seconds=seconds),
+        "stream, JSON": lambda n: stream_load.measure(
+            f"{policy}/stream", BODY, is_text=True, streams=n, seconds=seconds
+        ),
+        "stream, binary": lambda n: stream_load.measure(
+            f"{policy}/stream", message, is_text=False, streams=n, seconds=seconds
+        ),
+    }
+    rates: dict[str, list[float]] = {name: [] for name in asks}
+    latencies: dict[str, list[float]] = {name: [] for name in asks}
+    for _ in range(rounds):
+        for name, ask in asks.items():
+            rates[name].append(ask(CONNECTIONS if name.startswith("HTTP") else STREAMS).rate)
+            latencies[name].append(ask(1).p50)
+    for name in asks:
+        print(f"{name}: {median(rates[name]):,.0f}/s, p50 with one connection {median(latencies[name]):.3f} ms")
+    http, best = "HTTP, JSON", "stream, binary"
+    faster = median(own / other for own, other in zip(rates[best], rates[http], strict=True))
+    sooner = median(own / other for own, other in zip(latencies[best], latencies[http], strict=True))
+    print(f"{best} over {http}, rate: {faster:.2f}×   (at least {FASTER:g}×)")
+    print(f"{best} over {http}, p50: {sooner:.2f}×   (at most {SOONER:g}×)", flush=True)
+    return faster >= FASTER and sooner <= SOONER
+
+
+def _batches(url: str, rounds: int, seconds: float) -> bool:
+    boards = np.repeat(PLANES[None], BATCH, axis=0)
+    body, headers = binary({"observation": boards, "action_mask": np.ones((BATCH, 7), np.int8)})
+    infer = f"{url}/v2/models/{LEAGUE}/infer"
+    message = request([boards, np.ones((BATCH, 7), np.int8)], BATCH)
+    rest, stream = [], []
+    for _ in range(rounds):
+        rest.append(load.measure(infer, body, connections=4, seconds=seconds, headers=headers).rate * BATCH)
+        streamed = stream_load.measure(
+            f"{url}/v1/policies/{LEAGUE}/stream", message, is_text=False, streams=4, seconds=seconds
+        )
+        stream.append(streamed.rate * BATCH)
+    print(f"batches of {BATCH}, REST binary: {median(rest):,.0f} actions/s   (at least {ACTIONS:,})")
+    print(f"batches of {BATCH}, stream, binary: {median(stream):,.0f} actions/s", flush=True)
+    return median(rest) >= ACTIONS
+
+
+def _protocols(rest: str, grpc: str, rounds: int, seconds: float) -> bool:
+    for rows in (1, BATCH):
+        told = []
+        for module, address in ((over_http, rest), (over_grpc, grpc)):
+            with module.InferenceServerClient(address) as client:
+                inputs = _inputs(module, rows)
+                times = [_p50(lambda c=client, i=inputs: c.infer(LEAGUE, i), seconds) for _ in range(rounds)]
+            told.append(median(times))
+        print(f"tritonclient, {rows} rows: REST binary {told[0]:.2f} ms, gRPC {told[1]:.2f} ms", end="")
+        print(f", gRPC over REST: {told[1] / told[0]:.2f}×", flush=True)
+    return True
+
+
+def _inputs(module: object, rows: int) -> list[object]:
+    arrays = {"observation": np.repeat(PLANES[None], rows, axis=0), "action_mask": np.ones((rows, 7), np.int8)}
+    inputs = []
+    for name, array in arrays.items():
+        given = module.InferInput(name, list(array.shape), "INT8")  # type: ignore[attr-defined]
+        given.set_data_from_numpy(array)
+        inputs.append(given)
+    return inputs
+
+
+def _p50(call: Callable[[], object], seconds: float) -> float:
+    """Milliseconds."""
+    for _ in range(20):
+        call()
+    times, stop = [], time.perf_counter() + seconds
+    while (now := time.perf_counter()) < stop:
+        call()
+        times.append(time.perf_counter() - now)
+    return median(times) * 1e3
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    path: str
+    body: bytes
+    headers: Mapping[str, str]
+
+
+def _pictures(url: str, registry: Registry, version: VersionRow, picture: NDArray, rounds: int, seconds: float) -> bool:
+    """One picture in each form, with one connection."""
+    policy = load_policy(version.ref, None, registry)
+    body, headers = binary({"observation": picture[None]})
+    action = f"/v1/policies/{version.league}/action"
+    forms = {
+        "JSON": _Form(action, _document(picture.tolist()), load.JSON),
+        "PNG": _Form(action, _document(encoded(picture, "png")), load.JSON),
+        "base64": _Form(action, _document(encoded(picture, "base64")), load.JSON),
+        "binary": _Form(f"/v2/models/{version.league}/infer", body, headers),
+    }
+    inference: list[float] = []
+    times: dict[str, list[float]] = {name: [] for name in forms}
+    for _ in range(rounds):
+        inference.append(_p50(lambda: policy.act({"observation": picture[None]}), seconds))
+        for name, form in forms.items():
+            seen = load.measure(url + form.path, form.body, connections=1, seconds=seconds, headers=form.headers)
+            assert not seen.failed, f"{name}: {seen.statuses}"
+            times[name].append(seen.p50)
+    alone = median(inference)
+    print(f"a picture of {picture.shape}, inference alone: {alone:.2f} ms")
+    for name, form in forms.items():
+        share = alone / median(times[name])
+        print(f"{name}: {len(form.body):,} bytes, p50 {median(times[name]):.2f} ms, inference {share:.0%} of it")
+    beside = median(own / other for own, other in zip(times["binary"], inference, strict=True))
+    print(f"binary over inference alone: {beside:.2f}×   (at most {BESIDE_INFERENCE:g}×)")
+    return beside <= BESIDE_INFERENCE
+
+
+def _picture(registry: Registry, version: VersionRow) -> NDArray:
+    """What a piston sees in play: (84, 84, 4) uint8."""
+    row = registry.league(version.league)
+    modules = load_modules(
+        registry.artifacts.path(version.league, version.number) / TRAINING, row.config, row.interface
+    )
+    (batches,) = situations(row.config, row.interface, modules, 64).values()
+    return np.ascontiguousarray(batches[-1].observations["observation"][-1])
+
+
+def binary(arrays: Mapping[str, NDArray], outputs: Sequence[str] = ("action",)) -> tuple[bytes, dict[str, str]]:
+    """A request with the binary tensor extension: its body and its headers."""
+    inputs = [
+        {
+            "name": name,
+            "shape": list(array.shape),
+            "datatype": DATATYPES[array.dtype.name],
+            "parameters": {"binary_data_size": array.nbytes},
+        }
+        for name, array in arrays.items()
+    ]
+    wanted = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
+    head = orjson.dumps({"inputs": inputs, "outputs": wanted})
+    body = head + b"".join(array.tobytes() for array in arrays.values())
+    return body, BINARY | {"Inference-Header-Content-Length": str(len(head))}
+
+
+def _document(observation: object) -> bytes:
+    return orjson.dumps({"observation": observation})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,24 @@
+"""The processes of the servers that a benchmark has started."""
+
+import psutil
+
+
+def of_haproxy() -> set[int]:
+    """Ids of the HAProxy processes below this one."""
+    return {process.pid for process in _below() if _name(process) == "haproxy"}
+
+
+def of_replicas() -> list[psutil.Process]:
+    """The replicas of Ray Serve below this process."""
+    return [process for process in _below() if _name(process).startswith("ray::ServeRepl")]
+
+
+def _below() -> list[psutil.Process]:
+    return psutil.Process().children(recursive=True)
+
+
+def _name(process: psutil.Process) -> str:
+    try:
+        return process.name()
+    except psutil.NoSuchProcess:
+        return ""
