@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from serve_app.openapi.document import document
 from serve_app.permissions import of_request
 from tests.serve_app.conftest import QUICK
 
+ROOT = Path(__file__).parents[3]
 NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion"}
 
 
@@ -118,3 +120,16 @@ def test_it_says_the_limits(described: dict[str, Any]) -> None:
 def test_what_is_described_once_is_not_changed(described: dict[str, Any], unchanging: TestClient) -> None:
     assert unchanging.get("/openapi.json").json() != described
     assert document(QUICK, []) == described
+
+
+def test_the_page_on_http_has_the_same_codes(described: dict[str, Any]) -> None:
+    text = (ROOT / "docs" / "http.md").read_text()
+    rows = re.findall(r"^\| (\d{3}) \| (.*) \|$", text, flags=re.M)
+    written = {(int(status), code) for status, codes in rows for code in re.findall(r"`([a-z_]+)`", codes)}
+    told = {
+        (int(status), code)
+        for _, _, operation in operations(described)
+        for status, response in operation["responses"].items()
+        for code in codes_of(described, response)
+    }
+    assert written == told | {(405, "method_not_allowed")}
