@@ -15,6 +15,7 @@ ORDER = (
     "promotions",
     "shadowing",
     "footprint",
+    "fuzz",
     "fresh_machine",
     "strength",
 )
