@@ -37,6 +37,7 @@ from serve_app.middleware import shorten
 from serve_app.models import Models
 from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute
+from serve_app.routes.docs import DocsRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.metrics import MetricsRoute
@@ -137,6 +138,7 @@ class Server:
         promotion = PromotionRoutes(self.models, self.settings)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
+        docs = DocsRoutes(self.live, self.doors, self.settings)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
             routes=[
@@ -150,6 +152,8 @@ class Server:
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
                 Route("/v1/leagues/{league}/traffic", traffic.show),
                 Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
+                Route("/docs", docs.docs),
+                Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),

@@ -187,7 +187,7 @@ class Stream:
             raise InvalidState("reset and state contradict each other: an episode begins, or goes on")
         if not self._served.policy.state:
             raise InvalidState("state must be null: this policy is not recurrent")
-        number = pinned_version(ask, self._follows or str(self._served.version.number))
+        number = pinned_version(ask, self._model, self._follows or str(self._served.version.number))
         served = self._served
         if int(number) != served.version.number:
             served = Served.of(self._model, *await self._parts.models.find(self._model, number))
