@@ -86,6 +86,7 @@ def _warm_up(client: httpx.Client, statuses: Counter[str], count: int, number: i
     """The first tenth: memory that is taken once, for whatever is asked, is taken now."""
     for _ in range(200):
         client.post(f"/v1/policies/{LEAGUE}/action", content=BODY)
+    client.get("/openapi.json")
     _changed(client, statuses, count, number + 1)
 
 
