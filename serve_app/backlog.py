@@ -18,7 +18,7 @@ NEVER = float("inf")
 class Backlog:
     """The requests of one turn of the event loop. limit: those that it takes, once its queue stays too long."""
 
-    __slots__ = ("_begun", "_clock", "_limit", "_long_at", "_long_since", "_patience", "_waiting")
+    __slots__ = ("_begun", "_clock", "_goes_on", "_limit", "_long_since", "_patience", "_waiting")
 
     def __init__(self, limit: int, patience: float, clock: Callable[[], float] = monotonic) -> None:
         self._limit = limit
@@ -26,23 +26,20 @@ class Backlog:
         self._clock = clock
         self._waiting = 0
         self._begun = 0.0
-        self._long_at, self._long_since = -NEVER, NEVER
+        self._long_since = NEVER
+        self._goes_on = False
 
     def admit(self) -> None:
         """Let a request begin. Raises Overloaded."""
         if not self._waiting:
-            self._begin_turn()
+            # What is called soon is called in the next turn, before what arrives meanwhile.
+            asyncio.get_running_loop().call_soon(self._end_turn)
+            self._begun = self._clock()
+            self._goes_on = True
         self._waiting += 1
         # Whether the queue was too long in every turn for more than `patience` seconds, however long a turn takes.
         if self._waiting > self._limit and self._begun - self._long_since > self._patience:
             raise Overloaded(f"more than {self._limit} requests wait here already")
-
-    def _begin_turn(self) -> None:
-        # What is called soon is called in the next turn, before what arrives meanwhile.
-        asyncio.get_running_loop().call_soon(self._end_turn)
-        self._begun = self._clock()
-        if self._begun - self._long_at > self._patience:
-            self._long_since = NEVER  # nobody waited in between
 
     def _end_turn(self) -> None:
         is_long = self._waiting > self._limit
@@ -50,5 +47,12 @@ class Backlog:
         if not is_long:
             self._long_since = NEVER
             return
-        self._long_at = self._clock()
-        self._long_since = min(self._long_since, self._long_at)
+        self._long_since = min(self._long_since, self._clock())
+        self._goes_on = False
+        loop = asyncio.get_running_loop()
+        loop.call_soon(loop.call_soon, self._end_queue)  # after the next turn
+
+    def _end_queue(self) -> None:
+        """Nobody waits any more if a turn passes without a request."""
+        if not self._goes_on:
+            self._long_since = NEVER
