@@ -155,7 +155,7 @@ def _open_existing(
 
 
 def _refuse_moved(_: object, record: ConnectionPoolEntry, __: object) -> None:
-    """A connection stays with its file when that is moved away or replaced: then open what is there by that name now."""
+    """A connection stays with its file when that is moved away or replaced: then open what has its name now."""
     path, opened = record.info[FILE]
     if _identity(path) != opened:
         raise DisconnectionError(f"{path} is another file by now")

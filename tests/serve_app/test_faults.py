@@ -23,7 +23,7 @@ from tests.serve_app.leagues import everything, promote
 from tests.serve_app.test_action import BOARD
 from tests.serve_app.test_server import ACTION, Load, load, processes, serving, until
 
-SETTINGS = {"max_waiting": 8, "patience": 0.0}
+SETTINGS = {"max_waiting": 8, "patience": 0.01}
 """More than the clients here fill, less than those do who overrun it."""
 
 
