@@ -124,12 +124,16 @@ class Guarded:
         self._doors = doors
         self._errors = errors
         self._timeout = settings.timeout
+        self._is_first = True
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request in, or answer why not."""
         if (kind := scope["type"]) == "lifespan":
             await self._application(scope, receive, send)
             return
+        if self._is_first and (here := scope.get("server")):
+            self._is_first = False
+            self._doors.backlog.listens_on(here[1])
         if self._log is not None:
             send = self._log.begin(scope, _path(scope), send)
         try:
