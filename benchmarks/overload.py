@@ -64,13 +64,13 @@ class Caller(Connection):
         self.idle = idle
         self.head = b""
 
-    def send(self) -> None:
+    def send_when_due(self) -> None:
         """Wait."""
         self.idle.append(self)
 
     def ask(self) -> None:
         """Send the request."""
-        super().send()
+        self.send()
 
     def is_whole(self, head: bytes, body: int) -> bool:
         """See `Connection`."""

@@ -63,6 +63,6 @@ class Backlog:
         loop.call_soon(loop.call_soon, self._end_queue)  # after the next turn
 
     def _end_queue(self) -> None:
-        """Nobody waits any more if a turn passes without a request."""
-        if not self._goes_on:
+        """Nobody waits any more if a turn passes without a request, and no connection waits to be accepted."""
+        if not self._goes_on and not (self._queue and self._queue.length()):
             self._long_since = NEVER

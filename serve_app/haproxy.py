@@ -4,8 +4,8 @@ HAProxy is a child of a Ray worker, not of Ray: when Ray is killed it stays, and
 directory of its own, by which its HAProxy processes are known, and which it holds locked while it lives.
 
 Ray writes HAProxy's configuration, and no setting keeps its statistics from other machines, or bounds the time that a
-client may take to send the head of a request. So what Ray starts is a script, which amends the configuration and then
-becomes HAProxy.
+client may take to send the head of a request; and it takes Ray long to see that HAProxy was killed. So what Ray starts
+is a script (haproxy_script.py).
 """
 
 import fcntl
