@@ -1,4 +1,4 @@
-"""How many connections wait to be accepted: requests that the event loop has not seen yet.
+"""The connections that wait to be accepted: requests that the event loop has not seen yet.
 
 uvloop accepts one connection in each turn. Where many come at once and turns are long, that is where the queue is.
 """
@@ -35,6 +35,17 @@ class AcceptQueue:
         except OSError:  # it listens no more
             return 0
         return int.from_bytes(info[UNACKED], "little")
+
+    def take(self) -> socket.socket | None:
+        """Accept the next connection, which does not block; None if none waits."""
+        if self._listener is None:
+            return None
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # none waits, or it listens no more
+            return None
+        connection.setblocking(False)
+        return connection
 
 
 def _listener(port: int) -> socket.socket | None:

@@ -19,6 +19,7 @@ from starlette.routing import Route, WebSocketRoute
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app import http_protocol, websocket_protocol
 from serve_app.access_log import AccessLog
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.doors import Doors, Guarded
@@ -49,7 +50,6 @@ from serve_app.shadow import Shadow
 from serve_app.streams import StreamParts
 from serve_app.traffic import Traffic
 from serve_app.versions import Versions
-from serve_app.websocket_protocol import install
 
 LOOPBACK = "127.0.0.1"
 
@@ -78,7 +78,8 @@ class PolicyServer:
     def __serve_build_asgi_app__(self) -> Starlette:
         application = self._server.application()
         shorten(application)
-        install(self._server.settings.max_body)
+        http_protocol.install()
+        websocket_protocol.install(self._server.settings.max_body)
         offer(self._server.inference_service)
         return application
 

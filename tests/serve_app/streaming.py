@@ -1,4 +1,4 @@
-"""A replica's application on a uvicorn of its own, as Ray Serve starts it: with our protocol for WebSockets."""
+"""A replica's application on a uvicorn of its own, as Ray Serve starts it: with our protocols."""
 
 import threading
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ import uvicorn
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app import http_protocol, websocket_protocol
 from serve_app.app import Server
 from serve_app.settings import ServeSettings
-from serve_app.websocket_protocol import install
 from tests.serve_app.conftest import QUICK
 
 
@@ -38,7 +38,8 @@ def listening(
     storage: Storage, settings: ServeSettings = QUICK, replica: str = "replica-1", port: int = 0, **options: Any
 ) -> Iterator[Listening]:
     """A replica in a thread of its own, on a port of this machine, by default a free one. options: of uvicorn."""
-    install(settings.max_body)
+    http_protocol.install()
+    websocket_protocol.install(settings.max_body)
     server = Server(Registry.open(storage), settings, replica)
     config = uvicorn.Config(
         server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options

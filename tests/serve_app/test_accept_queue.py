@@ -37,3 +37,22 @@ def test_where_nobody_listens_nothing_waits() -> None:
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         assert AcceptQueue(bound.getsockname()[1]).length() == 0
+
+
+def test_connections_are_taken_in_their_order_until_none_waits() -> None:
+    with socket.create_server(("127.0.0.1", 0), backlog=16) as server:
+        server.setblocking(False)
+        queue = AcceptQueue(server.getsockname()[1])
+        assert queue.take() is None
+        waiting = [socket.create_connection(server.getsockname()) for _ in range(3)]
+        deadline = monotonic() + 10
+        while queue.length() < 3:
+            assert monotonic() < deadline
+        for connection in waiting:
+            taken = queue.take()
+            assert taken is not None
+            assert taken.getpeername() == connection.getsockname()
+            assert not taken.getblocking()
+            taken.close()
+            connection.close()
+        assert queue.take() is None
