@@ -15,6 +15,8 @@ ORDER = (
     "promotions",
     "shadowing",
     "footprint",
+    "faults",
+    "fuzz",
     "fresh_machine",
     "strength",
 )

@@ -115,7 +115,7 @@ def framed(message: bytes, opcode: int) -> bytes:
 async def run(url: str, message: bytes, is_text: bool, streams: int, seconds: float, warm_up: float) -> StreamLoad:
     """Load `url` for `warm_up + seconds`; the warm-up is not counted. A stream that ends early is a fault."""
     parts = urlsplit(url)
-    handshake = HANDSHAKE.format(path=parts.path, host=parts.netloc).encode()
+    handshake = HANDSHAKE.format(path=f"{parts.path}?{parts.query}", host=parts.netloc).encode()
     opcode = TEXT if is_text else BINARY
     frame, latencies, refused = framed(message, opcode), list[float](), 0
     start = time.perf_counter() + warm_up

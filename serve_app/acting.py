@@ -31,13 +31,11 @@ def is_plain(ask: Ask, policy: LoadedPolicy, quotes: int) -> bool:
 
 def read_given_state(ask: Ask, version: LoadedVersion, policy: LoadedPolicy, has_strings: bool = True) -> Arrays | None:
     """The recurrent state that came with the request. Raises ObservationError or InvalidState."""
-    if ask.tokens is None and not ask.state:
+    if not ask.state and not any(ask.tokens or ()):
         return None
     if not policy.state:
         raise InvalidState("state must be null: this policy is not recurrent")
     if ask.tokens is not None:
-        if not any(ask.tokens):
-            return None
         return state_of_tokens(ask.tokens, version.model(policy), version.sha256, policy.state)
     if has_strings:
         refuse_strings(ask.state)

@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager, suppress
 from functools import partial
 from typing import NamedTuple, TypeVar
 
-from league.errors import LeagueError
+from league.errors import LeagueError, StorageError
 from league.registry.registry import Registry
 from league.registry.rows import Traffic as Setting
 from serve_app.live import Alias, Live
@@ -69,6 +69,8 @@ class AliasWatcher:
     async def look(self) -> None:
         """Look at the aliases once: swap what moved, then say so. Raises StorageError."""
         aliases, settings = await self._call(self._wanted)
+        if not aliases and self._live.leagues():
+            raise StorageError("the registry names no version any more: it is not the one that was there")
         await self._live.follow(aliases | pinned(settings))
         self._traffic.follow(settings)
         self._polling.saw()

@@ -37,6 +37,7 @@ from serve_app.middleware import shorten
 from serve_app.models import Models
 from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute
+from serve_app.routes.docs import DocsRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.metrics import MetricsRoute
@@ -70,7 +71,8 @@ class PolicyServer:
 
     def __init__(self, settings: ServeSettings) -> None:
         replica = serve.get_replica_context().replica_id.unique_id
-        registry = Registry.open(Storage.from_environment())
+        # A replica that starts while the database is elsewhere must not put an empty one into its place.
+        registry = Registry.open(Storage.from_environment(), create=False)
         self._server = Server(registry, settings, replica, machine=_node_address(), is_exposed=serves_other_machines())
 
     def __serve_build_asgi_app__(self) -> Starlette:
@@ -128,7 +130,7 @@ class Server:
         )
 
     def _in_flight(self) -> dict[str, int]:
-        return {"action": self.action.in_flight, "infer": self.inference.in_flight}
+        return {"action": self.action.in_flight, "infer": self.inference.in_flight, "stream": self.stream.open}
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
@@ -136,6 +138,7 @@ class Server:
         promotion = PromotionRoutes(self.models, self.settings)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
+        docs = DocsRoutes(self.live, self.doors, self.settings)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
             routes=[
@@ -149,6 +152,8 @@ class Server:
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
                 Route("/v1/leagues/{league}/traffic", traffic.show),
                 Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
+                Route("/docs", docs.docs),
+                Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),

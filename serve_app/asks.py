@@ -67,14 +67,19 @@ def read_flag(document: dict[str, Any], key: str) -> bool:
     return flag
 
 
-def pinned_version(ask: Ask, asked: str) -> str:
-    """The version that must answer: that of the state's tokens, else the one that is `asked` for.
+def pinned_version(ask: Ask, model: str, asked: str) -> str:
+    """The version of `model` that must answer: that of the state's tokens, else the one that is `asked` for.
 
-    Raises InvalidState if both are named and differ. An alias contradicts nothing: it moves, and episodes stay.
+    Raises InvalidState if both are named and differ, or if a token is of another league, whose versions are others. An
+    alias contradicts nothing: it moves, and episodes stay.
     """
     tokens = [token for token in ask.tokens or () if token is not None]
     if not tokens:
         return asked
+    league = model.partition(".")[0]
+    for token in tokens:
+        if token.model.partition(".")[0] != league:
+            raise InvalidState(f"state is of {token.model[:64]}, not of {model[:64]}")
     version = common_version(tokens)
     if version_of(asked) not in (version, asked):
         raise InvalidState(

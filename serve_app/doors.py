@@ -75,6 +75,14 @@ class Doors:
             _take(key)
         self.backlog.admit()
 
+    def lets_read_all(self, headers: Iterable[tuple[bytes, bytes]]) -> bool:
+        """Whether a request that needs no key may be told of all leagues, by the key that it shows."""
+        try:
+            self.admit(Need("read", None, is_of_all=True), _shown(headers)[0])
+        except LeagueError:
+            return False
+        return True
+
     def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
         """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
         self.admit(permissions.of_rpc(rpc, model), _shown(headers_of(metadata))[0])
@@ -116,12 +124,16 @@ class Guarded:
         self._doors = doors
         self._errors = errors
         self._timeout = settings.timeout
+        self._is_first = True
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request in, or answer why not."""
         if (kind := scope["type"]) == "lifespan":
             await self._application(scope, receive, send)
             return
+        if self._is_first and (here := scope.get("server")):
+            self._is_first = False
+            self._doors.backlog.listens_on(here[1])
         if self._log is not None:
             send = self._log.begin(scope, _path(scope), send)
         try:

@@ -10,7 +10,7 @@ head, which is read before anything is decoded.
 
 import binascii
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from math import prod
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from league.errors import ObservationError
+from league.errors import BodyTooLarge, ObservationError
 from league.spaces import Leaf
 
 B64, PNG = "b64", "png"
@@ -29,17 +29,30 @@ CHUNK = struct.Struct(">I4s")
 CRC = 4
 HEADER = struct.Struct(">IIBBBBB")
 """Of IHDR: width, height, bits, colour type, compression, filter, interlacing."""
-PIXELS = (b"IHDR", b"IDAT", b"IEND")
+BODY = len(SIGNATURE) + CHUNK.size + HEADER.size + CRC
+"""Where a picture's chunks begin, behind its head. A second head there could ask for another size."""
+PIXELS = (b"IDAT", b"IEND")
 """The chunks that pixels need. Texts, profiles and frames of an animation may be compressed, too: they are not read."""
 CHANNELS = {0: 1, 4: 2, 2: 3, 6: 4}
 """PNG's colour type → values of a pixel. 3 is a palette, whose indices are no values."""
 MOST_PICTURES = 256
 """In one leaf."""
+MOST_DECODED = 64 * 2**20
+"""Bytes that the pictures of one request may decode to: a black one is a thousandth of that in the body."""
 
 
 def is_encoded(value: Any) -> bool:
     """Whether a leaf came as base64."""
     return type(value) is dict and (B64 in value or PNG in value)
+
+
+def refuse_large(name: str, rows: Sequence[Any], leaf: Leaf) -> None:
+    """Raise BodyTooLarge if one leaf of a batch holds pictures that are too much together once they are decoded."""
+    size = len(rows) * prod(leaf.shape)
+    if size > MOST_DECODED and any(type(row) is dict and PNG in row for row in rows):
+        raise BodyTooLarge(
+            f"the pictures of {name} are {size} bytes when they are decoded, expected at most {MOST_DECODED}"
+        )
 
 
 def decode(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
@@ -52,10 +65,13 @@ def _array(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
         raise ObservationError(f"{name} has the unknown key {_odd(value, ARRAY_KEYS)!r}, expected b64, dtype and shape")
     dtype = value.get("dtype", leaf.dtype)
     if dtype != leaf.dtype:
-        raise ObservationError(f"{name} has dtype {str(dtype)[:64]!r}, expected {leaf.dtype}: nothing is converted")
+        given = f"dtype {dtype[:64]!r}" if type(dtype) is str else "a dtype that is no string"
+        raise ObservationError(f"{name} has {given}, expected {leaf.dtype}: nothing is converted")
     shape = value.get("shape", list(leaf.shape))
     if shape != list(leaf.shape):
-        raise ObservationError(f"{name} has shape {str(shape)[:64]}, expected {list(leaf.shape)}")
+        is_list = type(shape) is list and all(type(size) is int for size in shape)
+        given = f"shape {shape[:16]}" if is_list else "a shape that is no list of integers"
+        raise ObservationError(f"{name} has {given}, expected {list(leaf.shape)}")
     data = _bytes(f"{name}.b64", value[B64])
     size = prod(leaf.shape) * np.dtype(leaf.dtype).itemsize
     if len(data) != size:
@@ -91,9 +107,9 @@ def _pictures(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
 def _channels(name: str, picture: bytes, height: int, width: int) -> int:
     """How many values a pixel has, by the picture's head, if that is as expected."""
     start = len(SIGNATURE) + CHUNK.size
-    if not picture.startswith(SIGNATURE) or picture[start - 4 : start] != b"IHDR":
+    if not picture.startswith(SIGNATURE + CHUNK.pack(HEADER.size, b"IHDR")):
         raise ObservationError(f"{name}.png is no PNG")
-    if len(picture) < start + HEADER.size:
+    if len(picture) < BODY:
         raise ObservationError(f"{name}.png is cut off")
     found_width, found_height, bits, colour, *_ = HEADER.unpack_from(picture, start)
     if (found_height, found_width) != (height, width):
@@ -109,18 +125,18 @@ def _channels(name: str, picture: bytes, height: int, width: int) -> int:
 def _decoded(name: str, picture: bytes, height: int, width: int) -> NDArray:
     """Pixels, (height, width, values) uint8."""
     try:
-        with Image.open(BytesIO(b"".join((SIGNATURE, *_pixel_chunks(picture)))), formats=("PNG",)) as image:
+        with Image.open(BytesIO(b"".join((picture[:BODY], *_pixel_chunks(picture)))), formats=("PNG",)) as image:
             return np.asarray(image).reshape(height, width, -1)
     except (OSError, SyntaxError, ValueError, struct.error, EOFError) as error:
         raise ObservationError(f"{name}.png cannot be decoded: {' '.join(str(error).split())[:200]}") from None
 
 
 def _pixel_chunks(picture: bytes) -> Iterator[bytes]:
-    at = len(SIGNATURE)
+    at = BODY
     while at < len(picture):
-        length, kind = CHUNK.unpack_from(picture, at)
+        length, name = CHUNK.unpack_from(picture, at)
         end = at + CHUNK.size + length + CRC
-        if kind in PIXELS:
+        if name in PIXELS:
             yield picture[at:end]
         at = end
 

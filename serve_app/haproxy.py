@@ -22,6 +22,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from league.errors import NotReady
+from serve_app import haproxy_script
 
 DIRECTORIES = Path("/tmp")
 PREFIX = "league-serve-"
@@ -33,26 +34,8 @@ SOFT_STOP = 1.0
 """Seconds that HAProxy has to finish requests in progress."""
 HARD_STOP = 5.0
 """Seconds until what was killed must be gone, and its port free."""
-AMENDED = """#!/bin/sh
-for argument; do
-    if [ "$before" = -f ]; then
-        sed -i \\
-            -e 's/^\\( *bind \\)[*]\\{{0,1\\}}:\\({stats}\\|{metrics}\\)$/\\1127.0.0.1:\\2/' \\
-            -e 's/^defaults$/&\\n    timeout http-request {head}s\\n    timeout tunnel {tunnel}s/' \\
-            "$argument"
-    fi
-    before=$argument
-done
-exec '{haproxy}' "$@"
-"""
-"""Statistics for this machine alone; limits for the head of a request, and for a WebSocket on which nothing is said, to
-which the limits for requests would apply else."""
-HEAD = 10
-"""Seconds that a client has to send the head of a request."""
 IDLE_CLIENT = 60
 """Seconds in which a client must take or send something of a request in progress."""
-IDLE_TUNNEL = 3600
-"""Seconds for which a WebSocket may be silent."""
 
 
 def environment(directory: Path) -> dict[str, str]:
@@ -67,6 +50,8 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S": "5",
         "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": str(IDLE_CLIENT),
+        # Seconds between two looks at HAProxy; after three that fail it is replaced.
+        "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "serve_app.middleware:middlewares",
         "RAY_AUTH_MODE": "token",
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -118,7 +103,7 @@ def _amended(directory: Path, stats: int, metrics: int) -> dict[str, str]:
     if found is None:
         return {}
     script = directory / "haproxy"
-    script.write_text(AMENDED.format(stats=stats, metrics=metrics, head=HEAD, tunnel=IDLE_TUNNEL, haproxy=found))
+    script.write_text(haproxy_script.script(directory, found, stats, metrics))
     script.chmod(0o700)
     return {"RAY_SERVE_HAPROXY_BINARY_PATH": str(script)}
 
@@ -158,6 +143,8 @@ def is_free(host: str, port: int) -> bool:
 
 def stop(directory: Path) -> None:
     """End the HAProxy processes of a directory: gently, then by force."""
+    with suppress(OSError):
+        (directory / haproxy_script.STOPPED).touch()
     for number, seconds in ((signal.SIGUSR1, SOFT_STOP), (signal.SIGKILL, HARD_STOP)):
         for pid in processes(directory):
             with suppress(ProcessLookupError):

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from time import time
 
+from league.errors import StorageError
 from league.registry.keys import TOKEN_LENGTH
 from league.registry.registry import Registry
 from league.registry.rows import KeyRow
@@ -89,5 +90,8 @@ class KeyWatcher:
     async def look(self) -> None:
         """Look at the keys once. Raises StorageError."""
         rows = await asyncio.get_running_loop().run_in_executor(self._thread, self._registry.api_keys)
+        if not rows and not self._keyring.is_empty:
+            # Revoked keys stay in the registry. Without a key the doors would stand open.
+            raise StorageError("the registry has no API key any more: it is not the one that was there")
         self._keyring.follow(rows)
         self._polling.saw()

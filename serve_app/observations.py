@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from league.errors import ObservationError
 from league.spaces import ACTION_MASK, Leaf, Space, check, check_mask, inputs, paths
-from serve_app.encoded import decode, is_encoded
+from serve_app.encoded import decode, is_encoded, refuse_large
 
 JSON_KINDS = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", int: "a number", float: "a number"}
 
@@ -30,7 +30,7 @@ class ObservationReader:
         return sum(len(keys) for keys in self._objects.values())
 
     def read(self, observations: Sequence[Any], is_plain: bool = False) -> dict[str, NDArray]:
-        """A batch for the graph, checked. Raises ObservationError or IllegalMask.
+        """A batch for the graph, checked. Raises ObservationError, IllegalMask or BodyTooLarge.
 
         is_plain: no value is a string, so that nothing is base64. NumPy must see no string: see `refuse_strings`.
         """
@@ -40,6 +40,7 @@ class ObservationReader:
         for name, path, leaf in self.leaves:
             rows = [_at(value, path) for value in observations]
             if not is_plain:
+                refuse_large(name, rows, leaf)
                 rows = [_decoded(name, row, leaf) for row in rows]
             arrays[name] = check(name, _array(name, rows, leaf), leaf)
         if self.is_masked:

@@ -4,15 +4,14 @@ act      POST …/action, …/infer; a stream
 read     GET (HEAD) of anything else; the index of models
 promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
          thought of is not the one that is open
-nothing  health
+nothing  health; the description of the server, which tells strangers nothing of a league
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 HEALTH = ("/v1/health/", "/v2/health/")
-OF_NO_LEAGUE = ("/v2", "/docs", "/openapi.json")
-"""Paths, and what is below `/docs`, that tell nothing of a league."""
+DESCRIPTION = ("/docs", "/openapi.json")
 
 
 class Need(NamedTuple):
@@ -33,12 +32,11 @@ NOTHING = Need(None, None)
 @lru_cache(maxsize=4096)  # the same few come again and again
 def of_request(kind: str, method: str, path: str) -> Need:
     """What a request needs; `kind` is ASGI's, `http` or `websocket`, and `path` is below the root path."""
-    if path.startswith(HEALTH) and method in ("GET", "HEAD"):
+    if (path.startswith(HEALTH) or path in DESCRIPTION) and method in ("GET", "HEAD"):
         return NOTHING
     league = league_of(path)
     scope = _scope(kind, method, path)
-    is_of_none = path in OF_NO_LEAGUE or path.startswith("/docs/")
-    return Need(scope, league, league is None and not is_of_none, scope == "promote" and _is_of_alias(path))
+    return Need(scope, league, league is None and path != "/v2", scope == "promote" and _is_of_alias(path))
 
 
 @lru_cache(maxsize=4096)

@@ -25,6 +25,7 @@ class Polling:
         self._has_seen = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self._pause = settings.poll
+        self._fails = False
 
     @property
     def is_ready(self) -> bool:
@@ -60,11 +61,13 @@ class Polling:
     def _back_off(self, error: Exception) -> None:
         """Look less often. Only a bug raises something else than a LeagueError; it must not end the looking."""
         bug = None if isinstance(error, LeagueError) else error
-        if self._pause <= self._settings.poll:
+        if not self._fails:
             logger.error("%s cannot be followed, what is known stays: %s", self._subject, error, exc_info=bug)
+        self._fails = True
         self._pause = min(2 * self._pause, self._settings.poll_slowest)
 
     def _recover(self) -> None:
-        if self._pause > self._settings.poll:
+        if self._fails:
             logger.error("%s are followed again", self._subject)
+        self._fails = False
         self._pause = self._settings.poll

@@ -105,6 +105,7 @@ class Stream:
         self._parts = parts
         self._model = model
         self._ref = policy_ref(model)
+        self._path = f"/v1/policies/{model}/stream"
         self._follows = follows
         self._headers = headers
         self._key = key
@@ -119,13 +120,16 @@ class Stream:
             self._parts.doors.admit_message(self._key)
             return await (self._answer_text(data) if is_text else self._answer_binary(data))
         except Unauthenticated as error:
+            self._parts.metrics.failed(self._path, error.code)
             raise StreamEnds(POLICY_VIOLATION, str(error)) from None
         except LeagueError as error:
+            self._parts.metrics.failed(self._path, error.code)
             return refusal(error, self._parts.settings.retry)
         except StreamEnds:
             raise
         except Exception as error:
             logger.error("a message of a stream failed", exc_info=error)
+            self._parts.metrics.failed(self._path, str(FAULT["code"]))
             return _text(FAULT)
 
     def farewell(self) -> Message | None:
@@ -183,7 +187,7 @@ class Stream:
             raise InvalidState("reset and state contradict each other: an episode begins, or goes on")
         if not self._served.policy.state:
             raise InvalidState("state must be null: this policy is not recurrent")
-        number = pinned_version(ask, self._follows or str(self._served.version.number))
+        number = pinned_version(ask, self._model, self._follows or str(self._served.version.number))
         served = self._served
         if int(number) != served.version.number:
             served = Served.of(self._model, *await self._parts.models.find(self._model, number))
@@ -235,6 +239,8 @@ class Stream:
 def refusal(error: LeagueError, retry: float) -> Message:
     """An error as a message. retry: seconds after which what is not ready may be."""
     document: dict[str, Any] = {"code": error.code, "message": str(error), "status": status_of(error)}
+    if document["status"] >= 500:
+        logger.error("%s: %s", error.code, error)
     if document["status"] in (429, 503):
         wait = error.wait if isinstance(error, RateLimited) else 1.0 if document["status"] == 429 else retry
         document["retry_after"] = max(1, ceil(wait))

@@ -5,8 +5,8 @@ means, the next version may have learned otherwise. It is base64 (RFC 4648, the 
 
     format 1 · version · first half of the manifest's digest · length of the model's name · name · state · digest
 
-The state is one row of each recurrent input of the manifest, little-endian. The digest tells a damaged token; it is no
-signature, for whoever may ask for actions may also send whatever state he likes, as tensors.
+The state is one row of each recurrent input, in the order of their names, little-endian. The digest tells a damaged
+token; it is no signature, for whoever may ask for actions may also send whatever state he likes, as tensors.
 """
 
 import binascii
@@ -15,6 +15,7 @@ from base64 import urlsafe_b64encode
 from collections.abc import Sequence
 from hashlib import blake2b
 from math import prod
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,7 +45,7 @@ class Token(NamedTuple):
 def write_tokens(model: str, version: int, sha256: str, state: dict[str, NDArray]) -> list[str]:
     """A token for each row of a state (k, …)."""
     head = _head(model, version, bytes.fromhex(sha256)[:16])
-    columns = [array.astype(array.dtype.newbyteorder("<"), copy=False) for array in state.values()]
+    columns = [array.astype(array.dtype.newbyteorder("<"), copy=False) for _, array in sorted(state.items())]
     rows = len(columns[0])
     return [_sealed(head + b"".join(column[row].tobytes() for column in columns)) for row in range(rows)]
 
@@ -95,7 +96,7 @@ def read_state(
     joined = b"".join(bytes(size) if token is None else token.state for token in tokens)
     rows = np.frombuffer(joined, np.uint8).reshape(len(tokens), size)
     state, at = {}, 0
-    for name, leaf in leaves:
+    for name, leaf in sorted(leaves, key=itemgetter(0)):
         column = np.ascontiguousarray(rows[:, at : at + _size(leaf)])
         array = column.view(np.dtype(leaf.dtype).newbyteorder("<")).reshape(len(tokens), *leaf.shape)
         if array.dtype.kind == "f" and not np.isfinite(array).all():

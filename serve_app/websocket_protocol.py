@@ -19,7 +19,9 @@ from uvicorn.config import Config
 from uvicorn.protocols.websockets import auto
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
+from websockets.frames import Frame
 from websockets.http11 import Request
+from websockets.protocol import State
 from websockets.speedups import apply_mask
 
 from serve_app.deadlines import continued
@@ -37,7 +39,7 @@ SWITCHING = 101
 AT_ONCE = 16
 """Messages of one connection that are answered before others have their turn."""
 CLOSE_TIMEOUT = 2.0
-"""Seconds that a client has to answer a close."""
+"""Seconds that a client has to answer a close, and to read what was said before."""
 RESTARTS = 1012
 
 
@@ -110,6 +112,30 @@ class StreamProtocol(WebSocketsSansIOProtocol):
         super().resume_writing()
         self._go_on()
 
+    def handle_close(self, event: Frame) -> None:
+        """The client ends the stream, or agrees to its end."""
+        super().handle_close(event)
+        self._abort_later()
+
+    def keepalive_timeout(self) -> None:
+        """The client does not answer."""
+        super().keepalive_timeout()
+        self._abort_later()
+
+    def handle_parser_exception(self) -> None:
+        """The client breaks the protocol, or sends too much: say so, and wait until it hangs up."""
+        if self.close_sent:
+            return  # more of the same
+        self.stop_keepalive()
+        close = self.conn.close_sent
+        assert close is not None
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        if self.transport.can_write_eof():  # not over TLS
+            self.transport.write_eof()
+        self.close_sent = True
+        self._abort_later()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": close.code, "reason": close.reason})
+
     def shutdown(self) -> None:
         """The server stops: give the client what it needs to go on elsewhere."""
         if self._stream is None or self.close_sent:
@@ -159,7 +185,7 @@ class StreamProtocol(WebSocketsSansIOProtocol):
     @property
     def _is_between(self) -> bool:
         """Whether a message may begin here: no fragments of another are there, and no end was said."""
-        return self.conn.current_size is None and not self.close_sent
+        return self.conn.current_size is None and self.conn.state is State.OPEN
 
     def _take(self, data: bytes, is_text: bool) -> None:
         """Answer a message: now, if nothing must be waited for."""
@@ -212,8 +238,7 @@ class StreamProtocol(WebSocketsSansIOProtocol):
             self._writes.clear()
 
     def _end(self, code: int, reason: str) -> None:
-        """Say that this is the end, and wait until the client says so, too: to hang up at once could cost it the last
-        words, if something of it is still unread here."""
+        """Say that this is the end, and wait until the client says so, too."""
         self._flush()
         if self.close_sent or self.transport.is_closing():
             return
@@ -221,8 +246,14 @@ class StreamProtocol(WebSocketsSansIOProtocol):
         self.conn.send_close(code, reason)
         self.transport.write(b"".join(self.conn.data_to_send()))
         self.close_sent = True
-        self.close_timer = self.loop.call_later(CLOSE_TIMEOUT, self.transport.close)
+        self._abort_later()
         self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
+
+    def _abort_later(self) -> None:
+        """Hang up soon. At once would cost the client the last words if something of it is still unread here, and to
+        wait until it has read them all might be for ever."""
+        if self.close_timer is None and not self.disconnected:
+            self.close_timer = self.loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
 
 
 def _head(data: bytes | bytearray, at: int) -> tuple[int, int] | None:

@@ -32,11 +32,12 @@ class AsyncClient:
         url: str = URL,
         *,
         key: str | None = None,
+        caller: str | None = None,
         timeout: float = 5.0,
         patience: float = 10.0,
         encoding: Encoding = "base64",
     ) -> None:
-        self.endpoint = Endpoint(url, key, timeout)
+        self.endpoint = Endpoint(url, key, caller, timeout)
         self.patience = patience
         self.encoding: Encoding = encoding
         self._http = httpx.AsyncClient(limits=LIMITS, verify=self.endpoint.is_encrypted)

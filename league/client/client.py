@@ -28,6 +28,8 @@ class Client:
 
     url: of the server.
     key: an API key; by default what LEAGUE_API_KEY holds, and none if it is not set.
+    caller: who asks, a player or an episode: while a canary is tried, each caller stays with one version; without, the
+        champion answers.
     timeout: seconds of one attempt.
     patience: seconds for which an attempt that found no server, or a busy one, is followed by another; 0: never. Every
         call may be repeated: acting changes nothing, and calls that do carry an Idempotency-Key.
@@ -42,11 +44,12 @@ class Client:
         url: str = URL,
         *,
         key: str | None = None,
+        caller: str | None = None,
         timeout: float = 5.0,
         patience: float = 10.0,
         encoding: Encoding = "base64",
     ) -> None:
-        self.endpoint = Endpoint(url, key, timeout)
+        self.endpoint = Endpoint(url, key, caller, timeout)
         self.patience = patience
         self.encoding: Encoding = encoding
         self._http = httpx.Client(limits=LIMITS, verify=self.endpoint.is_encrypted)

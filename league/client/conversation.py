@@ -17,7 +17,7 @@ from league.client.encoding import to_json
 from league.client.endpoint import Endpoint
 from league.client.faults import fault
 from league.client.models import Model
-from league.client.patience import Attempts, Outcome, told
+from league.client.patience import Attempts, Outcome
 from league.client.questions import BatchQuestion, Question
 from league.errors import BodyTooLarge, LeagueError, RemoteError, Unauthenticated
 from league.refs import CHAMPION
@@ -62,27 +62,33 @@ class Conversation:
         return self._model.version if isinstance(self._model.version, int) else None
 
     def opened(self, headers: Mapping[str, str]) -> None:
-        """The server has accepted: from now on it is asked for the version that it named."""
+        """The server has accepted: from now on it is asked for the version that it named. Raises RemoteError."""
+        version = headers.get("x-league-version", "")
+        if not version.isdecimal():
+            raise RemoteError(f"{self.url} is no stream of a policy server: its handshake names no version")
         self._replica = headers.get("x-league-replica", "")
         self._is_new = True
         if not self._follow:
-            self._model = self._model.at(int(headers["x-league-version"]))
+            self._model = self._model.at(int(version))
 
     def message(self, question: Question | BatchQuestion, reset: bool | list[bool]) -> str:
         """What to send now. It differs after a reconnection."""
         document = dict(question.document)
-        if reset:
-            document["reset"] = reset
         if self._has_state:
             document["return_state"] = True
         if self._is_new and self._state is not None and reset is not True:
             document["state"] = self._resumed(reset)
+        elif reset:
+            document["reset"] = reset
         return to_json(document).decode()
 
     def read(self, question: Question | BatchQuestion, message: str | bytes) -> Outcome | None:
         """Take a message: None if it is no answer to ours; else an outcome, after which `last` is the answer if its
-        status is 200."""
-        document = orjson.loads(message)
+        status is 200. Raises RemoteError."""
+        try:
+            document = orjson.loads(message)
+        except orjson.JSONDecodeError as error:
+            raise RemoteError(f"{self.url} answered what is no JSON: {message[:200]!r}") from error
         if "closing" in document:
             return None
         if "code" in document:
@@ -115,7 +121,7 @@ class Conversation:
         if (pause := attempts.pause(outcome)) is not None:
             return pause
         if isinstance(outcome, httpx.Response):
-            raise fault(outcome.status_code, told(outcome), outcome.text, self.url)
+            raise fault(outcome, self.url)
         raise RemoteError(f"{self.url}: {outcome}") from outcome
 
     def _resumed(self, reset: bool | list[bool]) -> Any:

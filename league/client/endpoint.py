@@ -9,7 +9,7 @@ import httpx
 from league.client.calls import Call
 from league.client.faults import fault
 from league.client.patience import Outcome, told
-from league.errors import InvalidInput, LeagueError, RemoteError
+from league.errors import InvalidInput, RemoteError
 
 T = TypeVar("T")
 
@@ -19,6 +19,8 @@ API_KEY = "LEAGUE_API_KEY"
 """The environment variable that holds the key of those who give none."""
 LIMIT = "x-request-timeout-ms"
 """The header by which a server gives up when its client does."""
+CALLER = "x-league-key"
+"""The header that says what stays with one version while a canary is tried."""
 LIMITS = httpx.Limits(max_connections=1000, max_keepalive_connections=100, keepalive_expiry=30.0)
 """Of one client; the server keeps a connection for longer, so that it is not the one to hang up."""
 
@@ -26,15 +28,17 @@ LIMITS = httpx.Limits(max_connections=1000, max_keepalive_connections=100, keepa
 class Endpoint:
     """A server's address, the key that is shown to it, and how long an attempt may take."""
 
-    def __init__(self, url: str, key: str | None, timeout: float) -> None:
-        """Raises InvalidInput if `url` is no address, or the timeout not positive."""
+    def __init__(self, url: str, key: str | None, caller: str | None, timeout: float) -> None:
+        """Raises InvalidInput if `url` is no address, `key` or `caller` no header, or the timeout not positive."""
         if not timeout > 0:
             raise InvalidInput(f"timeout is {timeout:g} s, expected more than 0")
         self.url = _checked(url)
         key = os.environ.get(API_KEY) if key is None else key
         self.headers = {LIMIT: str(max(1, round(timeout * 1000)))}
         if key:
-            self.headers["authorization"] = f"Bearer {_printable(key)}"
+            self.headers["authorization"] = f"Bearer {_printable('API key', key)}"
+        if caller is not None:
+            self.headers[CALLER] = _printable("caller", caller)
         self.timeout = timeout
         base = httpx.URL(self.url)
         host = base.netloc.decode("ascii")
@@ -67,8 +71,7 @@ class Endpoint:
         document = told(outcome)
         if outcome.status_code == 200 and document is not None:
             return call.read(document, outcome.headers.get("x-league-replica", ""))
-        error: LeagueError = fault(outcome.status_code, document, outcome.text, where)
-        raise error
+        raise fault(outcome, where)
 
 
 def _checked(url: str) -> str:
@@ -81,11 +84,11 @@ def _checked(url: str) -> str:
     return url.rstrip("/")
 
 
-def _printable(key: str) -> str:
-    key = key.strip()
-    if not (key.isascii() and key.isprintable()):
-        raise InvalidInput("the API key holds characters that no key has")
-    return key
+def _printable(what: str, text: str) -> str:
+    text = text.strip()
+    if not (text.isascii() and text.isprintable()):
+        raise InvalidInput(f"the {what} holds characters that no {what} has: expected printable ASCII")
+    return text
 
 
 @lru_cache(maxsize=1024)  # the same few come with every call

@@ -1,9 +1,9 @@
 """From what a server answers to the LeagueError that says so."""
 
-from collections.abc import Mapping
-from typing import Any
+import httpx
 
 from league import errors
+from league.client.patience import asked_for, told
 from league.errors import InvalidInput, LeagueError, RateLimited, RemoteError
 
 BY_CODE = {
@@ -11,14 +11,12 @@ BY_CODE = {
 }
 
 
-def fault(status: int, told: Mapping[str, Any] | None, text: str, where: str) -> LeagueError:
-    """The error for an answer that is none.
-
-    told: its JSON object, `code` and `message`; None if it is no server of ours that answers. text: the answer itself.
-    """
-    if told is None or "code" not in told or "message" not in told:
-        return RemoteError(f"{where} answered {status}: {text[:200]}")
-    kind = BY_CODE.get(told["code"])
+def fault(reply: httpx.Response, where: str) -> LeagueError:
+    """The error that a reply is; one that is no JSON object with `code` and `message` is not of a server of ours."""
+    document = told(reply)
+    if document is None or "code" not in document or "message" not in document:
+        return RemoteError(f"{where} answered {reply.status_code}: {reply.text[:200]}")
+    kind = BY_CODE.get(document["code"])
     if kind is RateLimited:
-        return RateLimited(told["message"], float(told.get("retry_after", 1.0)))
-    return (kind or (InvalidInput if status < 500 else RemoteError))(told["message"])
+        return RateLimited(document["message"], asked_for(reply))
+    return (kind or (InvalidInput if reply.status_code < 500 else RemoteError))(document["message"])

@@ -43,7 +43,7 @@ class Attempts:
         if isinstance(outcome, httpx.Response) and outcome.status_code < 400:
             return None
         seconds = min(self._seconds, hope(outcome))
-        return self.pause_within(seconds, _asked_for(outcome)) if seconds > 0 else None
+        return self.pause_within(seconds, asked_for(outcome)) if seconds > 0 else None
 
     def pause_within(self, seconds: float, least: float = 0.0) -> float | None:
         """The next pause, of `least` seconds or more; None if more than `seconds` would have passed by its end."""
@@ -71,7 +71,7 @@ def told(reply: httpx.Response) -> dict[str, Any] | None:
     return document if isinstance(document, dict) else None
 
 
-def _asked_for(outcome: Outcome) -> float:
+def asked_for(outcome: Outcome) -> float:
     """Seconds that a busy server asks for."""
     if not isinstance(outcome, httpx.Response) or outcome.status_code != 429:
         return 0.0

@@ -9,7 +9,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError
-from league.policies.actions import to_environment
+from league.policies.actions import dist_inputs_size, to_environment
 from league.policies.draws import sample
 from league.policies.policy import Actions, Arrays
 from league.registry.manifest import PolicyManifest
@@ -140,6 +140,9 @@ def _check_graph(inputs: dict[str, Any], outputs: dict[str, Any], manifest: Poli
                     f"{kind} {name} of the graph is {found.get(name, 'missing')}, "
                     f"but {expected.get(name, 'missing')} in the manifest"
                 )
+    found_size, size = outputs[DIST_INPUTS].shape[-1], dist_inputs_size(manifest.action)
+    if isinstance(found_size, int) and found_size != size:
+        raise ArtifactCorrupt(f"{DIST_INPUTS} of the graph has {found_size} values a row, but its actions need {size}")
 
 
 def _dtype(node: Any) -> str:

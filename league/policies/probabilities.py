@@ -37,9 +37,9 @@ def probabilities(dist_inputs: NDArray, space: Space, mask: NDArray | None = Non
 
 def _shares(logits: NDArray, mask: NDArray | None) -> NDArray:
     """Softmax, (k, n) float64."""
-    weights = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
     if mask is not None:
-        weights *= mask != 0
+        logits = np.where(mask != 0, logits, -np.inf)
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
     return weights / weights.sum(axis=1, keepdims=True)
 
 
@@ -49,6 +49,6 @@ def _gaussian(dist_inputs: NDArray, space: Box) -> tuple[NDArray, NDArray]:
     deviations = np.exp(log_deviations)
     low, high = (np.ravel(bound) for bound in bounds(space))
     finite = np.isfinite(low) & np.isfinite(high)
-    half = np.where(finite, high / 2 - low / 2, 1.0)
-    centre = np.where(finite, high / 2 + low / 2, 0.0)
+    low, high = np.where(finite, low, -1.0), np.where(finite, high, 1.0)
+    half, centre = high / 2 - low / 2, high / 2 + low / 2
     return centre + means * half, deviations * half

@@ -18,6 +18,9 @@ from league.policies.agreement import excused
 from league.policies.onnx import ACTION, STATE_IN, OnnxPolicy
 from league.spaces import Space
 
+LARGEST = 256 * 2**20
+"""Bytes of an archive's arrays. A thousandth of that may be in the file."""
+
 
 @dataclass(frozen=True, slots=True)
 class Probes:
@@ -45,10 +48,16 @@ class Probes:
     def from_bytes(cls, archive: bytes, source: str) -> Self:
         """Read an archive. `source` names it in the ArtifactCorrupt that a wrong one raises."""
         try:
+            with zipfile.ZipFile(io.BytesIO(archive)) as listed:
+                size = sum(entry.file_size for entry in listed.infolist())
+            if size > LARGEST:
+                raise ValueError(f"{size} bytes when they are decompressed, expected at most {LARGEST}")
             with np.load(io.BytesIO(archive), allow_pickle=False) as file:
                 arrays: dict[str, NDArray] = {name: file[name] for name in file.files}
+            if strangers := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
+                raise ValueError(f"{strangers[0]} is no array")
             actions = arrays.pop(ACTION)
-        except (ValueError, LookupError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        except Exception as error:  # whatever zipfile, its decompressors and NumPy make of bytes that are none
             raise ArtifactCorrupt(f"{source} holds no probes: {' '.join(str(error).split())}") from error
         if (
             not actions.ndim

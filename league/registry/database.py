@@ -1,12 +1,14 @@
 """One connection pool with two kinds of transaction, alike on SQLite and PostgreSQL."""
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from urllib.parse import quote
 
 from sqlalchemy import Connection, CursorResult, Engine, Executable, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
@@ -14,11 +16,13 @@ from sqlalchemy.exc import (
     ArgumentError,
     DatabaseError,
     DBAPIError,
+    DisconnectionError,
     InterfaceError,
     InternalError,
     OperationalError,
 )
 from sqlalchemy.orm import Session
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from league.errors import ConfigError, StorageError
 from league.registry import schema
@@ -27,6 +31,8 @@ from league.registry.tables import Table
 
 BUSY_SECONDS = 30
 """How long a transaction waits for another process's before it gives up."""
+FILE = "file"
+"""In a connection's `info`: the file that it has open, by device and inode."""
 STORAGE_FAULTS = (OperationalError, DatabaseError, InterfaceError, InternalError)
 """Disk full, read-only, locked, no database, no server. Others (a violated constraint) are for the caller."""
 
@@ -34,8 +40,9 @@ STORAGE_FAULTS = (OperationalError, DatabaseError, InterfaceError, InternalError
 class Database:
     """Sessions on the registry's database, whose schema is the newest once this exists."""
 
-    def __init__(self, url: str) -> None:
-        self.engine = _engine(url)
+    def __init__(self, url: str, create: bool = True) -> None:
+        """create: make an SQLite file that is not there. Raises StorageError or ConfigError."""
+        self.engine = _engine(url, create)
         self._writing = self.engine.execution_options(writes=True)
         try:
             with translated(self.engine):
@@ -105,7 +112,7 @@ def translated(engine: Engine) -> Iterator[None]:
         raise StorageError(f"the database {where} cannot be used: {reason}") from error
 
 
-def _engine(url: str) -> Engine:
+def _engine(url: str, create: bool) -> Engine:
     try:
         parsed = make_url(url)
     except ArgumentError:
@@ -117,13 +124,49 @@ def _engine(url: str) -> Engine:
         return _postgresql(url)
     if not parsed.database or parsed.database == ":memory:":
         raise ConfigError(f"LEAGUE_DATABASE_URL {url!r} names no file: expected sqlite:////path/to/league.db")
-    directory = Path(parsed.database).parent
-    with disk_faults(directory):
-        directory.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(parsed, json_serializer=_strict_json, connect_args={"timeout": BUSY_SECONDS})
+    return _sqlite(url, Path(parsed.database), create)
+
+
+def _sqlite(url: str, path: Path, create: bool) -> Engine:
+    if create:
+        with disk_faults(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    engine = create_engine(url, json_serializer=_strict_json, connect_args={"timeout": BUSY_SECONDS})
+    event.listen(engine, "do_connect", _open_existing)
     event.listen(engine, "connect", _prepare_sqlite)
+    event.listen(engine, "checkout", _refuse_moved)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
+
+
+def _open_existing(
+    _: object, record: ConnectionPoolEntry, arguments: list[Any], options: dict[str, Any]
+) -> sqlite3.Connection | None:
+    """Never make a file: one that is made while the database is elsewhere would be taken for it, and be mixed with its
+    write-ahead log."""
+    path = arguments[0]
+    record.info[FILE] = path, _identity(path)
+    if record.info[FILE][1] is None:
+        raise StorageError(f"the database {path} is not there")
+    arguments[0] = f"file:{quote(path)}?mode=rw"
+    options["uri"] = True
+    return None
+
+
+def _refuse_moved(_: object, record: ConnectionPoolEntry, __: object) -> None:
+    """A connection stays with its file when that is moved away or replaced: then open what has that name now."""
+    path, opened = record.info[FILE]
+    if _identity(path) != opened:
+        raise DisconnectionError(f"{path} is another file by now")
+
+
+def _identity(path: str) -> tuple[int, int] | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _postgresql(url: str) -> Engine:

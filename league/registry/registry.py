@@ -59,10 +59,10 @@ class Registry:
         self.artifacts = ArtifactStore(storage.artifacts)
 
     @classmethod
-    def open(cls, storage: Storage | None = None) -> Self:
-        """The registry at `storage`, by default that of the environment; made or migrated if need be."""
+    def open(cls, storage: Storage | None = None, create: bool = True) -> Self:
+        """The registry at `storage`, by default that of the environment; made (if `create`) or migrated if need be."""
         storage = storage or Storage.from_environment()
-        return cls(storage, Database(storage.database_url))
+        return cls(storage, Database(storage.database_url, create))
 
     def close(self) -> None:
         """Give the connections back."""

@@ -17,7 +17,7 @@ from urllib.parse import parse_qsl
 import orjson
 from starlette.types import Receive, Scope, Send
 
-from league.errors import Overloaded
+from league.errors import InvalidInput, Overloaded
 from league.refs import CHAMPION
 from serve_app.access_log import LINE, answered_by
 from serve_app.acting import act_as_asked, is_plain, read_given_state, reply_to, written_state
@@ -32,6 +32,8 @@ from serve_app.shadow import Shadow, Show
 REPLICA = b"x-league-replica"
 API = "action"
 """What this route is called in metrics."""
+MOST_PARAMETERS = 16
+"""In a query."""
 
 
 class ActionRoute:
@@ -63,7 +65,7 @@ class ActionRoute:
         refuse_unknown(document, KEYS)
         ask = read_ask(document, self._settings.max_batch)
         model = scope["path_params"]["model"]
-        asked = pinned_version(ask, query(scope).get("version", CHAMPION))
+        asked = pinned_version(ask, model, query(scope).get("version", CHAMPION))
         version, policy = await self._models.find(model, asked, scope["headers"])
         reply = await _reply(ask, body.count(b'"'), version, policy, self._shadow.of(model, version))
         reply |= {"model": model, "version": version.number, "sha256": version.sha256}
@@ -74,9 +76,14 @@ class ActionRoute:
 
 
 def query(scope: Scope) -> dict[str, str]:
-    """What stands behind the question mark."""
+    """What stands behind the question mark. Raises InvalidInput."""
     text: bytes = scope["query_string"]
-    return dict(parse_qsl(text.decode("latin-1"), keep_blank_values=True, max_num_fields=16)) if text else {}
+    if not text:
+        return {}
+    try:
+        return dict(parse_qsl(text.decode("latin-1"), keep_blank_values=True, max_num_fields=MOST_PARAMETERS))
+    except ValueError:
+        raise InvalidInput(f"the query has more than {MOST_PARAMETERS} parameters") from None
 
 
 async def _reply(

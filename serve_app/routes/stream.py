@@ -56,7 +56,7 @@ class StreamRoute:
         return stream, [(name, value.encode()) for name, value in headers.items()]
 
     async def _converse(self, stream: Stream, scope: Scope, receive: Receive, send: Send) -> None:
-        if (direct := scope["extensions"].get(DIRECT)) is not None:
+        if (direct := scope.get("extensions", {}).get(DIRECT)) is not None:
             direct.converse(stream)
         while (message := await receive())["type"] == "websocket.receive":
             text = message.get("text")

@@ -1,10 +1,10 @@
 """A replica's application on a uvicorn of its own, as Ray Serve starts it: with our protocol for WebSockets."""
 
-import asyncio
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import uvicorn
 
@@ -34,13 +34,17 @@ class Listening:
 
 
 @contextmanager
-def listening(storage: Storage, settings: ServeSettings = QUICK) -> Iterator[Listening]:
-    """A replica in a thread of its own, on a free port of this machine."""
+def listening(
+    storage: Storage, settings: ServeSettings = QUICK, replica: str = "replica-1", port: int = 0, **options: Any
+) -> Iterator[Listening]:
+    """A replica in a thread of its own, on a port of this machine, by default a free one. options: of uvicorn."""
     install(settings.max_body)
-    server = Server(Registry.open(storage), settings, "replica-1")
-    config = uvicorn.Config(server.application(), port=0, log_config=None, log_level="critical", access_log=False)
+    server = Server(Registry.open(storage), settings, replica)
+    config = uvicorn.Config(
+        server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
+    )
     runner = uvicorn.Server(config)
-    thread = threading.Thread(target=lambda: asyncio.run(runner.serve()), daemon=True)
+    thread = threading.Thread(target=runner.run, daemon=True)
     thread.start()
     while not runner.started:
         assert thread.is_alive()

@@ -1,8 +1,10 @@
 """A replica follows the registry, says what it serves, and goes on when the registry is gone."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
+from pathlib import Path
 from time import monotonic
 
 import pytest
@@ -12,6 +14,7 @@ from starlette.testclient import TestClient
 from league.errors import StorageError
 from league.registry.registry import Registry
 from league.registry.rows import Acknowledgement
+from league.settings import Storage
 from serve_app.app import Server
 from tests.serve_app.conftest import QUICK, replica
 from tests.serve_app.leagues import promote
@@ -130,3 +133,21 @@ def test_serving_outlives_the_artefacts(client: TestClient, registry: Registry) 
     assert act(client, observation=BOARD)["version"] == 1
     registry.artifacts.root.with_name("elsewhere").rename(registry.artifacts.root)
     until(lambda: serves(registry, 2))
+
+
+def test_an_empty_registry_in_the_place_of_the_one_that_was_followed_is_not_followed(
+    registry: Registry, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with replica(registry.storage) as client:
+        assert act(client, observation=BOARD)["version"] == 1
+        Registry.open(Storage.at(tmp_path / "other")).close()
+        home = registry.storage.home
+        home.rename(tmp_path / "away")
+        (tmp_path / "other").rename(home)
+        until(lambda: "not the one that was there" in caplog.text)
+        assert client.get("/v1/leagues").json() == {"leagues": []}
+        assert act(client, observation=BOARD)["version"] == 1
+        shutil.rmtree(home)
+        (tmp_path / "away").rename(home)
+        promote(registry, "board", 2)
+        until(lambda: act(client, observation=BOARD)["version"] == 2)

@@ -31,6 +31,11 @@ class Loop:
         await asyncio.sleep(0)
         return admitted
 
+    async def idle(self) -> None:
+        """Turns in which nobody comes."""
+        for _ in range(3):
+            await asyncio.sleep(0)
+
 
 async def test_a_short_queue_is_never_cut() -> None:
     loop = Loop()
@@ -50,10 +55,16 @@ async def test_bursts_that_come_now_and_then_are_not_cut() -> None:
     loop = Loop()
     for _ in range(20):
         assert await loop.turn(100, 0.05) == 100
-        loop.now += 10
+        await loop.idle()
 
 
 async def test_one_turn_that_takes_long_is_not_a_queue_that_stays() -> None:
     loop = Loop()
     assert await loop.turn(10, 5.0) == 10
     assert await loop.turn(10, 0.01) == 10
+
+
+async def test_turns_that_take_longer_than_patience_are_cut_too() -> None:
+    loop = Loop()
+    assert [await loop.turn(10, 3 * PATIENCE) for _ in range(2)] == [10] * 2
+    assert [await loop.turn(10, 3 * PATIENCE) for _ in range(20)] == [LIMIT] * 20

@@ -180,6 +180,18 @@ def test_keys_that_are_known_stay_while_the_database_is_gone(registry: Registry)
         registry.storage.home.with_name("elsewhere").rename(registry.storage.home)
 
 
+def test_a_registry_that_has_lost_its_keys_opens_no_door(
+    registry: Registry, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    registry.create_key("bot", ["act"])
+    Registry.open(Storage.at(tmp_path / "other")).close()
+    with served(registry) as client:
+        registry.storage.home.rename(tmp_path / "away")
+        (tmp_path / "other").rename(registry.storage.home)
+        until(lambda: "has no API key any more" in caplog.text)
+        assert client.post(ACTION, json=BODY).status_code == 401
+
+
 def test_a_standing_queue_is_cut(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     server = Server(Registry.open(registry.storage), QUICK, "replica-1")
 

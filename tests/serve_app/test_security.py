@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 
+import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper
@@ -29,7 +30,9 @@ from starlette.testclient import TestClient
 from league.registry.manifest import MANIFEST, Manifest
 from league.registry.registry import Registry
 from league.registry.tables import Version
+from serve_app.stream_framing import FRAMING, REQUEST
 from tests.league.policies.graphs import masked_mlp
+from tests.league.policies.test_probes import probes
 from tests.serve_app.leagues import promote, publish
 from tests.serve_app.test_action import BOARD, act
 
@@ -154,6 +157,61 @@ def test_a_booby_trapped_version_is_refused_and_the_champion_stays(
     assert not mark.exists()
 
 
+def pickled_array(trap: bytes) -> bytes:
+    """An array of objects as NumPy writes it: a head, and a pickle."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "|O", "fortran_order": False, "shape": (1,)})
+    return buffer.getvalue() + trap
+
+
+def archive(content: bytes, name: str = "action.npy") -> bytes:
+    """An archive of arrays as NumPy writes it."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as entries:
+        entries.writestr(name, content)
+    return buffer.getvalue()
+
+
+def damaged(content: bytes) -> bytes:
+    """Bytes that a decompressor stumbles over."""
+    return content[:60] + b"\xff" * 20 + content[80:]
+
+
+RECORDED: dict[str, Callable[[bytes], bytes]] = {
+    "a pickle": lambda trap: trap,
+    "an array of objects": pickled_array,
+    "an archive with an array of objects": lambda trap: archive(pickled_array(trap)),
+    "an archive with a pickle": lambda trap: archive(trap),
+    "an archive with a pickle of another name": lambda trap: archive(trap, "action.pkl"),
+    "a checkpoint of torch": torch_checkpoint,
+    "a damaged archive": lambda trap: damaged(archive(pickled_array(trap) + os.urandom(1000))),
+    "an archive of zeros": lambda _: archive(bytes(300 * 2**20)),
+}
+
+
+@pytest.mark.parametrize("kind", RECORDED)
+def test_booby_trapped_probes_are_refused_and_the_champion_stays(
+    client: TestClient, registry: Registry, trap: bytes, mark: Path, kind: str
+) -> None:
+    version = publish(registry, "board", {"shared": masked_mlp(seed=0)}, "run/trap", {"shared": probes()})
+    swap(registry, version.number, version.manifest, {"shared.probes.npz": RECORDED[kind](trap)})
+    with nothing_runs():
+        promote(registry, "board", version.number)
+        until(lambda: "holds no probes" in (faults(client) or [""])[0])
+        assert act(client, observation=BOARD)["version"] == 1
+    assert not mark.exists()
+
+
+def test_a_pickle_beside_the_files_of_the_manifest_is_refused(
+    client: TestClient, registry: Registry, trap: bytes, mark: Path
+) -> None:
+    (registry.artifacts.path("board", 2) / "weights.pkl").write_bytes(trap)
+    with nothing_runs():
+        promote(registry, "board", 2)
+        until(lambda: "does not belong to board@2" in (faults(client) or [""])[0])
+    assert not mark.exists()
+
+
 @pytest.mark.parametrize("name", ["../2/shared.onnx", "/etc/passwd", "missing.onnx", ".", "", "shared.onnx/x"])
 def test_a_manifest_that_names_other_files_is_refused(client: TestClient, registry: Registry, name: str) -> None:
     version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
@@ -234,6 +292,14 @@ def test_a_booby_trapped_request_is_refused(
         b'{"observation": {"__reduce__": ["os.system", ["touch %s"]]}}' % str(mark).encode(),
         b'{"py/object": "os.system", "py/reduce": ["touch %s"]}' % str(mark).encode(),
         b'{"inputs": [{"name": "observation", "shape": [1], "datatype": "BYTES", "data": ["%s"]}]}' % text.encode(),
+        b'{"observation": {"b64": "%s", "dtype": "object", "shape": [1]}}' % text.encode(),
+        *(
+            b'{"observation": {"observation": {"%s": "%s"}, "action_mask": [1, 1, 1, 1, 1, 1, 1]}}' % (key, encoded)
+            for key in (b"b64", b"png")
+            for encoded in map(base64.b64encode, (trap, pickled_array(trap), archive(pickled_array(trap))))
+        ),
+        b'{"observation": [1], "state": "%s"}' % base64.urlsafe_b64encode(trap).rstrip(b"="),
+        b'{"observation": [1], "state": {"state_in_0": "%s"}}' % text.encode(),
         b"!!python/object/apply:os.system ['touch %s']" % str(mark).encode(),
     ]
     with nothing_runs():
@@ -249,6 +315,18 @@ def test_a_booby_trapped_request_is_refused(
     assert not mark.exists()
     reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers={"x-api-key": token})
     assert reply.json()["version"] == 1
+
+
+def test_a_booby_trapped_message_of_a_stream_is_refused(client: TestClient, trap: bytes, mark: Path) -> None:
+    text = base64.b64encode(trap).decode()
+    with nothing_runs(), client.websocket_connect("/v1/policies/memory/stream") as stream:
+        for data in (trap, REQUEST.pack(FRAMING, 0, 0, 1, 0) + trap, pickled_array(trap), archive(pickled_array(trap))):
+            stream.send_bytes(data)
+            assert stream.receive_json()["status"] == 400
+        for document in ({"observation": text}, {"observation": {"b64": text}}, {"observation": [1], "state": text}):
+            stream.send_json(document)
+            assert stream.receive_json()["status"] == 400
+    assert not mark.exists()
 
 
 def swap(registry: Registry, number: int, manifest: Manifest, files: dict[str, bytes]) -> None:

@@ -5,16 +5,20 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic, sleep
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
 
 from league.client import Client
+from league.client.conversation import Conversation
+from league.client.stream import Stream
 from league.errors import UnknownLeague
 from league.policies.onnx import OnnxPolicy
 from league.policies.remote import RemotePolicy
@@ -26,6 +30,7 @@ from serve_app import haproxy
 from serve_app.launch import running
 from tests.league.policies.graphs import masked_mlp
 from tests.serve_app.leagues import everything, promote, publish
+from tests.serve_app.scaling import scale
 from tests.serve_app.test_action import BOARD
 
 ACTION = "/v1/policies/board/action"
@@ -41,8 +46,11 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
 
 @pytest.fixture(scope="module")
 def url(served: Registry) -> Iterator[str]:
-    with running(served.storage, replicas=2) as url:
-        yield url
+    with pytest.MonkeyPatch.context() as environment:
+        # A replica that is to stop stays open for 30 s else.
+        environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
+        with running(served.storage, replicas=2) as url:
+            yield url
     until(lambda: not processes(served.storage, ""), seconds=10)  # a server that stopped leaves no process
 
 
@@ -234,6 +242,56 @@ def test_the_death_of_a_replica_costs_our_client_no_request(url: str, served: Re
         until(lambda: seen.versions.total() > after + 2000)
     assert seen.failures == []
     until(lambda: len(set(processes(served.storage, "ServeReplica")) - {victim}) == 2)
+
+
+def test_promotions_end_no_stream(url: str, served: Registry) -> None:
+    promote(served, "board", 1)
+    until(lambda: serving(served, 1) >= 2)
+    with Client(url) as client, client.stream("board") as pinned, client.stream("board", follow=True) as following:
+        for version in (2, 3, 1):
+            pinned.act(BOARD)
+            promote(served, "board", version)
+            until(lambda version=version: serving(served, version) == 2)
+            for stream in (pinned, following):
+                stream.act(BOARD)
+            assert (pinned.version, following.version) == (1, version)
+
+
+def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> None:
+    """The observations are ones, and the third action is 1: whoever forgot what was before would answer 0."""
+    with Client(url) as client, ExitStack() as until_done:
+        streams = [until_done.enter_context(client.stream("memory")) for _ in range(6)]
+        for _ in range(2):
+            assert [stream.act([1.0]) for stream in streams] == [0] * 6
+        assert len(replicas(streams)) == 2
+        with ended_streams() as codes:
+            scale(processes(served.storage, "ServeReplica"), processes(served.storage, "raylet")[0], 1)
+            until(lambda: [stream.act([0.0]) for stream in streams] and len(replicas(streams)) == 1)
+        assert codes
+        assert set(codes) == {1012}
+        assert [stream.act([1.0]) for stream in streams] == [1] * 6
+        scale(processes(served.storage, "ServeReplica"), processes(served.storage, "raylet")[0], 2)
+    until(lambda: serving(served, 1) >= 2)
+
+
+def replicas(streams: list[Stream]) -> set[str]:
+    return {stream.last.replica for stream in streams if stream.last is not None}
+
+
+@contextmanager
+def ended_streams() -> Iterator[list[int]]:
+    """The codes by which servers close streams of our client while the context lasts."""
+    codes: list[int] = []
+    lost = Conversation.lost
+
+    def noted(self: Conversation, error: Exception) -> Any:
+        assert isinstance(error, ConnectionClosed), error
+        codes.append(error.rcvd.code if error.rcvd is not None else 1006)
+        return lost(self, error)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Conversation, "lost", noted)
+        yield codes
 
 
 def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:

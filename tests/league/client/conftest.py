@@ -1,20 +1,66 @@
-"""A replica's application behind a real socket, in a thread: what a client talks to. No Ray, no HAProxy."""
+"""What a client talks to: a replica's application behind a real socket. No Ray, no HAProxy."""
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import asyncio
+import inspect
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
-import uvicorn
 
+from league.client import AsyncClient, Client
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.app import Server
-from serve_app.settings import ServeSettings
 from tests.serve_app.conftest import QUICK
 from tests.serve_app.inference_protocol.leagues import every_kind
+from tests.serve_app.leagues import everything
+from tests.serve_app.streaming import Listening, listening
 
 SETTINGS = QUICK.model_copy(update={"max_body": 512 * 1024})
+
+Connect = Callable[..., Client]
+
+
+class Awaited:
+    """An AsyncClient, stream or episode whose every method waits for its result, so that one test does for both."""
+
+    def __init__(self, awaited: Any, runner: asyncio.Runner) -> None:
+        self._awaited = awaited
+        self._runner = runner
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._awaited, name)
+        if not callable(found):
+            return found
+        return lambda *args, **options: self._waited_for(found(*args, **options))
+
+    def __enter__(self) -> "Awaited":
+        self._runner.run(self._awaited.__aenter__())
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._runner.run(self._awaited.__aexit__(*error))
+
+    def _waited_for(self, result: Any) -> Any:
+        if inspect.iscoroutine(result):
+            return self._runner.run(result)
+        return Awaited(result, self._runner) if hasattr(result, "__aenter__") else result
+
+
+@pytest.fixture(params=[Client, AsyncClient], ids=["sync", "async"])
+def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
+    """Makes clients of either kind."""
+    made: list[Any] = []
+    with asyncio.Runner() as runner:
+
+        def connected(*args: Any, **options: Any) -> Any:
+            client = request.param(*args, **options)
+            made.append(Awaited(client, runner) if request.param is AsyncClient else client)
+            return made[-1]
+
+        yield connected
+        for client in made:
+            client.close()
 
 
 @pytest.fixture(scope="session")
@@ -28,31 +74,20 @@ def leagues(tmp_path_factory: pytest.TempPathFactory) -> Storage:
 @pytest.fixture(scope="session")
 def url(leagues: Storage) -> Iterator[str]:
     """A replica, for tests that change nothing."""
-    with listening(leagues) as url:
-        yield url
+    with listening(leagues, SETTINGS) as listener:
+        yield listener.url
 
 
-@contextmanager
-def listening(storage: Storage, settings: ServeSettings = SETTINGS, port: int = 0) -> Iterator[str]:
-    """A replica of its own, which listens while the context lasts; yields its URL."""
-    application = Server(Registry.open(storage), settings, "replica-1").application()
-    config = uvicorn.Config(
-        application,
-        host="127.0.0.1",
-        port=port,
-        log_level="warning",
-        ws="websockets-sansio",
-        timeout_graceful_shutdown=1,
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        while not server.started:
-            assert thread.is_alive(), "the server did not start"
-            thread.join(0.01)
-        (listener,) = server.servers
-        yield f"http://127.0.0.1:{listener.sockets[0].getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join()
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    """Leagues of every kind, for a test that changes them."""
+    registry = everything(Storage.at(tmp_path / "home"))
+    yield registry
+    registry.close()
+
+
+@pytest.fixture
+def listener(registry: Registry) -> Iterator[Listening]:
+    """A replica that follows `registry`."""
+    with listening(registry.storage) as listener:
+        yield listener

@@ -1,9 +1,8 @@
 """Both clients against a real replica: they send, read and refuse alike."""
 
-import asyncio
 import inspect
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,48 +26,14 @@ from league.errors import (
 )
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
-from league.settings import Storage
-from tests.league.client.conftest import listening
+from league.registry.rows import Portion
+from serve_app.traffic import position
+from tests.league.client.conftest import Connect
 from tests.league.policies.graphs import masked_mlp
-from tests.serve_app.leagues import everything
+from tests.serve_app.streaming import Listening, listening
+from tests.serve_app.test_alias_watcher import until
 
 BOARD = {"observation": np.zeros((6, 7, 2), np.int8), "action_mask": np.ones(7, np.int8)}
-
-
-class Awaited:
-    """An AsyncClient whose every method waits for its result: what the tests of both clients call."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        self._runner = asyncio.Runner()
-        self._client = AsyncClient(*args, **options)
-
-    def __getattr__(self, name: str) -> Any:
-        found = getattr(self._client, name)
-        return self._waiting(found) if inspect.iscoroutinefunction(found) else found
-
-    def close(self) -> None:
-        self._runner.run(self._client.close())
-        self._runner.close()
-
-    def _waiting(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda *args, **options: self._runner.run(function(*args, **options))
-
-
-Connect = Callable[..., Client]
-
-
-@pytest.fixture(params=[Client, Awaited], ids=["sync", "async"])
-def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
-    """Makes clients of either kind."""
-    made = []
-
-    def connected(*args: Any, **options: Any) -> Client:
-        made.append(request.param(*args, **options))
-        return made[-1]
-
-    yield connected
-    for client in made:
-        client.close()
 
 
 def test_the_two_clients_are_called_alike() -> None:
@@ -156,12 +121,12 @@ def test_probabilities_come_if_they_are_asked_for(connect: Connect, url: str) ->
 
 def test_recurrent_state_is_a_token_for_the_next_call(connect: Connect, url: str) -> None:
     client = connect(url)
-    observation = np.zeros(1, np.float32)
+    observation = np.ones(1, np.float32)
     first = client.act("memory", observation)
     second = client.act("memory", observation, state=first.state)
     assert isinstance(first.state, str)
     assert second.state != first.state
-    batch = client.act_batch("memory", np.zeros((2, 1), np.float32), state=[first.state, None])
+    batch = client.act_batch("memory", np.ones((2, 1), np.float32), state=[first.state, None])
     assert batch.state == [second.state, first.state]
     assert batch.answer(0).action == second.action
 
@@ -213,70 +178,75 @@ def test_a_server_that_is_not_there(connect: Connect) -> None:
         client.leagues()
 
 
-@pytest.mark.parametrize("options", [{"url": "127.0.0.1:8000"}, {"timeout": 0.0}, {"key": "é"}])
+@pytest.mark.parametrize("options", [{"url": "127.0.0.1:8000"}, {"timeout": 0.0}, {"key": "é"}, {"caller": "é"}])
 def test_what_no_client_can_be_made_of(connect: Connect, options: dict[str, Any]) -> None:
     with pytest.raises(InvalidInput):
         connect(**options)
 
 
-@pytest.fixture
-def guarded(registry: Registry) -> Iterator[str]:
-    """A replica that asks for keys, of leagues that may change."""
-    registry.create_key("somebody", ["act"])
-    with listening(registry.storage) as url:
-        yield url
-
-
-@pytest.fixture
-def registry(tmp_path: Any) -> Iterator[Registry]:
-    registry = everything(Storage.at(tmp_path / "home"))
-    yield registry
-    registry.close()
-
-
-def test_keys_open_what_they_are_for(
-    connect: Connect, guarded: str, registry: Registry, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_keys_open_what_they_are_for(connect: Connect, registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     _, token = registry.create_key("player", ["act"])
-    with pytest.raises(Unauthenticated):
-        connect(guarded).act("board", BOARD)
-    monkeypatch.setenv("LEAGUE_API_KEY", token)
-    client = connect(guarded)
-    client.wait_until_ready()
-    assert client.act("board", BOARD).version == 1
-    with pytest.raises(Forbidden, match="scope promote: player is for act"):
-        client.promote("board@2")
+    with listening(registry.storage) as listener:
+        with pytest.raises(Unauthenticated):
+            connect(listener.url).act("board", BOARD)
+        monkeypatch.setenv("LEAGUE_API_KEY", token)
+        client = connect(listener.url)
+        client.wait_until_ready()
+        assert client.act("board", BOARD).version == 1
+        with pytest.raises(Forbidden, match="scope promote: player is for act"):
+            client.promote("board@2")
+        with client.stream("board") as stream:
+            assert stream.act(BOARD) == client.act("board", BOARD).action
+            registry.revoke_key("player")
+            with pytest.raises(Unauthenticated, match="revoked"):
+                until(lambda: stream.act(BOARD) is None)
 
 
-def test_a_key_s_rate_is_waited_for_as_long_as_there_is_patience(
-    connect: Connect, guarded: str, registry: Registry
-) -> None:
+def test_a_key_s_rate_is_waited_for_as_long_as_there_is_patience(connect: Connect, registry: Registry) -> None:
     _, token = registry.create_key("slow", ["act"], rate=1.0)
-    hasty = connect(guarded, key=token, patience=0.0)
-    with pytest.raises(RateLimited) as raised:
-        deque((hasty.act("board", BOARD) for _ in range(5)), maxlen=0)
-    assert raised.value.wait == 1
-    patient = connect(guarded, key=token, patience=30.0)
-    assert [patient.act("board", BOARD).version for _ in range(2)] == [1, 1]
+    with listening(registry.storage) as listener:
+        hasty = connect(listener.url, key=token, patience=0.0)
+        with pytest.raises(RateLimited) as raised:
+            deque((hasty.act("board", BOARD) for _ in range(5)), maxlen=0)
+        assert raised.value.wait == 1
+        patient = connect(listener.url, key=token, patience=30.0)
+        assert [patient.act("board", BOARD).version for _ in range(2)] == [1, 1]
+        with patient.stream("board") as stream:
+            assert [stream.act(BOARD) for _ in range(2)] == [patient.act("board", BOARD).action] * 2
 
 
-def test_promotions_are_applied_once_and_followed_everywhere(
-    connect: Connect, guarded: str, registry: Registry
-) -> None:
+def test_promotions_are_applied_once_and_followed_everywhere(connect: Connect, registry: Registry) -> None:
     _, token = registry.create_key("operator", ["act", "read", "promote"])
-    client = connect(guarded, key=token)
-    moved = client.promote("board@2", expected=1, reason="better", wait=30)
-    assert (moved.version, moved.previous, moved.actor, moved.reason) == (2, 1, "operator", "better")
-    assert client.act("board", BOARD).version == 2
-    with pytest.raises(AliasMoved):
-        client.promote("board@3", expected=1)
-    same = [client.promote("board@3", idempotency_key="once") for _ in range(2)]
-    assert same[0] == same[1]
-    with pytest.raises(KeyReused):
-        client.promote("board@1", idempotency_key="once")
-    back = client.rollback("board", wait=30)
-    assert (back.kind, back.version) == ("rollback", 2)
-    assert client.promote("board@1", alias="candidate", expected=None, wait=30).alias == "candidate"
-    assert client.act("board@candidate", BOARD).version == 1
-    with pytest.raises(InvalidInput, match="expected the number"):
-        client.promote("board@candidate")
+    with listening(registry.storage) as listener:
+        client = connect(listener.url, key=token)
+        moved = client.promote("board@2", expected=1, reason="better", wait=30)
+        assert (moved.version, moved.previous, moved.actor, moved.reason) == (2, 1, "operator", "better")
+        assert client.act("board", BOARD).version == 2
+        with pytest.raises(AliasMoved):
+            client.promote("board@3", expected=1)
+        same = [client.promote("board@3", idempotency_key="once") for _ in range(2)]
+        assert same[0] == same[1]
+        with pytest.raises(KeyReused):
+            client.promote("board@1", idempotency_key="once")
+        back = client.rollback("board", wait=30)
+        assert (back.kind, back.version) == ("rollback", 2)
+        assert client.promote("board@1", alias="candidate", expected=None, wait=30).alias == "candidate"
+        assert client.act("board@candidate", BOARD).version == 1
+        with pytest.raises(InvalidInput, match="expected the number"):
+            client.promote("board@candidate")
+
+
+def test_a_caller_stays_with_one_version_while_a_canary_is_tried(
+    connect: Connect, registry: Registry, listener: Listening
+) -> None:
+    setting = registry.set_traffic("board", canary=Portion(2, 0.5), actor="test", reason="test")
+    until(lambda: [one.traffic for one in registry.acknowledgements("board")] == [setting.id])
+    expected = {f"player-{i}": 2 if position("board", b"player-%d" % i) < 0.5 else 1 for i in range(20)}
+    assert set(expected.values()) == {1, 2}
+    for caller, version in expected.items():
+        client = connect(listener.url, caller=caller)
+        assert client.act("board", BOARD).version == version
+        with client.stream("board", follow=True) as stream:
+            stream.act(BOARD)
+            assert stream.version == version
+    assert connect(listener.url).act("board", BOARD).version == 1

@@ -199,6 +199,11 @@ def test_exploring_needs_a_generator_for_each_row(rng: list[np.random.Generator]
             {"outputs": (Tensor(name="action", dtype="int32", shape=(None,)), manifest().outputs[1])},
             "output action of the graph is int64, but int32 in the manifest",
         ),
+        (
+            GRAPH,
+            {"action": Discrete(n=8)},
+            "action_dist_inputs of the graph has 7 values a row, but its actions need 8",
+        ),
     ],
 )
 def test_a_graph_that_is_not_the_manifest_s_is_refused(graph: bytes, changes: dict[str, Any], message: str) -> None:

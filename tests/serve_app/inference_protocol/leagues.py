@@ -120,10 +120,10 @@ def _graph(
     dist_inputs: str | None = None,
 ) -> bytes:
     if dist_inputs:
-        nodes.append(helper.make_node("Identity", [dist_inputs], ["action_dist_inputs"]))
+        nodes.append(helper.make_node("Concat", [dist_inputs, dist_inputs], ["action_dist_inputs"], axis=1))
     outputs = [
         _value("action", dtype, shape),
-        _value("action_dist_inputs", "float32", (width or shape[0],)),
+        _value("action_dist_inputs", "float32", (width or 2 * shape[0],)),
     ]
     initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
     graph = helper.make_graph(nodes, "policy", inputs, outputs, initializers)

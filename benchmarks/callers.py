@@ -1,0 +1,118 @@
+"""What callers see while a server is hurt: half of them our client, half a client that tries each request once.
+
+`python -m benchmarks.callers URL FILE` asks for actions until standard input ends, then writes what every call saw to
+FILE (an array, see `Seen`). It is a process of its own, so that it shares no interpreter with what hurts the server.
+"""
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.load import drive
+from benchmarks.served_league import BODY, LEAGUE, PLANES
+from league.client import AsyncClient
+from league.errors import LeagueError
+
+ROOT = Path(__file__).parent.parent
+CALLERS = 4
+"""Of each kind. Each calls again as soon as it is answered."""
+OURS, ONCE = 0.0, 1.0
+"""The kinds: our client, which tries again, and one that tries once."""
+
+
+@dataclass
+class Seen:
+    """What the callers of one run saw.
+
+    calls: (n, 4): kind, when it was made, when it ended, by `time.perf_counter`; 1 if it was answered, else 0.
+    errors: what our client raised → how often. Both are there once the callers have stopped.
+    """
+
+    calls: NDArray = field(default_factory=lambda: np.zeros((0, 4)))
+    errors: dict[str, int] = field(default_factory=dict)
+
+    def failed(self, kind: float) -> NDArray:
+        """When the calls of a kind failed."""
+        times: NDArray = self.calls[(self.calls[:, 0] == kind) & (self.calls[:, 3] == 0), 2]
+        return times
+
+    def p99(self, kind: float) -> float:
+        """Milliseconds that all but 1 % of the answered calls took, with all attempts and pauses."""
+        answered = self.calls[(self.calls[:, 0] == kind) & (self.calls[:, 3] == 1)]
+        return float(np.percentile(answered[:, 2] - answered[:, 1], 99) * 1e3) if len(answered) else float("nan")
+
+
+@contextmanager
+def calling(url: str, scratch: Path) -> Iterator[Seen]:
+    """Call in another process while the context lasts, which begins with the first answer."""
+    file = scratch / "calls.npy"
+    command = [sys.executable, "-m", "benchmarks.callers", url, str(file)]
+    seen = Seen()
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as callers:
+        assert callers.stdin is not None
+        assert callers.stdout is not None
+        callers.stdout.readline()
+        try:
+            yield seen
+        finally:
+            callers.stdin.close()
+            told = callers.stdout.read()
+    seen.calls, seen.errors = np.load(file), json.loads(told)
+
+
+def main() -> None:
+    """Call until standard input ends."""
+    import uvloop
+
+    url, file = sys.argv[1:]
+    stop = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+    calls, errors = uvloop.run(_call(url, stop))
+    np.save(file, np.array(calls))
+    print(json.dumps(errors))
+
+
+async def _call(url: str, stop: threading.Event) -> tuple[list[tuple[float, ...]], Counter[str]]:
+    calls: list[tuple[float, ...]] = []
+    errors: Counter[str] = Counter()
+    observation = {"observation": PLANES, "action_mask": np.ones(7, np.int8)}
+
+    def saw(kind: float, sent_at: float, is_answered: bool) -> None:
+        if not calls:
+            print("answered", flush=True)
+        calls.append((kind, sent_at, time.perf_counter(), float(is_answered)))
+
+    def on_reply(status: int, _: bytes, sent_at: float) -> bool:
+        saw(ONCE, sent_at, status == 200)
+        return not stop.is_set()
+
+    async def patient() -> None:
+        async with AsyncClient(url) as client:
+            while not stop.is_set():
+                sent_at = time.perf_counter()
+                try:
+                    await client.act(LEAGUE, observation)
+                except LeagueError as error:
+                    errors[f"{type(error).__name__}: {str(error)[:120]}"] += 1
+                    saw(OURS, sent_at, False)
+                else:
+                    saw(OURS, sent_at, True)
+
+    once = drive(f"{url}/v1/policies/{LEAGUE}/action", BODY, CALLERS, on_reply, lambda: not stop.is_set())
+    await asyncio.gather(once, *(patient() for _ in range(CALLERS)))
+    return calls, errors
+
+
+if __name__ == "__main__":
+    main()

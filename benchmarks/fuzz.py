@@ -1,0 +1,252 @@
+"""What becomes of a replica that is sent 10,000 bodies which nobody should send?
+
+Four tenths are made up from the server's own OpenAPI document by schemathesis, keeping to it or breaking it, for every
+route; four tenths are right requests with bytes changed, cut out or put in, for actions and inferences, in JSON and
+binary, plain and compressed; two tenths are such messages of a stream. All go to one replica over loopback. Counts
+answers by status, and the replica's memory before and after. Target: no 5xx, no dropped connection, the same process
+answers at the end, and its memory has grown by at most 5 % since the first tenth.
+"""
+
+import argparse
+import gzip
+import json
+import sys
+import tempfile
+import zlib
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import httpx
+import psutil
+import requests
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from schemathesis import GenerationMode
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from benchmarks.processes import of_replicas
+from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
+from serve_app.launch import running
+from serve_app.stream_framing import request as message_of
+
+GROWTH = 0.05
+"""Of the replica's memory, at most."""
+ROUTES = ("/v1/policies/{model}/action", "/v2/models/{model}/infer")
+NASTY = [None, True, -1, 2**63, 1e308, "", "\x00", "🎲", [], {}, [[]], {"b64": ""}, {"png": ""}, [None], {"": 0}, "NaN"]
+Request = tuple[str, bytes, dict[str, str]]
+"""Path, body, headers."""
+
+
+def main() -> int:
+    """Print what was counted; 1 if a target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--bodies", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="500 bodies: shows that it works, no more")
+    options = parser.parse_args()
+    bodies = 500 if options.quick else options.bodies
+    with tempfile.TemporaryDirectory() as scratch:
+        registry = publish(Path(scratch) / "home", versions=2)
+        with running(registry.storage, replicas=1) as url, httpx.Client(base_url=url, timeout=30) as client:
+            (replica,) = of_replicas()
+            statuses: Counter[str] = Counter()
+            _warm_up(client, statuses, bodies // 10, options.seed)
+            before = replica.memory_info().rss
+            _from_document(client, statuses, bodies * 4 // 10, options.seed)
+            _changed(client, statuses, bodies - bodies // 10 - bodies * 4 // 10 - bodies * 2 // 10, options.seed)
+            _stream(url, statuses, bodies * 2 // 10, options.seed)
+            answers = client.post(f"/v1/policies/{LEAGUE}/action", content=BODY).status_code == 200
+            registry.close()
+            return _report(statuses, before, replica, is_well=answers and of_replicas() == [replica])
+
+
+def _report(statuses: Counter[str], before: int, replica: psutil.Process, is_well: bool) -> int:
+    after = replica.memory_info().rss
+    faults = sum(count for status, count in statuses.items() if status.startswith("5") or status == "dropped")
+    growth = after / before - 1
+    print(
+        f"{statuses.total():,} bodies: "
+        + ", ".join(f"{status} {count:,}" for status, count in sorted(statuses.items()))
+    )
+    print(f"5xx, and dropped connections: {faults}   (at most 0)")
+    memory = f"{before / 2**20:.1f} MB → {after / 2**20:.1f} MB, {growth:+.1%}"
+    print(f"memory of the replica: {memory}   (at most +{GROWTH:.0%})")
+    print(f"the same replica answers at the end: {'yes' if is_well else 'no'}   (yes)")
+    return int(faults > 0 or growth > GROWTH or not is_well)
+
+
+def _warm_up(client: httpx.Client, statuses: Counter[str], count: int, number: int) -> None:
+    """The first tenth: memory that is taken once, for whatever is asked, is taken now."""
+    for _ in range(200):
+        client.post(f"/v1/policies/{LEAGUE}/action", content=BODY)
+    client.get("/openapi.json")
+    _changed(client, statuses, count, number + 1)
+
+
+def _from_document(client: httpx.Client, statuses: Counter[str], count: int, number: int) -> None:
+    schema = schemathesis.openapi.from_dict(client.get("/openapi.json").json())
+    operations = [each.ok() for each in schema.get_all_operations()]
+    acting = [each for each in operations if each.path in ROUTES]
+    names = {"model": LEAGUE, "league": LEAGUE, "alias": "candidate", "version": "1"}
+    left = count
+
+    @seed(number)
+    @settings(
+        max_examples=count,
+        database=None,
+        phases=[Phase.generate],
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(data=st.data())
+    def send(data: st.DataObject) -> None:
+        nonlocal left
+        operation = data.draw(st.sampled_from(acting) | st.sampled_from(operations))
+        named = (
+            {each.name: names[each.name] for each in operation.path_parameters} if data.draw(st.booleans()) else None
+        )
+        with suppress(schemathesis.errors.SchemathesisError):  # nothing to break where nothing is asked
+            case = data.draw(operation.as_strategy(data.draw(st.sampled_from(GenerationMode)), path_parameters=named))
+            case.method = operation.method.upper()
+            made = requests.Request(**case.as_transport_kwargs(base_url=str(client.base_url))).prepare()
+            headers = {name: value for name, value in made.headers.items() if name.lower() != "x-request-timeout-ms"}
+            content = made.body.encode() if isinstance(made.body, str) else made.body
+            if left > 0:
+                left -= 1
+                _send(client, statuses, str(made.method), str(made.url), content, headers)
+
+    while left > 0:
+        send()
+
+
+def _changed(client: httpx.Client, statuses: Counter[str], count: int, number: int) -> None:
+    random = Random(number)
+    whole = list(_right_requests())
+    for _ in range(count):
+        path, body, headers = random.choice(whole)
+        _send(client, statuses, "POST", path, _damaged(body, random), headers)
+
+
+def _send(
+    client: httpx.Client, statuses: Counter[str], method: str, url: str, body: bytes | None, headers: dict[str, str]
+) -> None:
+    try:
+        statuses[str(client.request(method, url, content=body, headers=headers).status_code)] += 1
+    except (httpx.InvalidURL, httpx.LocalProtocolError, UnicodeError):
+        statuses["not sent"] += 1
+    except httpx.TransportError:
+        statuses["dropped"] += 1
+
+
+def _stream(url: str, statuses: Counter[str], count: int, number: int) -> None:
+    random = Random(number)
+    binary = message_of([PLANES[None], _mask()], rows=1, seed=3, explore=True)
+    text = json.dumps(json.loads(BODY) | {"reset": True, "return_state": True}).encode()
+    address = url.replace("http://", "ws://") + f"/v1/policies/{LEAGUE}/stream"
+    left = count
+    while left > 0:
+        with suppress(ConnectionClosed), connect(address, compression=None) as stream:
+            while left > 0:
+                left -= 1
+                whole, is_text = random.choice([(binary, False), (text, True)])
+                message = _damaged(whole, random)
+                status = "dropped"
+                try:
+                    status = _say(stream, message.decode("utf-8", "replace") if is_text else message)
+                finally:
+                    statuses[status] += 1
+
+
+def _say(stream: ClientConnection, message: str | bytes) -> str:
+    """The status of an answer, 200 where it says none."""
+    stream.send(message)
+    answer = stream.recv(timeout=30)
+    return str(json.loads(answer).get("status", 200)) if isinstance(answer, str) else "200"
+
+
+def _right_requests() -> Iterator[Request]:
+    action, infer = (path.replace("{model}", LEAGUE) for path in ROUTES)
+    board = {"observation": {"b64": b64encode(PLANES.tobytes()).decode()}, "action_mask": [1] * 7}
+    for document in (
+        json.loads(BODY),
+        {
+            "observations": [json.loads(BODY)["observation"]] * 3,
+            "explore": True,
+            "seed": [1, 2, 3],
+            "probabilities": True,
+        },
+        {"observation": board, "state": None},
+    ):
+        yield action, json.dumps(document).encode(), {}
+    mask = _mask()
+    inputs = [
+        {"name": "observation", "datatype": "INT8", "shape": [1, 6, 7, 2]},
+        {"name": "action_mask", "datatype": "INT8", "shape": [1, 7]},
+    ]
+    listed = [given | {"data": array.ravel().tolist()} for given, array in zip(inputs, (PLANES, mask), strict=True)]
+    plain = json.dumps({"inputs": listed, "outputs": [{"name": "action"}]}).encode()
+    sized = [
+        given | {"parameters": {"binary_data_size": array.size}}
+        for given, array in zip(inputs, (PLANES, mask), strict=True)
+    ]
+    head = json.dumps({"inputs": sized, "parameters": {"binary_data_output": True}}).encode()
+    binary, length = head + PLANES.tobytes() + mask.tobytes(), {"inference-header-content-length": str(len(head))}
+    yield infer, plain, {}
+    yield infer, binary, length
+    yield infer, gzip.compress(plain), {"content-encoding": "gzip"}
+    yield infer, zlib.compress(binary), length | {"content-encoding": "deflate"}
+
+
+def _mask() -> Any:
+    return PLANES.reshape(-1)[:7].copy() | 1
+
+
+def _damaged(body: bytes, random: Random) -> bytes:
+    """A body with up to four changes."""
+    for _ in range(random.randint(0, 4)):
+        change: Callable[[bytes, Random], bytes] = random.choice([_flip, _cut, _put, _swap])
+        body = change(body, random)
+    return body
+
+
+def _flip(body: bytes, random: Random) -> bytes:
+    at = random.randrange(len(body) + 1)
+    return body[:at] + random.randbytes(random.randint(1, 4)) + body[at + random.randint(1, 4) :]
+
+
+def _cut(body: bytes, random: Random) -> bytes:
+    at = random.randrange(len(body) + 1)
+    return body[:at] + body[at + random.choice([1, 16, 10_000]) :]
+
+
+def _put(body: bytes, random: Random) -> bytes:
+    at = random.randrange(len(body) + 1)
+    return (
+        body[:at] + random.choice([b"[" * 500, b'"', b"{}", b"9" * 40, bytes(50), b"\xff", b"null", b":"]) + body[at:]
+    )
+
+
+def _swap(body: bytes, random: Random) -> bytes:
+    """Put something nasty in the place of one value of a JSON object, if it is one."""
+    with suppress(ValueError, RecursionError):
+        document = json.loads(body)
+        at = document
+        while isinstance(at, dict | list) and at:
+            key = random.choice(list(at) if isinstance(at, dict) else range(len(at)))
+            if not isinstance(at[key], dict | list) or not at[key] or random.random() < 0.3:
+                at[key] = random.choice(NASTY)
+                break
+            at = at[key]
+        return json.dumps(document).encode()
+    return body
+
+
+if __name__ == "__main__":
+    sys.exit(main())

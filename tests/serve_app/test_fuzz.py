@@ -1,0 +1,246 @@
+"""Requests made up from the OpenAPI document, binary messages made up from their framing: none is the server's fault.
+
+What is made up keeps to the document or breaks it; each answer must be one that the document describes.
+"""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import requests
+import schemathesis
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from schemathesis import GenerationMode
+from schemathesis.checks import CHECKS, load_all_checks
+from schemathesis.schemas import APIOperation
+from starlette.testclient import TestClient
+
+from league.errors import LeagueError
+from league.registry.registry import Registry
+from league.settings import Storage
+from league.spaces import inputs
+from serve_app.error_handlers import status_of
+from serve_app.inference_protocol.framing import read_request, write_response
+from serve_app.inference_protocol.inference import InferResponse
+from serve_app.inference_protocol.signature import signature_of
+from serve_app.inference_protocol.tensors import read_inputs
+from serve_app.loading import LoadedPolicy, load
+from serve_app.openapi.document import document
+from serve_app.stream_framing import FRAMING, REQUEST, Framing, read_head
+from tests.serve_app.conftest import QUICK, replica
+from tests.serve_app.inference_protocol.leagues import every_kind
+
+load_all_checks()
+CONFORMS = CHECKS.get_by_names(
+    [
+        "status_code_conformance",
+        "content_type_conformance",
+        "response_headers_conformance",
+        "response_schema_conformance",
+    ]
+)
+SCHEMA = schemathesis.openapi.from_dict(document(QUICK, []))
+OPERATIONS = [each.ok() for each in SCHEMA.get_all_operations()]
+SEVERAL = {"deadline": None, "suppress_health_check": list(HealthCheck)}
+OURS = ("x-api-key", "authorization", "x-request-timeout-ms")
+REAL = {
+    "model": ["board", "vector", "nested", "memory", "duo", "duo.left", "pistons", "kinds", "empty"],
+    "league": ["board", "memory", "duo", "empty"],
+    "alias": ["champion", "candidate"],
+    "version": ["1", "2", "champion"],
+}
+
+
+@pytest.fixture(scope="module")
+def storage_to_fuzz(tmp_path_factory: pytest.TempPathFactory) -> Storage:
+    storage = Storage.at(tmp_path_factory.mktemp("fuzz"))
+    every_kind(storage).close()
+    return storage
+
+
+@pytest.fixture(scope="module")
+def fuzzed(storage_to_fuzz: Storage) -> Iterator[TestClient]:
+    """A replica whose client has a key for everything. What it serves changes, as it is asked to."""
+    registry = Registry.open(storage_to_fuzz)
+    _, token = registry.create_key("fuzz", ["act", "read", "promote"])
+    registry.close()
+    with replica(storage_to_fuzz) as client:
+        client.headers["x-api-key"] = token
+        while client.get("/v1/leagues").status_code != 200:
+            pass
+        yield client
+
+
+@pytest.mark.parametrize("operation", OPERATIONS, ids=lambda each: each.label.replace("/", " "))
+@settings(max_examples=15, **SEVERAL)
+@given(data=st.data())
+def test_each_answer_is_one_that_is_described(fuzzed: TestClient, operation: APIOperation, data: st.DataObject) -> None:
+    named = data.draw(
+        st.none() | st.fixed_dictionaries({name: st.sampled_from(REAL[name]) for name in _names(operation)})
+    )
+    mode = data.draw(st.sampled_from(GenerationMode))
+    try:
+        case = data.draw(operation.as_strategy(mode, path_parameters=named))
+    except schemathesis.errors.SchemathesisError:
+        assume(False)  # there is nothing to break in an operation without parameters
+        raise
+    case.method = operation.method.upper()
+    asked = requests.Request(**case.as_transport_kwargs(base_url="http://testserver")).prepare()
+    # The key is the client's, and whoever gives the server a millisecond gets what he asked for.
+    headers = {name: value for name, value in asked.headers.items() if name.lower() not in OURS}
+    reply = fuzzed.request(str(asked.method), str(asked.url), headers=headers, content=_content(asked.body))
+    assert reply.status_code < 500 or _is_not_ready(reply), reply.text
+    if reply.status_code not in (404, 405) and operation.path != "/v1/policies/{model}/stream":
+        case.validate_response(reply, checks=CONFORMS)
+
+
+def _names(operation: APIOperation) -> list[str]:
+    return [parameter.name for parameter in operation.path_parameters]
+
+
+def _content(body: Any) -> bytes | None:
+    return body.encode() if isinstance(body, str) else body
+
+
+def _is_not_ready(reply: Any) -> bool:
+    return reply.status_code == 503 and b"no champion" in reply.content
+
+
+MODELS = ("board", "memory", "nested", "kinds", "choice", "vector")
+
+
+@pytest.fixture(scope="module")
+def policies(storage_to_fuzz: Storage) -> dict[str, LoadedPolicy]:
+    registry = Registry.open(storage_to_fuzz)
+    loaded = {model: load(registry, model, 1, inline=0.001).policy(None) for model in MODELS}
+    registry.close()
+    return loaded
+
+
+def zeros(policy: LoadedPolicy, rows: int) -> dict[str, np.ndarray]:
+    """Observations that the policy takes: nothing is there, every action is legal."""
+    arrays = policy.reader.zeros(rows)
+    for name, leaf in inputs(policy.manifest.observation).items():
+        arrays[name] = arrays[name] + np.asarray(getattr(leaf, "start", 0), arrays[name].dtype)
+    return arrays
+
+
+@st.composite
+def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
+    """A message with a few bytes changed, left out or put in."""
+    message = bytearray(whole)
+    for _ in range(draw(st.integers(0, 3))):
+        at = draw(st.integers(0, len(message)))
+        message[at : at + draw(st.sampled_from([0, 1, 4, 1000]))] = draw(st.binary(max_size=8))
+    return bytes(message)
+
+
+def is_refused_rightly(error: LeagueError) -> bool:
+    """Whether it is the caller's fault, in a sentence of a sane length."""
+    return status_of(error) < 500 and 0 < len(str(error)) < 2000
+
+
+@settings(max_examples=400, **SEVERAL)
+@given(data=st.data())
+def test_a_binary_message_of_a_stream_is_read_or_refused(
+    policies: dict[str, LoadedPolicy], data: st.DataObject
+) -> None:
+    policy = policies[data.draw(st.sampled_from(MODELS))]
+    framing, rows = Framing(policy), data.draw(st.integers(1, 4))
+    flags = data.draw(st.integers(0, 15))
+    tensors = b"".join(array.astype(array.dtype.newbyteorder("<")).tobytes() for array in zeros(policy, rows).values())
+    resets = bytes(data.draw(st.lists(st.integers(0, 1), min_size=rows, max_size=rows))) if flags & 8 else b""
+    whole = REQUEST.pack(FRAMING, flags, 0, rows, 7 if flags & 2 else 0) + resets + tensors
+    message = data.draw(damaged(whole) | st.binary(max_size=64))
+    try:
+        ask = read_head(message, max_batch=8)
+        arrays = framing.read(ask)
+    except LeagueError as error:
+        assert is_refused_rightly(error)  # noqa: PT017
+        assert message != whole
+        return
+    answer = policy.policy.act(arrays, explore=ask.explore, rng=[np.random.default_rng(0)] * ask.rows)
+    assert len(framing.write(answer.actions, 1)) == 16 + answer.actions.nbytes
+
+
+@settings(max_examples=400, **SEVERAL)
+@given(data=st.data())
+def test_a_binary_inference_is_read_or_refused(policies: dict[str, LoadedPolicy], data: st.DataObject) -> None:
+    policy = policies[data.draw(st.sampled_from(MODELS))]
+    whole, length = binary_inference(policy, data.draw(st.integers(1, 4)), data)
+    body = data.draw(damaged(whole) | st.binary(max_size=64))
+    header_length = data.draw(st.just(length) | st.none() | st.integers(0, 2 * length))
+    try:
+        request = read_request("board", "", body, header_length)
+        arrays = read_inputs(request.infer.inputs, signature_of(policy.manifest), max_batch=8)
+    except LeagueError as error:
+        assert is_refused_rightly(error)  # noqa: PT017
+        assert (body, header_length) != (whole, length)
+        return
+    outputs = {"action": policy.policy.act(arrays).actions}
+    reply, found = write_response(InferResponse("board", "1", request.infer.id, outputs), request)
+    assert json.loads(reply[:found])["outputs"][0]["name"] == "action"
+
+
+def binary_inference(policy: LoadedPolicy, rows: int, data: st.DataObject) -> tuple[bytes, int]:
+    """A body, and the length of its JSON."""
+    ports, parts, listed = signature_of(policy.manifest).inputs, [], []
+    for name, array in zeros(policy, rows).items():
+        document = {"name": name, "datatype": ports[name].datatype, "shape": list(array.shape)}
+        if data.draw(st.booleans()):
+            listed.append(document | {"data": array.ravel().tolist()})
+        else:
+            parts.append(array.astype(array.dtype.newbyteorder("<")).tobytes())
+            listed.append(document | {"parameters": {"binary_data_size": len(parts[-1])}})
+    outputs = [{"name": "action", "parameters": {"binary_data": data.draw(st.booleans())}}]
+    head = json.dumps({"id": "1", "inputs": listed, "outputs": outputs}).encode()
+    return b"".join((head, *parts)), len(head)
+
+
+@settings(max_examples=150, **SEVERAL)
+@given(data=st.data())
+def test_a_binary_inference_over_http_is_answered_or_refused(
+    fuzzed: TestClient, policies: dict[str, LoadedPolicy], data: st.DataObject
+) -> None:
+    model = data.draw(st.sampled_from(MODELS))
+    whole, length = binary_inference(policies[model], data.draw(st.integers(1, 4)), data)
+    headers = {
+        "inference-header-content-length": data.draw(st.just(str(length)) | st.sampled_from(["-1", "", "9" * 11, "0"])),
+        "content-encoding": data.draw(st.sampled_from(["identity", "gzip", "deflate", "br"])),
+        "accept-encoding": data.draw(st.sampled_from(["", "gzip", "deflate;q=0, gzip", "*", ";;,,"])),
+    }
+    reply = fuzzed.post(f"/v2/models/{model}/infer", content=data.draw(damaged(whole)), headers=headers)
+    assert reply.status_code < 500, reply.text
+    assert reply.status_code == 200 or reply.json().keys() == {"error"}
+
+
+def test_a_stream_survives_whatever_it_is_sent(fuzzed: TestClient, policies: dict[str, LoadedPolicy]) -> None:
+    """Text and binary, right and wrong, in one conversation: each is answered, and none is a fault."""
+    good = REQUEST.pack(FRAMING, 0, 0, 1, 0) + np.ones(1, "<f4").tobytes()
+
+    with fuzzed.websocket_connect("/v1/policies/memory/stream") as stream:
+
+        @settings(max_examples=300, **SEVERAL)
+        @given(
+            message=damaged(good) | st.binary(max_size=40) | damaged(b'{"observation": [1], "reset": true}').map(_text)
+        )
+        def converse(message: bytes | str) -> None:
+            if isinstance(message, str):
+                stream.send_text(message)
+            else:
+                stream.send_bytes(message)
+            answer = stream.receive()
+            assert answer["type"] == "websocket.send", answer
+            if answer.get("text") is not None:
+                assert json.loads(answer["text"]).get("status", 200) < 500, answer
+
+        converse()
+        stream.send_text('{"observation": [1], "reset": true}')
+        assert stream.receive_json()["action"] == 0
+
+
+def _text(message: bytes) -> str:
+    return message.decode("utf-8", "replace")
