@@ -1,4 +1,4 @@
-"""`league evaluate` and `league nightly`."""
+"""`league evaluate`, `league nightly` and `league verify`."""
 
 import os
 from pathlib import Path
@@ -76,6 +76,23 @@ def nightly(
     reports = [hold_night(config, workers, quiet=as_json) for config in leagues]
     if as_json:
         emit({"leagues": [report.to_json() for report in reports]})
+
+
+def verify(
+    verdict: Annotated[str, typer.Argument(metavar="VERDICT", help="Its id, which `league history` and --json tell.")],
+    replays: Annotated[int, typer.Option(min=0, help="Games that are played again from their seeds, too.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Compute a verdict again from the games in the ledger, and fail if its record says anything else."""
+    from evaluation.verification import verify as run
+
+    found = run(verdict, registry=Registry.open(), replays=replays)
+    if as_json:
+        emit(found.to_json())
+        return
+    say(f"{found.outcome}: {found.matches} matches are as scheduled, and {found.numbers} numbers follow from them.")
+    if found.replayed:
+        say(f"{found.replayed} games were played again and came out the same.")
 
 
 def hold_night(config: LeagueConfig, workers: int = CORES, quiet: bool = False) -> NightReport:

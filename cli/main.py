@@ -8,7 +8,7 @@ import typer
 from cli.demo import demo
 from cli.doctor import doctor
 from cli.environments import check_env
-from cli.evaluation import evaluate, nightly
+from cli.evaluation import evaluate, nightly, verify
 from cli.keys import app as keys
 from cli.output import errors
 from cli.replay import replay
@@ -38,6 +38,7 @@ for command in (
     versions,
     evaluate,
     nightly,
+    verify,
     promote,
     rollback,
     history,

@@ -10,25 +10,26 @@ from typing import Any
 from league.results.records import Scoring
 
 
-class _Document:
+class Document:
     """A dataclass that is a JSON document."""
 
     def to_json(self) -> dict[str, Any]:
         """Nested dictionaries and lists; what is undefined is None."""
-        document: dict[str, Any] = _plain(asdict(self))  # type: ignore[call-overload]
+        document: dict[str, Any] = plain(asdict(self))  # type: ignore[call-overload]
         return document
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """As JSON has it: lists for tuples, None for what is not finite."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass(frozen=True, slots=True)
-class Standing(_Document):
+class Standing(Document):
     """One contestant's results. `score` is in [0, 1], `mean_return` in the environment's own unit.
 
     rating: Elo above `script:random`, None if no chain of games leads there.
@@ -46,7 +47,7 @@ class Standing(_Document):
 
 
 @dataclass(frozen=True, slots=True)
-class Difference(_Document):
+class Difference(Document):
     """A mean difference of returns, in the environment's own unit, with the bounds of its 95 % interval; these take two
     blocks at least.
     """
@@ -57,7 +58,7 @@ class Difference(_Document):
 
 
 @dataclass(frozen=True, slots=True)
-class Payoff(_Document):
+class Payoff(Document):
     """score[i][j] is contestant i's mean score against j over games[i][j] games; None if they did not meet.
 
     by_side[side][i][j] is the same for the games in which i played that side alone.
@@ -72,7 +73,7 @@ class Payoff(_Document):
 
 
 @dataclass(frozen=True, slots=True)
-class EvaluationReport(_Document):
+class EvaluationReport(Document):
     """A round robin: who stands where, best first, and who beats whom.
 
     by_side: who stands where on each side; empty where sides are alike, or there is one.
@@ -90,7 +91,7 @@ class EvaluationReport(_Document):
 
 
 @dataclass(frozen=True, slots=True)
-class VerdictReport(_Document):
+class VerdictReport(Document):
     """One challenger's test with its evidence.
 
     outcome: `promote`, `reject`, `inconclusive`, or `void` where it could not be ended: `note` says why.
@@ -120,7 +121,7 @@ class VerdictReport(_Document):
 
 
 @dataclass(frozen=True, slots=True)
-class NightReport(_Document):
+class NightReport(Document):
     """One night of a league: its verdicts in order, the champion before and after, and everybody's ratings.
 
     faults: versions that could not be judged or rated, each with the reason; they are tried again the next night.

@@ -1,4 +1,4 @@
-"""The sequential test on block scores: generalised SPRT, its bounds, and the Elo estimate with its interval.
+"""Sequential tests: the generalised SPRT on block scores, and a betting test on paired differences of returns.
 
 A *block* is `n` games between two contestants from one opening, the sides rotated, so that seat and luck cancel; its
 score lies on the grid `a_i = i / 2n`, `i = 0 … 2n`. One game per block gives the trinomial cells (L, D, W), two give
@@ -16,7 +16,10 @@ distributions under the constraint of each hypothesis. Empty cells count as 1e-3
 
 Sources: M. Van den Bergh's notes on fishtest, cantate.be/Fishtest: support_MLE_multinomial.pdf (Proposition 1.1) and
 normalized_elo_practical.pdf (section 4.1); A. Wald, "Sequential tests of statistical hypotheses" (1945); A. Owen,
-"Empirical likelihood ratio confidence intervals for a single functional" (1988) for the constrained estimate.
+"Empirical likelihood ratio confidence intervals for a single functional" (1988) for the constrained estimate; D.
+Siegmund, "Sequential Analysis" (1985), chapter 8, for the overshoot; I. Waudby-Smith and A. Ramdas, "Estimating means
+of bounded random variables by betting" (arXiv 2010.09686); S. Howard et al., "Time-uniform, nonparametric,
+nonasymptotic confidence sequences" (arXiv 1810.08240), for the mixture over Bernoulli probabilities.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
+from scipy.optimize import brentq
+from scipy.special import betaln, ndtri
 
 Model = Literal["logistic", "normalized"]
 Floats = NDArray[np.float64]
@@ -66,6 +70,121 @@ def bounds(alpha: float, beta: float) -> tuple[float, float]:
     if not (alpha > 0 and beta > 0 and alpha + beta < 1):
         raise ValueError(f"alpha and beta must be positive with a sum below 1, not {alpha} and {beta}")
     return math.log(beta / (1 - alpha)), math.log((1 - beta) / alpha)
+
+
+def overshoot(curve: ArrayLike) -> tuple[float, float]:
+    """By how much the LLR is expected to jump over the lower and over the upper bound when it leaves them, both >= 0.
+
+    A test that stops at the bounds themselves errs less than it may, since it stops beyond them. Moved inwards by this
+    (`lower + first`, `upper - second`), it errs as often as it may, and stops sooner. Estimated from the ladder heights
+    h of the curve so far, its steps to a new extreme, as E h² / 2 E h (Siegmund, equation 8.49).
+
+    curve: the LLR after each block, as `gsprt_llr` of all prefixes gives it.
+    """
+    llr = np.concatenate([[0.0], np.asarray(curve, dtype=np.float64)])
+    return _ladder(np.minimum.accumulate(llr)), _ladder(np.maximum.accumulate(llr))
+
+
+def _ladder(extremes: Floats) -> float:
+    heights = np.abs(np.diff(extremes))
+    return float((heights**2).sum() / (2 * heights.sum())) if heights.any() else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class BettingTest:
+    """An anytime-valid test of independent differences `d` within ±bound, whatever their distribution.
+
+    H0: the mean is at most `low`; H1: it is at least `high`. A gambler bets on each difference before it is seen, at
+    odds that are fair under the hypothesis that is to be refuted; the chance that its wealth ever reaches `1 / a` is at
+    most `a` then (Ville). So the test may stop at any time, and looks as often as it likes. For few blocks, and for
+    returns that no likelihood is known of.
+
+    The bet on `x = (1 + d / bound) / 2` against a mean of `m` is `clip((mu - m) / (s² + (mu - m)²), 0, c / m)`, with
+    mean and variance of all before it (the approximate GRAPA bet of Waudby-Smith and Ramdas, section B.3).
+    """
+
+    bound: float
+    alpha: float
+    beta: float
+    low: float = 0.0
+    high: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.bound > 0 and 0 < self.alpha < 1 and 0 < self.beta < 1):
+            raise ValueError(f"bound must be positive, alpha and beta within (0, 1), not {self}")
+        if not -self.bound < self.low <= self.high < self.bound:
+            raise ValueError(f"low and high must lie within ±{self.bound:g}, low first, not {self.low} and {self.high}")
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Of the two log wealths: `ln(1 / beta)` accepts H0, `ln(1 / alpha)` accepts H1."""
+        return math.log(1 / self.beta), math.log(1 / self.alpha)
+
+    def curves(self, differences: ArrayLike) -> tuple[Floats, Floats]:
+        """Log wealth of who bets against H1, and of who bets against H0, after each difference.
+
+        differences: `(..., N)`. Returns two arrays of that shape. Raises ValueError for one beyond ±bound.
+        """
+        x = (1 + np.asarray(differences, dtype=np.float64) / self.bound) / 2
+        if not ((x >= 0) & (x <= 1)).all():
+            raise ValueError(f"differences must lie within ±{self.bound:g}")
+        low, high = ((1 + edge / self.bound) / 2 for edge in (self.low, self.high))
+        return _log_wealth(1 - x, 1 - high), _log_wealth(x, low)
+
+    def decide(self, differences: ArrayLike) -> tuple[Literal["H0", "H1"] | None, int]:
+        """What one series `(N,)` decides, and after how many differences; None and N while the test is open."""
+        curves = np.stack(self.curves(differences))
+        crossed = np.flatnonzero((curves >= np.array(self.bounds)[:, None]).any(axis=0))
+        if not crossed.size:
+            return None, curves.shape[1]
+        first = int(crossed[0])
+        return ("H1" if curves[1, first] >= self.bounds[1] else "H0"), first + 1
+
+
+BOLDNESS = 0.75
+"""Share of its wealth that a bet may lose at most."""
+
+
+def _log_wealth(x: Floats, mean: float) -> Floats:
+    """Of who bets that the mean of x in [0, 1] is greater than `mean`: `sum ln(1 + bet (x - mean))`."""
+    seen = np.arange(1, x.shape[-1] + 1)
+    before = np.cumsum(x, axis=-1) - x
+    guess = (0.5 + before) / seen
+    deviations = (x - (0.5 + np.cumsum(x, axis=-1)) / (seen + 1)) ** 2
+    variance = (0.25 + np.cumsum(deviations, axis=-1) - deviations) / seen
+    edge = guess - mean
+    bet = np.clip(edge / (variance + edge**2), 0.0, BOLDNESS / mean)
+    return np.asarray(np.cumsum(np.log1p(bet * (x - mean)), axis=-1))
+
+
+def bernoulli_interval(successes: int, trials: int, alpha: float = 0.05, best_at: float = 100.0) -> tuple[float, float]:
+    """An interval for a probability that covers it at all times at once with probability `1 - alpha`.
+
+    It may be looked at after every trial. best_at: trials at which it is about as narrow as it can be. It holds the p
+    of which a mixture of Bernoulli likelihoods, Beta-distributed around p, is less than `1 / alpha` times as likely
+    (Howard et al., proposition 7).
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"successes must be of at least one trial, not {successes} of {trials}")
+    failures = trials - successes
+
+    def refuted(p: float) -> float:
+        variance = p * (1 - p)
+        scale = 2 * math.log(1 / MIXTURE_ALPHA)
+        rho = best_at * variance / (scale + math.log(1 + scale))
+        r = max(rho - variance, 1e-3 * variance)
+        a, b = r / (1 - p), r / p
+        mixture = betaln(a + successes, b + failures) - betaln(a, b)
+        return float(mixture - successes * math.log(p) - failures * math.log(1 - p) + math.log(alpha))
+
+    estimate = min(max(successes / trials, EDGE), 1 - EDGE)
+    low = brentq(refuted, EDGE, estimate) if successes and refuted(EDGE) > 0 else 0.0
+    high = brentq(refuted, estimate, 1 - EDGE) if failures and refuted(1 - EDGE) > 0 else 1.0
+    return low, high
+
+
+MIXTURE_ALPHA = 0.05
+EDGE = 1e-12
 
 
 def score_of(elo: float) -> float:

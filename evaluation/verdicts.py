@@ -59,7 +59,7 @@ def conclude(
     """Play an open verdict to its end, move the champion if it says so, and close it."""
     if (obstacle := _obstacle(registry, verdict)) is not None:
         return _close(registry, verdict, VOID, _decision(registry, verdict), note=obstacle)
-    watch = Watch(_gate(verdict), _challenger(verdict))
+    watch = Watch(gate_of(verdict), _challenger(verdict))
 
     def report(progress: Progress | VerdictReport) -> None:
         if listener and isinstance(progress, Progress):
@@ -95,15 +95,16 @@ def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str 
         if (shadowing.candidate, shadowing.champion) == (verdict.candidate, champion):
             latency = shadowing.milliseconds(0.95)
             seen = shadowing.observations, shadowing.failed, shadowing.agreement
-            return floor(_gate(verdict), *seen, latency)
-    return floor(_gate(verdict), 0, 0, None, None)
+            return floor(gate_of(verdict), *seen, latency)
+    return floor(gate_of(verdict), 0, 0, None, None)
 
 
 def _schedule(registry: Registry, verdict: VerdictRow) -> Schedule:
     return Ledger(registry).schedule(verdict.schedule)
 
 
-def _gate(verdict: VerdictRow) -> GateConfig:
+def gate_of(verdict: VerdictRow) -> GateConfig:
+    """The settings under which it was opened."""
     return GateConfig.model_validate(verdict.settings["gate"])
 
 
@@ -116,7 +117,7 @@ def _matches(registry: Registry, verdict: VerdictRow) -> Sequence[Match]:
 
 
 def _decision(registry: Registry, verdict: VerdictRow) -> Decision:
-    return judge(_gate(verdict), _matches(registry, verdict), _challenger(verdict))
+    return judge(gate_of(verdict), _matches(registry, verdict), _challenger(verdict))
 
 
 def _difference(registry: Registry, verdict: VerdictRow, decision: Decision) -> Difference | None:

@@ -34,6 +34,7 @@ LeagueError
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
 ├── WorkerLost                worker processes that die again and again
+├── VerdictRefuted            a verdict whose record is not what its games say
 ├── ParityError               an exported graph that acts otherwise than the trained module
 ├── NotReady                  a policy that nothing serves yet
 ├── RemoteError               a policy server that cannot be reached or failed
@@ -243,6 +244,12 @@ class GameHung(LeagueError):
     """A game of a match that has not ended after `play.max_moves` actions."""
 
     code = "game_hung"
+
+
+class VerdictRefuted(LeagueError):
+    """A verdict whose record is not what the games in the ledger say."""
+
+    code = "verdict_refuted"
 
 
 class WorkerLost(LeagueError):

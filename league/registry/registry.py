@@ -358,6 +358,11 @@ class Registry:
         with self.database.write() as session:
             verdicts.close(session, verdict, outcome, evidence)
 
+    def verdict(self, verdict: str) -> VerdictRow:
+        """A verdict by its id. Raises NotFound."""
+        with self.database.read() as session:
+            return verdicts.one(session, verdict)
+
     def verdicts(self, league: str) -> list[VerdictRow]:
         """All verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
         with self.database.read() as session:

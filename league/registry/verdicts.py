@@ -38,6 +38,14 @@ def close(session: Session, verdict: str, outcome: str, evidence: dict[str, Any]
     row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
 
 
+def one(session: Session, verdict: str) -> rows.VerdictRow:
+    """A verdict by its id. Raises NotFound."""
+    row = session.get(Verdict, verdict)
+    if row is None:
+        raise NotFound(f"there is no verdict {verdict!r}")
+    return _row(row)
+
+
 def every(session: Session, league: str) -> list[rows.VerdictRow]:
     """All verdicts of a league, in the order in which they were opened. Raises UnknownLeague."""
     leagues.require(session, league)

@@ -4,6 +4,7 @@ import pytest
 import yaml
 
 from league.registry.registry import Registry
+from league.registry.tables import Verdict
 from tests.cli.conftest import League
 from tests.evaluation import examples
 
@@ -46,3 +47,15 @@ def test_a_night_judges_promotes_and_rates_and_the_next_has_nothing_to_do(
     assert again["champion"] == f"tictactoe@{champion}"
     rated = league("versions", "tictactoe", "--json").json["versions"]
     assert all(version["rating"] is not None for version in rated)
+
+
+def test_a_verdict_is_verified_and_a_changed_one_fails(league: League, registry: Registry, config: str) -> None:
+    verdict = league("nightly", config, "--workers", "0", "--json").json["leagues"][0]["verdicts"][0]["verdict"]
+    told = league("verify", verdict, "--replays", "3")
+    assert (told.code, "3 games were played again" in told.out) == (0, True)
+    with registry.database.write() as session:
+        row = session.get_one(Verdict, verdict)
+        row.evidence = {**row.evidence, "llr": 99.0}  # type: ignore[dict-item]
+    refuted = league("verify", verdict)
+    assert (refuted.code, refuted.err.count("\n")) == (1, 1)
+    assert "llr is 99.0, and by the games" in refuted.err

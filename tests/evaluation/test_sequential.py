@@ -8,12 +8,15 @@ from scipy.optimize import minimize
 
 from evaluation.sequential import (
     ELO_PER_EFFECT,
+    BettingTest,
     Model,
+    bernoulli_interval,
     bounds,
     elo_estimate,
     elo_of,
     expected_games,
     gsprt_llr,
+    overshoot,
     score_of,
 )
 
@@ -181,3 +184,136 @@ def test_counts_that_are_none_are_refused(observed: object) -> None:
 def test_hypotheses_that_are_none_are_refused(elo0: float, elo1: float) -> None:
     with pytest.raises(ValueError, match="elo0"):
         gsprt_llr((1, 2, 3, 4, 5), elo0, elo1, "normalized")
+
+
+@given(st.lists(st.floats(-1, 1), min_size=1, max_size=60))
+def test_overshoot_is_half_the_weighted_step_to_a_new_extreme(steps: list[float]) -> None:
+    curve = np.cumsum(steps)
+    low, high = overshoot(curve)
+    heights, best = [], 0.0
+    for value in curve:
+        if value > best:
+            heights.append(value - best)
+            best = value
+    expected = sum(h * h for h in heights) / (2 * sum(heights)) if heights else 0.0
+    assert high == pytest.approx(expected)
+    assert overshoot(-curve) == pytest.approx((high, low))
+
+
+def test_with_the_overshoot_a_test_errs_as_often_as_it_may() -> None:
+    """A random walk with steps of a fifth of the bound: at the bounds it errs too seldom, corrected about as it may."""
+    rng, lower, upper = np.random.default_rng(0), *bounds(0.05, 0.05)
+    effect = 0.6
+    steps = effect * (rng.normal(0, 1, (4000, 400)) - effect / 2)  # log likelihood ratio of a shift, under H0
+    curves = steps.cumsum(axis=1)
+    plain = [_ends(curve, lower, upper) for curve in curves]
+    corrected = []
+    for curve in curves[:1500]:
+        first = next(
+            n
+            for n in range(1, 401)
+            for low, high in [overshoot(curve[:n])]
+            if not lower + low < curve[n - 1] < upper - high
+        )
+        corrected.append(curve[first - 1] > 0)
+    assert np.mean(plain) < 0.045
+    assert 0.036 <= np.mean(corrected) <= 0.066
+
+
+def _ends(curve: np.ndarray, lower: float, upper: float) -> bool:
+    return bool(curve[np.flatnonzero((curve <= lower) | (curve >= upper))[0]] > 0)
+
+
+def test_the_interval_of_confseq() -> None:
+    """gostevehoward/confseq: bernoulli_confidence_interval(700, 1000, .05, 100)."""
+    assert bernoulli_interval(700, 1000, 0.05, 100) == pytest.approx((0.651629, 0.745949), abs=1e-6)
+
+
+@given(st.integers(1, 500), st.data())
+def test_the_interval_of_a_probability_holds_the_estimate_and_mirrors(trials: int, data: st.DataObject) -> None:
+    successes = data.draw(st.integers(0, trials))
+    low, high = bernoulli_interval(successes, trials)
+    assert 0 <= low <= successes / trials <= high <= 1
+    assert bernoulli_interval(trials - successes, trials) == pytest.approx((1 - high, 1 - low), abs=1e-6)
+
+
+def test_the_interval_of_a_probability_holds_at_all_times_at_once() -> None:
+    rng, missed = np.random.default_rng(1), 0
+    for _ in range(200):
+        successes = np.cumsum(rng.random(300) < 0.9)
+        looks = (bernoulli_interval(int(successes[n - 1]), n) for n in range(5, 301, 5))
+        missed += any(not low <= 0.9 <= high for low, high in looks)
+    assert missed <= 17, "5 % of 200, and two and a half standard deviations"
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(-1, 5), (6, 5), (0, 0)])
+def test_successes_of_no_trial_are_refused(successes: int, trials: int) -> None:
+    with pytest.raises(ValueError, match="successes"):
+        bernoulli_interval(successes, trials)
+
+
+DIFFERENCES = {
+    "normal": lambda rng, size: np.clip(rng.normal(0, 0.3, size), -1, 1),
+    "rarely, by much": lambda rng, size: rng.choice([-1.0, 0.0, 1.0], size, p=[0.02, 0.96, 0.02]),
+    "skewed": lambda rng, size: np.where(rng.random(size) < 0.9, 0.1, -0.9),
+    "two points": lambda rng, size: rng.choice([-1.0, 1.0], size),
+}
+
+
+@pytest.mark.parametrize("kind", DIFFERENCES)
+def test_a_bet_seldom_wins_where_there_is_nothing_to_win(kind: str) -> None:
+    """Ville's inequality: at most alpha of all series ever get there, however often they are looked at."""
+    series = DIFFERENCES[kind](np.random.default_rng(0), (2000, 800))
+    assert abs(series.mean()) < 0.01
+    test = BettingTest(1.0, alpha=0.05, beta=0.05)
+    down, up = test.curves(series)
+    assert (up.max(axis=1) >= test.bounds[1]).mean() <= 0.0622, "5 %, and two and a half standard deviations"
+    assert (down.max(axis=1) >= test.bounds[0]).mean() <= 0.0622
+
+
+def test_a_bet_wins_where_there_is_something_to_win() -> None:
+    rng = np.random.default_rng(0)
+    better = np.clip(rng.normal(0.1, 0.3, (300, 800)), -1, 1)
+    test = BettingTest(1.0, alpha=0.05, beta=0.05)
+    ends = [test.decide(series) for series in better]
+    assert all(outcome == "H1" for outcome, _ in ends)
+    assert np.median([number for _, number in ends]) < 120, "a fixed test of the same power takes 78"
+
+
+def test_with_a_gap_between_the_hypotheses_both_can_be_accepted() -> None:
+    rng, test = np.random.default_rng(0), BettingTest(10.0, alpha=0.05, beta=0.05, low=0.0, high=1.0)
+    equal = rng.normal(0, 2, (200, 2000)).clip(-10, 10)
+    outcomes = [test.decide(series)[0] for series in equal]
+    assert outcomes.count("H0") >= 190 - 1
+    assert outcomes.count("H1") <= 18
+
+
+@given(st.lists(st.floats(-1, 1), min_size=1, max_size=40), st.integers(1, 39))
+def test_a_bet_depends_on_nothing_that_comes_later(differences: list[float], cut: int) -> None:
+    test = BettingTest(1.0, alpha=0.05, beta=0.05)
+    whole, part = test.curves(differences), test.curves(differences[:cut])
+    for long, short in zip(whole, part, strict=True):
+        assert long[: len(short)] == pytest.approx(short)
+        assert np.isfinite(long).all(), "no bet loses everything"
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=40))
+def test_the_two_sides_of_a_bet_are_mirror_images(differences: list[float]) -> None:
+    test = BettingTest(5.0, alpha=0.05, beta=0.05)
+    down, up = test.curves(differences)
+    again = test.curves([-d for d in differences])
+    assert (down, up) == (pytest.approx(again[1]), pytest.approx(again[0]))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"bound": 0.0}, {"alpha": 0.0}, {"beta": 1.0}, {"low": 1.0}, {"low": 0.2, "high": 0.1}, {"high": 2.0}],
+)
+def test_a_bet_on_nothing_is_refused(arguments: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"bound|low"):
+        BettingTest(**({"bound": 1.0, "alpha": 0.05, "beta": 0.05} | arguments))
+
+
+def test_a_difference_beyond_the_bound_is_refused() -> None:
+    with pytest.raises(ValueError, match="within ±1"):
+        BettingTest(1.0, alpha=0.05, beta=0.05).curves([0.5, 1.5])

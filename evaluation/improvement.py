@@ -1,0 +1,76 @@
+"""Which of two ways of training is better, by scores of several runs on several tasks: rliable's statistics.
+
+Scores are matrices (runs, tasks): a run is one training with one seed, a task one league or one side of it. Intervals
+come from a bootstrap that draws runs anew within each task, so that every task keeps its weight.
+
+Source: R. Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import rankdata, trim_mean
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A statistic with the bounds of a two-sided interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def iqm(scores: ArrayLike) -> float:
+    """The interquartile mean: the mean of all runs on all tasks, a quarter cut off at either end."""
+    return float(trim_mean(_scores(scores), 0.25, axis=None))
+
+
+def probability_of_improvement(scores: ArrayLike, baseline: ArrayLike) -> float:
+    """How likely a run scores more than one of the baseline on the same task, ties by half; the mean over tasks.
+
+    Mann and Whitney's U, divided by the number of pairs. Raises ValueError if the tasks are not the same number.
+    """
+    ours, theirs = _scores(scores), _scores(baseline)
+    if ours.shape[1] != theirs.shape[1]:
+        raise ValueError(f"both must be of the same tasks, not of {ours.shape[1]} and {theirs.shape[1]}")
+    runs = len(ours)
+    ranks = rankdata(np.concatenate([ours, theirs]), axis=0)[:runs]
+    above = ranks.sum(axis=0) - runs * (runs + 1) / 2
+    return float((above / (runs * len(theirs))).mean())
+
+
+def stratified_bootstrap(
+    statistic: Callable[..., float],
+    *scores: ArrayLike,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Estimate:
+    """`statistic(*scores)`, and the interval between the quantiles of its values on scores drawn anew.
+
+    In each resample as many runs as there are, with replacement, independently in each task and each matrix.
+    """
+    given = [_scores(each) for each in scores]
+    rng = np.random.default_rng(seed)
+    values = [statistic(*(_redrawn(each, rng) for each in given)) for _ in range(resamples)]
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(values, [tail, 1 - tail])
+    return Estimate(statistic(*given), float(low), float(high))
+
+
+def _redrawn(scores: Floats, rng: np.random.Generator) -> Floats:
+    return np.take_along_axis(scores, rng.integers(len(scores), size=scores.shape), axis=0)
+
+
+def _scores(scores: ArrayLike) -> Floats:
+    matrix = np.asarray(scores, dtype=np.float64)
+    if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
+        raise ValueError(f"scores are a matrix (runs, tasks) of finite numbers, not of shape {matrix.shape}")
+    return matrix

@@ -1,0 +1,138 @@
+"""A verdict, computed once more from the games that the ledger holds: whether its record is what they say.
+
+Nothing of the record is taken for granted but the settings under which it was opened: the matches are held against
+their schedule, scores against returns, and every number of the evidence against what follows from them. Games can be
+played again from their seeds, too, so that not even returns need be believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evaluation import promotion
+from evaluation.gate import Decision, judge
+from evaluation.paired import paired_difference
+from evaluation.replay import replay
+from evaluation.report import Document, plain
+from evaluation.verdicts import VOID, gate_of
+from league.environments.lockstep import stepping
+from league.errors import InvalidInput, LedgerRefusal, VerdictRefuted
+from league.registry.registry import Registry
+from league.registry.rows import VerdictRow
+from league.results.admission import admit
+from league.results.ledger import Ledger
+from league.results.records import Match, Schedule
+
+ROUNDING = 1e-9
+"""Numbers that differ by less, relative to their size, are the same on another machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verification(Document):
+    """A verdict that holds. matches: in the ledger. numbers: of its evidence that were computed again. replayed: games
+    that were played again."""
+
+    verdict: str
+    outcome: str
+    matches: int
+    numbers: int
+    replayed: int
+
+
+def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verification:
+    """Compute a closed verdict again, and play `replays` of the games that count once more, evenly spread.
+
+    Raises VerdictRefuted, which names all that differs; NotFound; InvalidInput for a verdict that is open.
+    """
+    row = registry.verdict(verdict)
+    if row.outcome is None or row.evidence is None:
+        raise InvalidInput(f"verdict {verdict} is open: `league nightly` goes on with it")
+    ledger = Ledger(registry)
+    schedule = ledger.schedule(row.schedule)
+    matches = ledger.matches(league=row.league, schedule=row.schedule)
+    _check_matches(row, schedule, matches)
+    challenger = f"{row.league}@{row.candidate}"
+    decision = judge(gate_of(row), matches, challenger)
+    computed = _computed(registry, row, schedule, matches, decision)
+    wrong = [
+        f"{name} is {row.evidence.get(name)!r}, and by the games {value!r}"
+        for name, value in computed.items()
+        if not _same(row.evidence.get(name), value)
+    ]
+    if wrong:
+        raise VerdictRefuted(f"verdict {verdict} is not what its games say: {'; '.join(wrong)}")
+    replayed = _replay(registry, row, matches[: decision.blocks], replays)
+    return Verification(verdict, row.outcome, len(matches), len(computed), replayed)
+
+
+def _check_matches(row: VerdictRow, schedule: Schedule, matches: Sequence[Match]) -> None:
+    try:
+        for position, match in enumerate(matches):
+            if match.position != position:
+                raise VerdictRefuted(f"verdict {row.id} has no match {position}, but one behind it")
+            admit(match, schedule)
+    except LedgerRefusal as error:
+        raise VerdictRefuted(f"verdict {row.id} counts a match that its schedule did not ask for: {error}") from error
+
+
+def _computed(
+    registry: Registry, row: VerdictRow, schedule: Schedule, matches: Sequence[Match], decision: Decision
+) -> dict[str, Any]:
+    """What the evidence must say. A void verdict ended for a reason beside its games, at any point of them."""
+    challenger = f"{row.league}@{row.candidate}"
+    estimate = decision.estimate
+    counted = matches[: decision.blocks]
+    difference = None if schedule.scoring == "game" else paired_difference(counted, challenger)
+    computed = {
+        "verdict": row.id,
+        "candidate": challenger,
+        "opponent": row.champion,
+        "outcome": row.outcome if row.outcome == VOID else decision.outcome,
+        "llr": decision.llr,
+        "bounds": decision.bounds,
+        "blocks": decision.blocks,
+        "games": decision.games,
+        "distinct_games": decision.distinct_games or 0,
+        "score": decision.score,
+        "elo": estimate.elo if estimate else None,
+        "interval": (estimate.low, estimate.high) if estimate else None,
+        "counts": decision.counts,
+        "promoted": promotion.is_applied(registry, row),
+        "difference": None
+        if difference is None
+        else {"mean": difference.mean, "low": difference.low, "high": difference.high},
+    }
+    document: dict[str, Any] = plain(computed)
+    return document
+
+
+def _same(recorded: Any, computed: Any) -> bool:
+    if isinstance(computed, dict):
+        return isinstance(recorded, dict) and all(_same(recorded.get(key), value) for key, value in computed.items())
+    if isinstance(computed, list):
+        return isinstance(recorded, list) and len(recorded) == len(computed) and all(map(_same, recorded, computed))
+    if isinstance(computed, float) and isinstance(recorded, int | float):
+        return math.isclose(recorded, computed, rel_tol=ROUNDING, abs_tol=ROUNDING)
+    return bool(recorded == computed)
+
+
+def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], replays: int) -> int:
+    games = [(match, index) for match in matches for index in range(len(match.games))]
+    wanted = min(replays, len(games))
+    if not wanted:
+        return 0
+    league = registry.league(row.league)
+    environment = stepping(league.config.environment, 1)
+    try:
+        for number in np.linspace(0, len(games) - 1, wanted).astype(int):
+            match, index = games[number]
+            for _ in replay(environment, league.config, league.interface, match, index):
+                pass
+    finally:
+        environment.close()
+    return wanted
