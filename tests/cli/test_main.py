@@ -13,7 +13,7 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 def test_the_commands_are_those_of_the_mission() -> None:
     assert set(COMMANDS) == {
         "doctor", "check-env", "train", "sweep", "versions", "evaluate", "promote", "rollback", "history", "nightly",
-        "replay", "serve", "act", "demo",
+        "replay", "serve", "act", "demo", "keys", "traffic", "verify",
     }  # fmt: skip
 
 
@@ -22,9 +22,11 @@ def test_each_command_and_option_explains_itself(name: str) -> None:
     command = COMMANDS[name]
     assert command.help
     assert len(command.help) > 40
-    for parameter in command.params:
-        if parameter.name != "help":
-            assert getattr(parameter, "help", None), f"{name} {parameter.name} has no help"
+    for part in (command, *getattr(command, "commands", {}).values()):
+        assert part.help, f"{name} {part.name} has no help"
+        for parameter in part.params:
+            if parameter.name != "help":
+                assert getattr(parameter, "help", None), f"{name} {parameter.name} has no help"
 
 
 @pytest.mark.parametrize(
