@@ -30,6 +30,10 @@ PREFIX = "league-serve-"
 LOCK = "lock"
 PORTS = range(20_000, 30_000)
 """Where free ports are looked for: below those that the kernel hands out to outgoing connections."""
+GRPC = "grpc"
+"""A file of this name says which ports a server has taken."""
+GRPC_PORTS = range(10_000, 20_000, 100)
+"""Where blocks of ports for the replicas' gRPC servers begin: more than a machine has replicas."""
 SOFT_STOP = 1.0
 """Seconds that HAProxy has to finish requests in progress."""
 HARD_STOP = 5.0
@@ -41,6 +45,7 @@ IDLE_CLIENT = 60
 def environment(directory: Path) -> dict[str, str]:
     """Ray's variables for a server whose HAProxy has its files in `directory`. deploy.yaml explains the first."""
     stats, metrics, fallback_http, fallback_grpc = free_ports(4)
+    grpc = _own_block(directory)
     return _amended(directory, stats, metrics) | {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
@@ -62,6 +67,10 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
         "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+        # Ray means its replicas' gRPC servers to refuse a port that is taken, but says so by a string, which gRPC does
+        # not read: two servers on one machine would share ports, and answer one another's calls.
+        "RAY_SERVE_DIRECT_INGRESS_MIN_GRPC_PORT": str(grpc.start),
+        "RAY_SERVE_DIRECT_INGRESS_MAX_GRPC_PORT": str(grpc.stop - 1),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(directory / "haproxy.cfg"),
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(directory / "admin.sock"),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(directory / "metrics.sock"),
@@ -128,6 +137,17 @@ def free_ports(count: int, host: str = "") -> list[int]:
         if len(found) == count:
             return found
     raise NotReady(f"this machine has no {count} free ports from {PORTS.start} to {PORTS.stop - 1}")
+
+
+def _own_block(directory: Path) -> range:
+    """Ports for the replicas' gRPC servers, which no other server has taken, and on which nothing listens."""
+    taken = {int(path.read_text()) for path in DIRECTORIES.glob(f"{PREFIX}*/{GRPC}")}
+    for start in random.sample(GRPC_PORTS, len(GRPC_PORTS)):
+        block = range(start, start + GRPC_PORTS.step)
+        if start not in taken and all(is_free("", port) for port in block):
+            (directory / GRPC).write_text(str(start))
+            return block
+    raise NotReady(f"this machine has no {GRPC_PORTS.step} free ports in a row from {GRPC_PORTS.start} on")
 
 
 def is_free(host: str, port: int) -> bool:
