@@ -132,7 +132,7 @@ def _promoting(registry: Registry) -> Iterator[list[Promotion]]:
 
     def promote() -> None:
         while not is_over.is_set():
-            promotions.append(_promote(registry, 3 - registry.aliases(LEAGUE)["champion"]))
+            promotions.append(_promote(registry, 3 - registry.aliases(LEAGUE)["champion"], every=0.025))
 
     thread = threading.Thread(target=promote)
     thread.start()
@@ -143,22 +143,23 @@ def _promoting(registry: Registry) -> Iterator[list[Promotion]]:
         thread.join()
 
 
-def _promote(registry: Registry, version: int) -> Promotion:
+def _promote(registry: Registry, version: int, every: float = 0.005) -> Promotion:
+    """Move the champion and wait until it is moved everywhere, looking every so many seconds."""
     begun = time.perf_counter()
     expected = registry.aliases(LEAGUE)["champion"]
     registry.set_alias(LEAGUE, "champion", version, expected=expected, actor="benchmark", reason="back and forth")
     returned = time.perf_counter()
-    _await_replicas(registry, version)
+    _await_replicas(registry, version, every)
     return Promotion(version, begun, returned, time.perf_counter())
 
 
-def _await_replicas(registry: Registry, version: int) -> None:
+def _await_replicas(registry: Registry, version: int, every: float = 0.005) -> None:
     """Return when every replica has acknowledged a version."""
     deadline = time.monotonic() + 30
     while sum(said.version == version for said in registry.acknowledgements(LEAGUE)) < REPLICAS:
         if time.monotonic() > deadline:
             raise TimeoutError(f"version {version} did not reach every replica within 30 s")
-        time.sleep(0.005)
+        time.sleep(every)
 
 
 @contextmanager

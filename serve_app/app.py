@@ -6,6 +6,7 @@ Nothing stands behind the ingress: a request is answered in the process that it 
 without Ray Serve's part on that way (middleware.py).
 """
 
+import sys
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
@@ -52,6 +53,9 @@ from serve_app.traffic import Traffic
 from serve_app.versions import Versions
 
 LOOPBACK = "127.0.0.1"
+SWITCH = 0.0005
+"""Seconds after which a thread that looks at the database, or computes a shadow, gives way to the event loop. Python's
+default of 5 ms would be the time that the slowest requests wait."""
 
 
 def build_app(args: ServeSettings) -> Application:
@@ -70,6 +74,7 @@ class PolicyServer:
     """One replica. Where its leagues live, LEAGUE_HOME and its siblings say."""
 
     def __init__(self, settings: ServeSettings) -> None:
+        sys.setswitchinterval(SWITCH)
         replica = serve.get_replica_context().replica_id.unique_id
         # A replica that starts while the database is elsewhere must not put an empty one into its place.
         registry = Registry.open(Storage.from_environment(), create=False)

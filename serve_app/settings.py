@@ -57,7 +57,7 @@ class ServeSettings(BaseModel):
     access_log: str | None = None
     """Directory of an access log, inside LEAGUE_HOME unless it is absolute: a file of JSON lines for each replica. None
     for no log."""
-    shadow_waiting: int = Field(default=256, ge=1)
+    shadow_waiting: int = Field(default=1024, ge=1)
     """Requests that may wait to be mirrored to a shadow; beyond them they are not mirrored, and counted as dropped."""
     shadow_load: float = Field(default=0.1, gt=0, lt=1)
     """Share of a core that mirrored requests may take. What does not fit is dropped."""

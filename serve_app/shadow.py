@@ -30,8 +30,8 @@ from serve_app.models import policy_ref
 from serve_app.settings import ServeSettings
 from serve_app.traffic import Traffic
 
-WINDOW = 0.01
-"""Seconds for which requests are collected."""
+WINDOW = 0.05
+"""Seconds for which requests are collected: the fewer wake-ups, the less the event loop has to share."""
 TOLERANCE = 0.01
 """Numbers of a continuous action that differ by less than this share of their span count as the same."""
 MOST_BYTES = 16 * 2**20
