@@ -6,6 +6,7 @@ Nothing stands behind the ingress: a request is answered in the process that it 
 without Ray Serve's part on that way (middleware.py).
 """
 
+import gc
 import sys
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -38,7 +39,7 @@ from serve_app.metrics import Metrics
 from serve_app.middleware import shorten
 from serve_app.models import Models
 from serve_app.reporting import Reporter
-from serve_app.routes.action import ActionRoute
+from serve_app.routes.action import ActionRoute, Shortcut
 from serve_app.routes.docs import DocsRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
@@ -86,6 +87,7 @@ class PolicyServer:
         http_protocol.install()
         websocket_protocol.install(self._server.settings.max_body)
         offer(self._server.inference_service)
+        gc.freeze()  # what is loaded by now stays: looking through it again and again would stop the event loop
         return application
 
     def check_health(self) -> None:
@@ -164,7 +166,10 @@ class Server:
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
             ],
-            middleware=[Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log)],
+            middleware=[
+                Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log),
+                Middleware(Shortcut, self.action),
+            ],
             exception_handlers=self.errors.table(),
             lifespan=self._running,
         )

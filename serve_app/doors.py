@@ -136,6 +136,7 @@ class Guarded:
             self._doors.backlog.listens_on(here[1])
         if self._log is not None:
             send = self._log.begin(scope, _path(scope), send)
+        reply = Reply(send)
         try:
             token, patience = _shown(scope["headers"])
             need = permissions.of_request(kind, scope.get("method", "GET"), _path(scope))
@@ -148,9 +149,10 @@ class Guarded:
                 await self._application(scope, receive, send)
                 return
             timeout = self._timeout if patience is None else min(_seconds(patience), self._timeout)
-            reply = Reply(send)
             await within(timeout, self._application(scope, receive, reply.send))
         except LeagueError as error:
+            if reply.is_begun:
+                raise
             await self._refuse(error, scope, receive, send)
         except Expired:
             if not reply.is_begun:  # else the client does not read it, and the server hangs up

@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 import orjson
-from starlette.types import Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from league.errors import InvalidInput, Overloaded
 from league.refs import CHAMPION
@@ -30,6 +30,7 @@ from serve_app.settings import ServeSettings
 from serve_app.shadow import Shadow, Show
 
 REPLICA = b"x-league-replica"
+BEGINNING, ENDING = "/v1/policies/", "/action"
 API = "action"
 """What this route is called in metrics."""
 MOST_PARAMETERS = 16
@@ -73,6 +74,25 @@ class ActionRoute:
             answered_by(scope, model, version.number)
         await _send(send, orjson.dumps(reply), self._replica)
         self._metrics.answered(API, model, version, len(ask.observations), perf_counter_ns() - begun)
+
+
+class Shortcut:
+    """Requests for actions go to their route at once; the others are looked up among all routes."""
+
+    def __init__(self, application: ASGIApp, action: ActionRoute) -> None:
+        self._application = application
+        self._action = action
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Raises LeagueError."""
+        path = scope["path"] if scope["type"] == "http" else ""
+        if path.startswith(BEGINNING) and path.endswith(ENDING) and scope["method"] == "POST":
+            model = path[len(BEGINNING) : -len(ENDING)]
+            if model and "/" not in model:
+                scope["path_params"] = {"model": model}
+                await self._action(scope, receive, send)
+                return
+        await self._application(scope, receive, send)
 
 
 def query(scope: Scope) -> dict[str, str]:
