@@ -40,7 +40,7 @@ class Doors:
         self._keyring = keyring
         self._settings = settings
         self._is_exposed = is_exposed
-        self.backlog = Backlog(settings.max_waiting, settings.patience)
+        self.backlog = Backlog(settings.max_waiting, settings.max_turn, settings.patience)
 
     @property
     def are_locked(self) -> bool:

@@ -31,9 +31,12 @@ class ServeSettings(BaseModel):
     """For one request, from its head to its reply; beyond it 504, or 408 if the body was the cause. Less than
     RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy answers 500. A client may ask for less by
     `x-request-timeout-ms`."""
-    max_waiting: int = Field(default=64, ge=1)
-    """Requests for actions that may wait for each other on the event loop, as backlog.py counts them. When more wait
-    for longer than `patience`, those beyond are answered 429."""
+    max_waiting: int = Field(default=256, ge=1)
+    """Requests for actions that may wait for each other on the event loop, those on connections that were not accepted
+    yet among them. When more wait for longer than `patience`, those beyond are answered 429."""
+    max_turn: float = Field(default=0.025, gt=0)
+    """The same in time: what one turn of the event loop comes to later than that is answered 429, if its turns take
+    longer for more than `patience`. Who is accepted waits for two turns at most."""
     patience: float = Field(default=0.1, ge=0)
     """How long a burst may last."""
     require_keys: Literal["auto", "always", "never"] = "auto"
