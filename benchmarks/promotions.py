@@ -71,7 +71,7 @@ def main() -> int:
         replies = Path(scratch) / "replies.npy"
         with running(registry.storage, replicas=REPLICAS) as url:
             _await_replicas(registry, 1)
-            before, started = of_haproxy(), set[int]()
+            before, started = _settled(), set[int]()
             with _loading(url, replies):
                 promotions = []
                 for i in range(count):
@@ -160,6 +160,16 @@ def _await_replicas(registry: Registry, version: int, every: float = 0.005) -> N
         if time.monotonic() > deadline:
             raise TimeoutError(f"version {version} did not reach every replica within 30 s")
         time.sleep(every)
+
+
+def _settled(seconds: float = 3.0) -> set[int]:
+    """HAProxy's processes, once they have stayed the same for a while: the last replica's coming is a reload, too."""
+    known, since = of_haproxy(), time.monotonic()
+    while time.monotonic() < since + seconds:
+        time.sleep(0.1)
+        if (now := of_haproxy()) != known:
+            known, since = now, time.monotonic()
+    return known
 
 
 @contextmanager
