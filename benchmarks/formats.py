@@ -69,7 +69,7 @@ def main() -> int:
         registry = publish(Path(scratch) / "home", versions=1)
         with local_ray(1):
             small = prepare(CONFIGS / "pistonball.yaml", registry, updates=0)
-            large = prepare(CONFIGS / "pistonball.yaml", registry, updates=0, **MNIH)
+            large = prepare(CONFIGS / "pistonball.yaml", registry, updates=0, source="parity/2", **MNIH)
         picture = _picture(registry, large)
         (grpc_port,) = haproxy.free_ports(1, "127.0.0.1")
         with running(registry.storage, replicas=1, grpc_port=grpc_port) as url:

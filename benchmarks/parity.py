@@ -60,8 +60,11 @@ class Compared:
         return self.graph_differs == self.endpoint_differs == 0
 
 
-def prepare(path: Path, registry: Registry, updates: int, **training: object) -> VersionRow:
-    """Train a configuration for a few updates, publish it, and promote what came of it. training: other settings."""
+def prepare(path: Path, registry: Registry, updates: int, source: str = "parity/1", **training: object) -> VersionRow:
+    """Train a configuration for a few updates, publish it, and promote what came of it.
+
+    source: what is published once. training: other settings.
+    """
     config = LeagueConfig.load(path).with_training(runners=0, **training)
     described = interface(config)
     registry.register(config, described)
@@ -74,7 +77,7 @@ def prepare(path: Path, registry: Registry, updates: int, **training: object) ->
         finally:
             algorithm.stop()
         version = publish(
-            Checkpoint(Path(scratch), source="parity/1", steps=updates),
+            Checkpoint(Path(scratch), source=source, steps=updates),
             registry=registry,
             config=config,
             interface=described,
