@@ -25,7 +25,8 @@ class Polling:
         self._has_seen = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self._pause = settings.poll
-        self._fails = False
+        self._fault: str | None = None
+        """The last one that was told; None while there is none."""
 
     @property
     def is_ready(self) -> bool:
@@ -61,13 +62,13 @@ class Polling:
     def _back_off(self, error: Exception) -> None:
         """Look less often. Only a bug raises something else than a LeagueError; it must not end the looking."""
         bug = None if isinstance(error, LeagueError) else error
-        if not self._fails:
+        if str(error) != self._fault:
             logger.error("%s cannot be followed, what is known stays: %s", self._subject, error, exc_info=bug)
-        self._fails = True
+        self._fault = str(error)
         self._pause = min(2 * self._pause, self._settings.poll_slowest)
 
     def _recover(self) -> None:
-        if self._fails:
+        if self._fault is not None:
             logger.error("%s are followed again", self._subject)
-        self._fails = False
+        self._fault = None
         self._pause = self._settings.poll
