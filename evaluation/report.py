@@ -15,16 +15,15 @@ class Document:
 
     def to_json(self) -> dict[str, Any]:
         """Nested dictionaries and lists; what is undefined is None."""
-        document: dict[str, Any] = plain(asdict(self))  # type: ignore[call-overload]
+        document: dict[str, Any] = _plain(asdict(self))  # type: ignore[call-overload]
         return document
 
 
-def plain(value: Any) -> Any:
-    """As JSON has it: lists for tuples, None for what is not finite."""
+def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [_plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -136,8 +136,17 @@ def _reason(verdict: VerdictRow, decision: Decision) -> str:
 def _close(
     registry: Registry, verdict: VerdictRow, outcome: str, decision: Decision, note: str | None
 ) -> VerdictReport:
+    report = report_of(registry, verdict, outcome, decision, note)
+    registry.close_verdict(verdict.id, outcome, evidence_of(report, decision))
+    return report
+
+
+def report_of(
+    registry: Registry, verdict: VerdictRow, outcome: str, decision: Decision, note: str | None
+) -> VerdictReport:
+    """What is told of a verdict that ends with this decision."""
     estimate = decision.estimate
-    report = VerdictReport(
+    return VerdictReport(
         verdict=verdict.id,
         candidate=_challenger(verdict),
         opponent=verdict.champion,
@@ -154,6 +163,8 @@ def _close(
         difference=_difference(registry, verdict, decision),
         note=note,
     )
-    evidence: dict[str, Any] = report.to_json() | {"counts": list(decision.counts)}
-    registry.close_verdict(verdict.id, outcome, evidence)
-    return report
+
+
+def evidence_of(report: VerdictReport, decision: Decision) -> dict[str, Any]:
+    """What is recorded of it."""
+    return report.to_json() | {"counts": list(decision.counts)}

@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from evaluation import promotion
-from evaluation.gate import Decision, judge
-from evaluation.paired import paired_difference
+from evaluation.gate import judge
 from evaluation.replay import replay
-from evaluation.report import Document, plain
-from evaluation.verdicts import VOID, gate_of
+from evaluation.report import Document
+from evaluation.verdicts import VOID, evidence_of, gate_of, report_of
 from league.environments.lockstep import stepping
 from league.errors import InvalidInput, LedgerRefusal, VerdictRefuted
 from league.registry.registry import Registry
@@ -56,9 +54,10 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     schedule = ledger.schedule(row.schedule)
     matches = ledger.matches(league=row.league, schedule=row.schedule)
     _check_matches(row, schedule, matches)
-    challenger = f"{row.league}@{row.candidate}"
-    decision = judge(gate_of(row), matches, challenger)
-    computed = _computed(registry, row, schedule, matches, decision)
+    decision = judge(gate_of(row), matches, f"{row.league}@{row.candidate}")
+    # A void verdict ended for a reason beside its games, at any point of them.
+    outcome = VOID if row.outcome == VOID else str(decision.outcome)
+    computed = evidence_of(report_of(registry, row, outcome, decision, row.evidence.get("note")), decision)
     wrong = [
         f"{name} is {row.evidence.get(name)!r}, and by the games {value!r}"
         for name, value in computed.items()
@@ -78,37 +77,6 @@ def _check_matches(row: VerdictRow, schedule: Schedule, matches: Sequence[Match]
             admit(match, schedule)
     except LedgerRefusal as error:
         raise VerdictRefuted(f"verdict {row.id} counts a match that its schedule did not ask for: {error}") from error
-
-
-def _computed(
-    registry: Registry, row: VerdictRow, schedule: Schedule, matches: Sequence[Match], decision: Decision
-) -> dict[str, Any]:
-    """What the evidence must say. A void verdict ended for a reason beside its games, at any point of them."""
-    challenger = f"{row.league}@{row.candidate}"
-    estimate = decision.estimate
-    counted = matches[: decision.blocks]
-    difference = None if schedule.scoring == "game" else paired_difference(counted, challenger)
-    computed = {
-        "verdict": row.id,
-        "candidate": challenger,
-        "opponent": row.champion,
-        "outcome": row.outcome if row.outcome == VOID else decision.outcome,
-        "llr": decision.llr,
-        "bounds": decision.bounds,
-        "blocks": decision.blocks,
-        "games": decision.games,
-        "distinct_games": decision.distinct_games or 0,
-        "score": decision.score,
-        "elo": estimate.elo if estimate else None,
-        "interval": (estimate.low, estimate.high) if estimate else None,
-        "counts": decision.counts,
-        "promoted": promotion.is_applied(registry, row),
-        "difference": None
-        if difference is None
-        else {"mean": difference.mean, "low": difference.low, "high": difference.high},
-    }
-    document: dict[str, Any] = plain(computed)
-    return document
 
 
 def _same(recorded: Any, computed: Any) -> bool:
