@@ -48,6 +48,7 @@ def serve(
         address=address,
         on_ready=lambda url: say(
             f"Serving the leagues of {storage.home} on {url}\n"
+            f"  {url}/docs                                every call, to try in a browser\n"
             f"  {url}/v1/leagues                          what is served\n"
             f"  {url}/v1/policies/LEAGUE/action           POST an observation, get an action\n"
             f"  {url}/v2/models/LEAGUE                    the Open Inference Protocol, over gRPC too\n"
