@@ -59,7 +59,7 @@ def _train(config: LeagueConfig, minutes: float) -> None:
 
 
 def _hold_league(config: LeagueConfig) -> None:
-    from cli.evaluation import hold_night
+    from cli.nightly import hold_night
 
     _step(2, "the league: each new version challenges the champion, in pairs of games with the seats swapped.")
     say("A sequential test (GSPRT) plays until it knows: promote, reject, or undecided.")

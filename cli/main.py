@@ -8,13 +8,15 @@ import typer
 from cli.demo import demo
 from cli.doctor import doctor
 from cli.environments import check_env
-from cli.evaluation import evaluate, nightly, verify
+from cli.evaluation import evaluate
 from cli.keys import app as keys
+from cli.nightly import nightly
 from cli.output import errors
 from cli.replay import replay
 from cli.serving import act, serve
 from cli.traffic import traffic
 from cli.training import sweep, train
+from cli.verdicts import verify, void
 from cli.versions import history, promote, rollback, versions
 from league.errors import InvalidInput, LeagueError, NotFound
 
@@ -39,6 +41,7 @@ for command in (
     evaluate,
     nightly,
     verify,
+    void,
     promote,
     rollback,
     history,

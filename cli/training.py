@@ -84,9 +84,8 @@ def train(
         options = _given(**{"from": parent}, **settings)
         _submit(address, config, [f"--{name}={value}" for name, value in options.items()] + ["--resume"] * resume)
         return
-    from league.refs import CheckpointRef
+    from league.refs import CheckpointRef, of_league
     from league.registry.registry import Registry
-    from training.pinning import of_league
     from training.run import train as run
 
     with _ended_by_ctrl_c():

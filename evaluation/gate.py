@@ -1,7 +1,10 @@
 """The gate: from the blocks of a verdict's schedule to `promote`, `reject` or `inconclusive`.
 
-A decision is a function of the settings and of the block scores in schedule order, and of nothing else: not of when a
-block was finished, nor of how many workers played, nor of blocks behind the one at which the test stopped.
+A decision is a function of the settings and of the blocks in schedule order, and of nothing else: not of when a block
+was finished, nor of how many workers played, nor of blocks behind the one at which the test stopped.
+
+The evidence is a block's score, tested by a GSPRT on Elo, or with the model `returns` the difference of its returns,
+tested by betting.
 """
 
 from __future__ import annotations
@@ -13,8 +16,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.sequential import EloEstimate, bounds, elo_estimate, gsprt_llr
+from evaluation.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config import GateConfig
+from league.errors import BoundExceeded
 from league.results.records import GAMES_PER_BLOCK, Action, Game, Match
 
 Outcome = Literal["promote", "reject", "inconclusive"]
@@ -27,7 +31,8 @@ class Decision:
     outcome: None while the test is open.
     blocks: how many blocks count; the test stopped at the last of them if it has an outcome.
     counts: how many of those ended in each cell, worst for the challenger first.
-    curve: the LLR after each of those blocks; `llr` is its end, 0.0 without blocks.
+    curve: the LLR after each of those blocks; `llr` is its end, 0.0 without blocks. Of a betting test it is the greater
+        of two log wealths: who bets against H0 counts up, who bets against H1 down.
     estimate: the challenger's Elo over the champion, logistic as ratings are; None without blocks.
     distinct_games: how many different games are among those that count; None where moves are not known.
     """
@@ -49,29 +54,38 @@ class Decision:
         return sum(i * n for i, n in enumerate(self.counts)) / (top * self.blocks) if self.blocks else None
 
 
-def decide(settings: GateConfig, block_scores: Sequence[float], comparisons: int = 2) -> Decision:
+def decide(
+    settings: GateConfig,
+    block_scores: Sequence[float],
+    comparisons: int = 2,
+    differences: Sequence[float] = (),
+) -> Decision:
     """Decide on the challenger's mean score in each block, in schedule order.
 
     `promote` at the first block whose LLR reaches the upper bound, `reject` at the lower one, `inconclusive` at
     `max_blocks` without either. Blocks behind the stopping block do not count.
 
     comparisons: how often a block compares the two: in both games, or once where each plays a game alone.
-    Raises ValueError for scores that such blocks cannot have.
+    differences: by how much the challenger's return exceeds the other's in each block, for the model `returns`.
+    Raises ValueError for scores that such blocks cannot have, and BoundExceeded.
     """
-    lower, upper = bounds(settings.alpha, settings.beta)
+    limits = limits_of(settings)
     counts = _cumulated(block_scores[: settings.max_blocks], comparisons)
-    curve = gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
-    crossed = _crossed(curve, (lower, upper))
+    if settings.model == "returns":
+        curve = _wealth(settings, differences[: settings.max_blocks])
+    else:
+        curve = gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
+    crossed = _crossed(curve, limits)
     blocks = int(crossed[0]) + 1 if crossed.size else len(counts)
     outcome: Outcome | None = None
     if crossed.size:
-        outcome = "promote" if curve[blocks - 1] >= upper else "reject"
+        outcome = "promote" if curve[blocks - 1] >= limits[1] else "reject"
     elif blocks == settings.max_blocks:
         outcome = "inconclusive"
     return Decision(
         outcome=outcome,
         llr=float(curve[blocks - 1]) if blocks else 0.0,
-        bounds=(lower, upper),
+        bounds=limits,
         blocks=blocks,
         games=blocks * GAMES_PER_BLOCK,
         distinct_games=None,
@@ -83,7 +97,8 @@ def decide(settings: GateConfig, block_scores: Sequence[float], comparisons: int
 
 def judge(settings: GateConfig, matches: Sequence[Match], challenger: str) -> Decision:
     """Decide on matches in schedule order, and count the distinct games among those that count."""
-    decision = decide(settings, *_block_scores(matches, challenger))
+    differences = _differences(matches, challenger) if settings.model == "returns" else ()
+    decision = decide(settings, *_block_scores(matches, challenger), differences)
     return replace(decision, distinct_games=distinct_games(matches[: decision.blocks]))
 
 
@@ -125,23 +140,63 @@ class Watch:
 
     def __init__(self, settings: GateConfig, challenger: str) -> None:
         self._settings, self._challenger = settings, challenger
-        self.bounds = bounds(settings.alpha, settings.beta)
+        self.bounds = limits_of(settings)
         self.llr = 0.0
         self._counts: NDArray[np.int64] | None = None
+        self._differences: list[float] = []
         self._seen = 0
 
     def is_over(self, matches: Sequence[Match]) -> bool:
         """Whether the test is decided or exhausted by `matches`, all of the schedule so far in its order."""
         new = matches[self._seen : self._settings.max_blocks]
         if new:
-            counts = _cumulated(*_block_scores(new, self._challenger))
-            counts = counts if self._counts is None else counts + self._counts
-            curve = gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
-            self._counts, self.llr = counts[-1], float(curve[-1])
+            curve = self._wealth(new) if self._settings.model == "returns" else self._llr(new)
+            self.llr = float(curve[-1])
             self._seen += len(new)
             if _crossed(curve, self.bounds).size:
                 return True
         return self._seen >= self._settings.max_blocks
+
+    def _llr(self, new: Sequence[Match]) -> NDArray[np.float64]:
+        counts = _cumulated(*_block_scores(new, self._challenger))
+        counts = counts if self._counts is None else counts + self._counts
+        self._counts = counts[-1]
+        assert self._settings.model != "returns"
+        return gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
+
+    def _wealth(self, new: Sequence[Match]) -> NDArray[np.float64]:
+        self._differences += _differences(new, self._challenger)
+        return _wealth(self._settings, self._differences)
+
+
+def counts_of(matches: Sequence[Match], challenger: str) -> tuple[int, ...]:
+    """How many of all the blocks ended in each cell, worst for the challenger first; there must be one."""
+    return tuple(int(n) for n in _cumulated(*_block_scores(matches, challenger))[-1])
+
+
+def limits_of(settings: GateConfig) -> tuple[float, float]:
+    """The two values of the LLR, or of the log wealth, at which a test decides."""
+    if settings.model != "returns":
+        return bounds(settings.alpha, settings.beta)
+    lower, upper = _betting(settings).bounds
+    return -lower, upper
+
+
+def _betting(settings: GateConfig) -> BettingTest:
+    assert settings.return_bound is not None, "the configuration asks for it"
+    return BettingTest(settings.return_bound, settings.alpha, settings.beta, settings.return0, settings.return1)
+
+
+def _wealth(settings: GateConfig, differences: Sequence[float]) -> NDArray[np.float64]:
+    """Log wealth of the richer of the two who bet, counted down for who bets against H1."""
+    beyond = [d for d in differences if abs(d) > (settings.return_bound or 0)]
+    if beyond:
+        raise BoundExceeded(
+            f"gate.return_bound is {settings.return_bound:g}, but the returns of a block differ by {beyond[0]:g}:"
+            " void the verdict (`league void`) and set a bound that no block can exceed"
+        )
+    against_h1, against_h0 = _betting(settings).curves(np.asarray(differences, dtype=np.float64))
+    return np.where(against_h0 >= against_h1, against_h0, -against_h1)
 
 
 def distinct_games(matches: Iterable[Match], contestant: str | None = None) -> int:
@@ -172,6 +227,15 @@ def _block_scores(matches: Sequence[Match], challenger: str) -> tuple[list[float
     """The challenger's score in each block, and how many comparisons make one."""
     scores = [match.score(match.contestants.index(challenger)) for match in matches]
     return scores, matches[0].result().games if matches else GAMES_PER_BLOCK
+
+
+def _differences(matches: Sequence[Match], challenger: str) -> list[float]:
+    """By how much the challenger's mean return exceeds the other's in each block."""
+    gaps = []
+    for match in matches:
+        own = match.contestants.index(challenger)
+        gaps.append(match.mean_return(own) - match.mean_return(1 - own))
+    return gaps
 
 
 def _cumulated(block_scores: Sequence[float], comparisons: int) -> NDArray[np.int64]:

@@ -90,16 +90,44 @@ class EvaluationReport(Document):
 
 
 @dataclass(frozen=True, slots=True)
+class AnchorReport(Document):
+    """One test of non-inferiority with its evidence, as in VerdictReport.
+
+    margin: by how much the challenger may be weaker, in the gate's unit. schedule: of the matches that count.
+    outcome: `not inferior`, `inferior`, `inconclusive`, or `open` where the verdict was voided before its end.
+    """
+
+    ref: str
+    margin: float
+    schedule: str
+    outcome: str
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    distinct_games: int
+    counts: tuple[int, ...]
+    score: float | None
+    elo: float | None
+    interval: tuple[float | None, float | None] | None
+
+
+@dataclass(frozen=True, slots=True)
 class VerdictReport(Document):
     """One challenger's test with its evidence.
 
     outcome: `promote`, `reject`, `inconclusive`, or `void` where it could not be ended: `note` says why.
-    llr, bounds: the log likelihood ratio at the end, and the two values at which it decides.
+    llr, bounds: the log likelihood ratio at the end, and the two values at which it decides; log wealths where returns
+    are tested.
     blocks, games: those that counted. distinct_games: how many different games are among them.
+    counts: blocks in each cell, worst for the challenger first.
     score: the challenger's mean score. elo, interval: its strength over the opponent in logistic Elo, with its 95 %
     interval; None where a side of it is infinite.
+    alpha: what this verdict spends of a year's.
+    anchors: the tests of non-inferiority that were played, after the opponent was beaten.
     difference: its mean return minus the opponent's, where contestants are compared on the same side; else None.
-    promoted: whether this verdict made the challenger champion; `note` says why not where `promote` was refused.
+    promoted: whether this verdict made the challenger champion.
+    note: why it did not although the opponent was beaten, or why it is void.
     """
 
     verdict: str
@@ -111,18 +139,37 @@ class VerdictReport(Document):
     blocks: int
     games: int
     distinct_games: int
+    counts: tuple[int, ...]
     score: float | None
     elo: float | None
     interval: tuple[float | None, float | None] | None
     promoted: bool
+    alpha: float
+    anchors: tuple[AnchorReport, ...] = ()
     difference: Difference | None = None
     note: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation(Document):
+    """How much a promotion gained, by a fresh match of fixed length: `elo` and `interval` as in VerdictReport."""
+
+    verdict: str
+    candidate: str
+    opponent: str
+    games: int
+    score: float
+    elo: float
+    interval: tuple[float | None, float | None]
+    difference: Difference | None
 
 
 @dataclass(frozen=True, slots=True)
 class NightReport(Document):
     """One night of a league: its verdicts in order, the champion before and after, and everybody's ratings.
 
+    confirmations: of promotions whose fresh match was played this night.
+    alpha_spent: by all verdicts of the last 365 days, of the gate's `alpha`.
     faults: versions that could not be judged or rated, each with the reason; they are tried again the next night.
     """
 
@@ -130,6 +177,8 @@ class NightReport(Document):
     champion_before: str | None
     champion: str | None
     verdicts: tuple[VerdictReport, ...]
+    confirmations: tuple[Confirmation, ...]
+    alpha_spent: float
     faults: tuple[str, ...]
     standings: tuple[Standing, ...]
     seconds: float

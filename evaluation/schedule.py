@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
-from league.config import LeagueConfig
+from league.config import GateConfig, LeagueConfig
 from league.errors import EnvironmentMismatch
 from league.interface import Interface, digest
 from league.results.records import Schedule, Scoring
@@ -44,13 +44,34 @@ def gauntlet(
     return _schedule(config, interface, "gauntlet", contestants, pairings, blocks * len(pairings), seed)
 
 
-def verdict(config: LeagueConfig, interface: Interface, challenger: str, champion: str, seed: int = 0) -> Schedule:
+def verdict(
+    config: LeagueConfig,
+    interface: Interface,
+    challenger: str,
+    champion: str,
+    gate: GateConfig | None = None,
+    seed: int = 0,
+) -> Schedule:
     """The challenger meets the champion in up to `gate.max_blocks` matches; its id depends on the gate's
     settings too.
+
+    gate: by default the league's.
     """
-    schedule = _schedule(config, interface, "verdict", [challenger, champion], [(0, 1)], config.gate.max_blocks, seed)
-    gate = config.gate.model_dump(mode="json")
-    return replace(schedule, id=f"{schedule.id}-{digest(gate)[:8]}")
+    gate = gate or config.gate
+    schedule = _schedule(config, interface, "verdict", [challenger, champion], [(0, 1)], gate.max_blocks, seed)
+    return replace(schedule, id=f"{schedule.id}-{digest(gate.model_dump(mode='json'))[:8]}")
+
+
+def beside(
+    config: LeagueConfig, interface: Interface, kind: str, verdict: Schedule, opponent: str, blocks: int
+) -> Schedule:
+    """The challenger of a verdict meets somebody in up to `blocks` matches of that verdict's own, with seeds that no
+    other schedule has.
+
+    kind: `anchor` or `confirmation`.
+    """
+    contestants = [verdict.contestants[0], opponent]
+    return _schedule(config, interface, kind, contestants, [(0, 1)], blocks, verdict.seed, of=verdict.id)
 
 
 def scoring(interface: Interface) -> Scoring:
@@ -73,6 +94,7 @@ def _schedule(
     pairings: Sequence[Pairing],
     length: int,
     seed: int,
+    of: str | None = None,
 ) -> Schedule:
     if not pairings:
         raise EnvironmentMismatch(f"a schedule of league {config.league} needs two contestants that can meet")
@@ -86,6 +108,8 @@ def _schedule(
         "length": length,
         "seed": seed,
     }
+    if of is not None:
+        content |= {"kind": kind, "of": of}
     name = digest(content)
     return Schedule(
         id=f"{config.league}-{kind}-{name[:16]}",

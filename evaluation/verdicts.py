@@ -1,11 +1,11 @@
 """One verdict from its opening to its end, at any point of which the process may die and another go on.
 
-    schedule in the ledger → verdict opened → matches → decision → champion moved → verdict closed
+    schedules in the ledger → verdict opened → matches → findings → champion moved → verdict closed
 
-The order makes every step repeatable. A verdict that is open has its schedule. What was played is in the
-ledger, and the decision follows from it. The champion moves while the verdict is still open, and the audit
-row names it: so a verdict that was interrupted there is closed, and never applied twice, even if the champion
-was rolled back in between.
+The order makes every step repeatable. A verdict that is open has its schedules: against the champion, against each
+anchor, and for the match that confirms a promotion. What was played is in the ledger, and the findings follow from it.
+The champion moves while the verdict is still open, and the audit row names it: so a verdict that was interrupted there
+is closed, and never applied twice, even if the champion was rolled back in between.
 """
 
 from __future__ import annotations
@@ -15,10 +15,14 @@ from dataclasses import replace
 from typing import Any
 
 from evaluation import promotion, tournament
-from evaluation.gate import Decision, Watch, floor, judge
+from evaluation.anchors import anchors_of
+from evaluation.findings import Anchored, Findings, found
+from evaluation.gate import Watch, counts_of, floor, judge
 from evaluation.paired import paired_difference
-from evaluation.report import Difference, Listener, Progress, VerdictReport
+from evaluation.report import AnchorReport, Confirmation, Difference, Listener, Progress, VerdictReport
+from evaluation.schedule import beside
 from evaluation.schedule import verdict as verdict_schedule
+from evaluation.sequential import elo_estimate
 from league.config import GateConfig
 from league.refs import CHAMPION
 from league.registry.registry import Registry
@@ -36,44 +40,107 @@ def stands(verdict: VerdictRow) -> bool:
     return verdict.outcome != VOID
 
 
-def open_verdict(registry: Registry, league: LeagueRow, candidate: int, opponent: str) -> VerdictRow:
+def open_verdict(
+    registry: Registry,
+    league: LeagueRow,
+    candidate: int,
+    opponent: str,
+    alpha: float | None = None,
+    night: int | None = None,
+) -> VerdictRow:
     """Open a verdict on `candidate` against `opponent`, or find it open.
 
     One that does not stand is followed by another on other games, never by the same once more.
+    alpha: what it spends, by default the gate's. night: the one that it belongs to.
     """
     spent = [
         row
         for row in registry.verdicts(league.slug)
         if (row.candidate, row.champion) == (candidate, opponent) and row.outcome is not None
     ]
-    challenger = f"{league.slug}@{candidate}"
-    schedule = verdict_schedule(league.config, league.interface, challenger, opponent, seed=len(spent))
-    Ledger(registry).open(schedule)
-    settings = {"gate": league.config.gate.model_dump(mode="json")}
+    config, challenger, ledger = league.config, f"{league.slug}@{candidate}", Ledger(registry)
+    gate = config.gate.of_one_verdict(config.gate.alpha if alpha is None else alpha)
+    schedule = verdict_schedule(config, league.interface, challenger, opponent, gate, seed=len(spent))
+    ledger.open(schedule)
+    settings: dict[str, Any] = {"gate": gate.model_dump(mode="json"), "night": night, "anchors": []}
+    for anchor in anchors_of(registry, league, candidate, opponent):
+        own = beside(config, league.interface, "anchor", schedule, anchor.ref, gate.max_blocks)
+        settings["anchors"].append(
+            {"ref": anchor.ref, "margin": anchor.margin or gate.margin, "schedule": ledger.open(own).id}
+        )
+    if gate.confirmation_blocks:
+        own = beside(config, league.interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
+        settings["confirmation"] = ledger.open(own).id
     return registry.open_verdict(league.slug, candidate, opponent, schedule.id, settings)
 
 
 def conclude(
     registry: Registry, verdict: VerdictRow, *, workers: int = 0, listener: Listener | None = None
 ) -> VerdictReport:
-    """Play an open verdict to its end, move the champion if it says so, and close it."""
+    """Play an open verdict to its end, move the champion if it says so, and close it.
+
+    One that a person voids meanwhile ends where it is.
+    """
     if (obstacle := _obstacle(registry, verdict)) is not None:
-        return _close(registry, verdict, VOID, _decision(registry, verdict), note=obstacle)
-    watch = Watch(gate_of(verdict), _challenger(verdict))
+        return _close(registry, verdict, VOID, findings(registry, verdict), note=obstacle)
+    for schedule, gate in _tests(registry, verdict):
+        _play(registry, verdict, schedule, gate, workers, listener)
+        stopped = registry.verdict(verdict.id)
+        seen = findings(registry, verdict)
+        if stopped.outcome is not None:
+            return report_of(registry, verdict, stopped.outcome, seen, (stopped.evidence or {}).get("note"))
+        if seen.outcome is not None:
+            break
+    assert seen.outcome is not None, "a schedule ends where its test does"
+    refused = promotion.apply(registry, verdict, _reason(verdict, seen)) if seen.outcome == "promote" else seen.note
+    return _close(registry, verdict, seen.outcome, seen, note=refused)
+
+
+def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bool = False) -> VerdictRow:
+    """Stop a verdict that is open, or take back one that has fallen. Its alpha is spent: what was seen of it may have
+    been the reason. The candidate is judged again, on other games; a promotion that it led to stays.
+
+    purge: its games, which stay in the ledger, count for nothing any more.
+    Raises NotFound, or Conflict for one whose promotion is just being applied.
+    """
+    row = registry.void_verdict(verdict, f"voided by {actor}: {reason}")
+    if purge:
+        own = [row.schedule, *(anchor["schedule"] for anchor in row.settings.get("anchors", ()))]
+        Ledger(registry).purge([*own, row.settings.get("confirmation") or row.schedule])
+    return row
+
+
+def _tests(registry: Registry, verdict: VerdictRow) -> list[tuple[Schedule, GateConfig]]:
+    """The schedules of a verdict in their order, each with what decides it."""
+    ledger, gate = Ledger(registry), gate_of(verdict)
+    return [
+        (_schedule(registry, verdict), gate),
+        *(
+            (ledger.schedule(anchor["schedule"]), gate.against_anchor(anchor["margin"]))
+            for anchor in verdict.settings.get("anchors", ())
+        ),
+    ]
+
+
+def _play(
+    registry: Registry,
+    verdict: VerdictRow,
+    schedule: Schedule,
+    gate: GateConfig,
+    workers: int,
+    listener: Listener | None,
+) -> None:
+    """Play one of its tests until that is decided, or the verdict is closed by somebody else."""
+    watch = Watch(gate, _challenger(verdict))
 
     def report(progress: Progress | VerdictReport) -> None:
         if listener and isinstance(progress, Progress):
             listener(replace(progress, llr=watch.llr, bounds=watch.bounds))
 
-    tournament.run(
-        _schedule(registry, verdict), registry=registry, workers=workers, enough=watch.is_over, listener=report
-    )
-    decision = _decision(registry, verdict)
-    assert decision.outcome is not None, "a schedule ends where its test does"
-    refused = None
-    if decision.outcome == "promote":
-        refused = promotion.apply(registry, verdict, _reason(verdict, decision))
-    return _close(registry, verdict, decision.outcome, decision, note=refused)
+    def enough(matches: Sequence[Match]) -> bool:
+        return watch.is_over(matches) or registry.verdict(verdict.id).outcome is not None
+
+    tournament.run(schedule, registry=registry, workers=workers, enough=enough, listener=report)
 
 
 def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
@@ -104,7 +171,7 @@ def _schedule(registry: Registry, verdict: VerdictRow) -> Schedule:
 
 
 def gate_of(verdict: VerdictRow) -> GateConfig:
-    """The settings under which it was opened."""
+    """The settings under which it was opened, its own alpha among them."""
     return GateConfig.model_validate(verdict.settings["gate"])
 
 
@@ -112,40 +179,49 @@ def _challenger(verdict: VerdictRow) -> str:
     return f"{verdict.league}@{verdict.candidate}"
 
 
-def _matches(registry: Registry, verdict: VerdictRow) -> Sequence[Match]:
-    return Ledger(registry).matches(league=verdict.league, schedule=verdict.schedule)
+def _matches(registry: Registry, verdict: VerdictRow, schedule: str | None = None) -> Sequence[Match]:
+    return Ledger(registry).matches(league=verdict.league, schedule=schedule or verdict.schedule)
 
 
-def _decision(registry: Registry, verdict: VerdictRow) -> Decision:
-    return judge(gate_of(verdict), _matches(registry, verdict), _challenger(verdict))
+def findings(registry: Registry, verdict: VerdictRow) -> Findings:
+    """What the ledger says of a verdict's challenger."""
+    gate, challenger = gate_of(verdict), _challenger(verdict)
+    anchors = [
+        Anchored(
+            anchor["ref"],
+            anchor["margin"],
+            anchor["schedule"],
+            judge(gate.against_anchor(anchor["margin"]), _matches(registry, verdict, anchor["schedule"]), challenger),
+        )
+        for anchor in verdict.settings.get("anchors", ())
+    ]
+    return found(judge(gate, _matches(registry, verdict), challenger), anchors, len(anchors), None)
 
 
-def _difference(registry: Registry, verdict: VerdictRow, decision: Decision) -> Difference | None:
-    if _schedule(registry, verdict).scoring == "game":
+def _difference(registry: Registry, verdict: VerdictRow, seen: Findings) -> Difference | None:
+    if _schedule(registry, verdict).scoring == "game" and gate_of(verdict).model != "returns":
         return None
-    return paired_difference(_matches(registry, verdict)[: decision.blocks], _challenger(verdict))
+    return paired_difference(_matches(registry, verdict)[: seen.champion.blocks], _challenger(verdict))
 
 
-def _reason(verdict: VerdictRow, decision: Decision) -> str:
+def _reason(verdict: VerdictRow, seen: Findings) -> str:
+    decision = seen.champion
+    beside = f", and is not inferior to {', '.join(each.ref for each in seen.anchors)}" if seen.anchors else ""
     return (
         f"beat {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
-        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}"
+        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{beside}"
     )
 
 
-def _close(
-    registry: Registry, verdict: VerdictRow, outcome: str, decision: Decision, note: str | None
-) -> VerdictReport:
-    report = report_of(registry, verdict, outcome, decision, note)
-    registry.close_verdict(verdict.id, outcome, evidence_of(report, decision))
+def _close(registry: Registry, verdict: VerdictRow, outcome: str, seen: Findings, note: str | None) -> VerdictReport:
+    report = report_of(registry, verdict, outcome, seen, note)
+    registry.close_verdict(verdict.id, outcome, evidence_of(report))
     return report
 
 
-def report_of(
-    registry: Registry, verdict: VerdictRow, outcome: str, decision: Decision, note: str | None
-) -> VerdictReport:
-    """What is told of a verdict that ends with this decision."""
-    estimate = decision.estimate
+def report_of(registry: Registry, verdict: VerdictRow, outcome: str, seen: Findings, note: str | None) -> VerdictReport:
+    """What is told of a verdict that ends with these findings."""
+    decision, estimate = seen.champion, seen.champion.estimate
     return VerdictReport(
         verdict=verdict.id,
         candidate=_challenger(verdict),
@@ -156,15 +232,83 @@ def report_of(
         blocks=decision.blocks,
         games=decision.games,
         distinct_games=decision.distinct_games or 0,
+        counts=decision.counts,
         score=decision.score,
         elo=estimate.elo if estimate else None,
         interval=(estimate.low, estimate.high) if estimate else None,
         promoted=promotion.is_applied(registry, verdict),
-        difference=_difference(registry, verdict, decision),
+        alpha=verdict.alpha,
+        anchors=tuple(_anchor_report(anchor) for anchor in seen.anchors),
+        difference=_difference(registry, verdict, seen),
         note=note,
     )
 
 
-def evidence_of(report: VerdictReport, decision: Decision) -> dict[str, Any]:
+OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "inconclusive", None: "open"}
+
+
+def _anchor_report(anchor: Anchored) -> AnchorReport:
+    decision, estimate = anchor.decision, anchor.decision.estimate
+    return AnchorReport(
+        ref=anchor.ref,
+        margin=anchor.margin,
+        schedule=anchor.schedule,
+        outcome=OUTCOMES[decision.outcome],
+        llr=decision.llr,
+        bounds=decision.bounds,
+        blocks=decision.blocks,
+        games=decision.games,
+        distinct_games=decision.distinct_games or 0,
+        counts=decision.counts,
+        score=decision.score,
+        elo=estimate.elo if estimate else None,
+        interval=(estimate.low, estimate.high) if estimate else None,
+    )
+
+
+def evidence_of(report: VerdictReport) -> dict[str, Any]:
     """What is recorded of it."""
-    return report.to_json() | {"counts": list(decision.counts)}
+    return report.to_json()
+
+
+def confirm(
+    registry: Registry, verdict: VerdictRow, *, workers: int = 0, listener: Listener | None = None
+) -> Confirmation | None:
+    """Play the fresh match of a verdict that promoted, to its end, and tell how much was gained.
+
+    None where nothing was promoted, no confirmation was asked for, or the environment is another by now.
+    """
+    schedule = verdict.settings.get("confirmation")
+    if verdict.outcome != "promote" or not stands(verdict) or schedule is None:
+        return None
+    whole = Ledger(registry).schedule(schedule)
+    if whole.environment_digest != registry.league(verdict.league).environment_digest:
+        return None
+    tournament.run(whole, registry=registry, workers=workers, listener=listener)
+    return confirmation(registry, verdict)
+
+
+def confirmation(registry: Registry, verdict: VerdictRow) -> Confirmation | None:
+    """How much a promotion gained, by its fresh match; None while that is not played to its end.
+
+    Its length was fixed before, and it has no part in the decision: so the estimate is unbiased, where that of the
+    verdict itself, which stopped because it looked good, is too good.
+    """
+    name = verdict.settings.get("confirmation")
+    if name is None:
+        return None
+    schedule, matches = Ledger(registry).schedule(name), _matches(registry, verdict, name)
+    if len(matches) < schedule.length:
+        return None
+    counts = counts_of(matches, _challenger(verdict))
+    estimate = elo_estimate(counts, "logistic")
+    return Confirmation(
+        verdict=verdict.id,
+        candidate=_challenger(verdict),
+        opponent=verdict.champion,
+        games=2 * len(matches),
+        score=sum(i * n for i, n in enumerate(counts)) / (len(counts) - 1) / len(matches),
+        elo=estimate.elo,
+        interval=(estimate.low, estimate.high),
+        difference=None if schedule.scoring == "game" else paired_difference(matches, _challenger(verdict)),
+    )

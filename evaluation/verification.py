@@ -14,17 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.gate import judge
 from evaluation.replay import replay
 from evaluation.report import Document
-from evaluation.verdicts import VOID, evidence_of, gate_of, report_of
+from evaluation.verdicts import VOID, evidence_of, findings, report_of
 from league.environments.lockstep import stepping
 from league.errors import InvalidInput, LedgerRefusal, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.rows import VerdictRow
 from league.results.admission import admit
 from league.results.ledger import Ledger
-from league.results.records import Match, Schedule
+from league.results.records import Match
 
 ROUNDING = 1e-9
 """Numbers that differ by less, relative to their size, are the same on another machine."""
@@ -43,21 +42,24 @@ class Verification(Document):
 
 
 def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verification:
-    """Compute a closed verdict again, and play `replays` of the games that count once more, evenly spread.
+    """Compute a closed verdict again, and play `replays` of the games that count once more, evenly spread over them.
 
     Raises VerdictRefuted, which names all that differs; NotFound; InvalidInput for a verdict that is open.
     """
     row = registry.verdict(verdict)
     if row.outcome is None or row.evidence is None:
         raise InvalidInput(f"verdict {verdict} is open: `league nightly` goes on with it")
-    ledger = Ledger(registry)
-    schedule = ledger.schedule(row.schedule)
-    matches = ledger.matches(league=row.league, schedule=row.schedule)
-    _check_matches(row, schedule, matches)
-    decision = judge(gate_of(row), matches, f"{row.league}@{row.candidate}")
+    matches = _checked_matches(registry, row, row.schedule)
+    for anchor in row.settings.get("anchors", ()):
+        matches += _checked_matches(registry, row, anchor["schedule"])
+    seen = findings(registry, row)
     # A void verdict ended for a reason beside its games, at any point of them.
-    outcome = VOID if row.outcome == VOID else str(decision.outcome)
-    computed = evidence_of(report_of(registry, row, outcome, decision, row.evidence.get("note")), decision)
+    outcome = VOID if row.outcome == VOID else str(seen.outcome)
+    note = seen.note if outcome not in (VOID, "promote") else row.evidence.get("note")
+    computed = evidence_of(report_of(registry, row, outcome, seen, note))
+    if row.outcome == VOID:
+        # What a person voids keeps the evidence that it had: none while it was open, and its own outcome afterwards.
+        computed = {name: value for name, value in computed.items() if name in row.evidence and name != "outcome"}
     wrong = [
         f"{name} is {row.evidence.get(name)!r}, and by the games {value!r}"
         for name, value in computed.items()
@@ -65,18 +67,22 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     ]
     if wrong:
         raise VerdictRefuted(f"verdict {verdict} is not what its games say: {'; '.join(wrong)}")
-    replayed = _replay(registry, row, matches[: decision.blocks], replays)
+    replayed = _replay(registry, row, matches, replays)
     return Verification(verdict, row.outcome, len(matches), len(computed), replayed)
 
 
-def _check_matches(row: VerdictRow, schedule: Schedule, matches: Sequence[Match]) -> None:
+def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Match]:
+    """The matches of one of its schedules, each as that schedule asked for it, none missing."""
+    ledger = Ledger(registry)
+    schedule, matches = ledger.schedule(name), ledger.matches(league=row.league, schedule=name)
     try:
         for position, match in enumerate(matches):
             if match.position != position:
-                raise VerdictRefuted(f"verdict {row.id} has no match {position}, but one behind it")
+                raise VerdictRefuted(f"verdict {row.id} has no match {position} of {name}, but one behind it")
             admit(match, schedule)
     except LedgerRefusal as error:
         raise VerdictRefuted(f"verdict {row.id} counts a match that its schedule did not ask for: {error}") from error
+    return matches
 
 
 def _same(recorded: Any, computed: Any) -> bool:

@@ -213,20 +213,55 @@ LARGEST_NORMALIZED_ELO = 190
 """Farther hypotheses have no usable test: see evaluation/sequential.py."""
 
 
-class GateConfig(_Part):
-    """The sequential test that a challenger must pass against the champion. See docs/statistics.md."""
+class AnchorConfig(_Part):
+    """Somebody held out of training, to whom a challenger must not be inferior."""
 
-    model: Literal["logistic", "normalized"] = "normalized"
+    ref: str
+    """A script (`script:one_ply`), a version (`connect_four@3`), or an alias, which is pinned when a verdict opens;
+    `@3` and `@gold` are short for those of the league itself."""
+    margin: float | None = Field(default=None, gt=0)
+    """By how much it may be weaker; by default the gate's."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        return {"ref": value} if isinstance(value, str) else value
+
+
+class GateConfig(_Part):
+    """What a challenger must show to be promoted. See docs/statistics.md."""
+
+    model: Literal["logistic", "normalized", "returns"] = "normalized"
+    """What a block counts: its score, in logistic or normalized Elo (GSPRT), or the difference of returns (betting)."""
     elo0: float = 0.0
-    """H0: the challenger is this much stronger, in Elo of `model`."""
+    """H0: the challenger is this much stronger than the champion, in Elo of `model`."""
     elo1: float = 30.0
     """H1: the challenger is this much stronger."""
+    return0: float = 0.0
+    """H0 of the model `returns`: its mean return is at most this much greater."""
+    return1: float = 0.0
+    """H1 of the model `returns`: its mean return is at least this much greater."""
+    return_bound: float | None = Field(default=None, gt=0)
+    """No block's returns differ by more; `returns` needs it."""
     alpha: float = Field(default=0.05, gt=0, lt=0.5)
-    """Probability of promoting under H0."""
+    """Probability of promoting any challenger under H0 in a year of nights."""
+    nights: int | None = Field(default=365, ge=1)
+    """Nights of a year, over which alpha is spent in equal parts; the candidates of a night share its part. Null: every
+    verdict has all of alpha for itself."""
     beta: float = Field(default=0.05, gt=0, lt=0.5)
-    """Probability of rejecting under H1."""
-    max_blocks: int = Field(default=2000, ge=1)
-    """Blocks after which the verdict is `inconclusive` and the champion stays."""
+    """Probability of rejecting a challenger under H1."""
+    max_blocks: int = Field(default=4000, ge=1)
+    """Blocks of one test after which it is `inconclusive` and the champion stays."""
+    anchors: tuple[AnchorConfig, ...] = ()
+    """Those to whom a challenger must not be inferior, besides earlier champions."""
+    earlier_champions: int = Field(default=2, ge=0)
+    """How many champions before the present one are anchors, too."""
+    margin: float = Field(default=50.0, gt=0)
+    """How much weaker than an anchor a challenger may be, in Elo of `model`, or in returns."""
+    confirmation_blocks: int = Field(default=200, ge=0)
+    """Fresh blocks against the champion of before, played after a promotion: how much was really gained."""
+    forfeits: bool = False
+    """Whether a challenger may be promoted that forfeited a game, by an illegal action or a crash."""
     shadow_agreement: float | None = Field(default=None, ge=0, le=1)
     """Share of mirrored observations on which the challenger must act as the champion does; null asks for none. Like
     `latency_ms`, it applies where there is a champion, whose requests can be mirrored."""
@@ -237,14 +272,39 @@ class GateConfig(_Part):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        margins = [self.margin, *(anchor.margin for anchor in self.anchors if anchor.margin is not None)]
+        if self.model == "returns":
+            self._check_returns(max(margins))
+            return self
         if not self.elo0 < self.elo1:
             raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
-        if self.model == "normalized" and max(-self.elo0, self.elo1) > LARGEST_NORMALIZED_ELO:
+        if self.model == "normalized" and max(-self.elo0, self.elo1, *margins) > LARGEST_NORMALIZED_ELO:
             raise ValueError(
-                f"elo0 and elo1 must lie within ±{LARGEST_NORMALIZED_ELO} (normalized Elo),"
-                f" got {self.elo0:g} and {self.elo1:g}"
+                f"elo0, elo1 and margins must lie within ±{LARGEST_NORMALIZED_ELO} (normalized Elo),"
+                f" got {self.elo0:g}, {self.elo1:g} and {max(margins):g}"
             )
         return self
+
+    def _check_returns(self, margin: float) -> None:
+        if self.return_bound is None:
+            raise ValueError("the model returns needs return_bound: by how much the returns of a block can differ")
+        if not -self.return_bound < self.return0 <= self.return1 < self.return_bound:
+            raise ValueError(
+                f"return0 and return1 must lie within ±{self.return_bound:g} (return_bound), return0 first,"
+                f" got {self.return0:g} and {self.return1:g}"
+            )
+        if margin >= self.return_bound:
+            raise ValueError(f"margin must be smaller than return_bound ({self.return_bound:g}), got {margin:g}")
+
+    def against_anchor(self, margin: float | None) -> Self:
+        """The test of non-inferiority: H0 is being weaker by the margin, H1 being as strong."""
+        below = -(self.margin if margin is None else margin)
+        zero = {"return0": below, "return1": 0.0} if self.model == "returns" else {"elo0": below, "elo1": 0.0}
+        return self.model_copy(update=zero)
+
+    def of_one_verdict(self, alpha: float) -> Self:
+        """The same for a verdict that spends this much of alpha."""
+        return self.model_copy(update={"alpha": alpha, "nights": None})
 
 
 class AshaConfig(_Part):
@@ -364,6 +424,8 @@ def _fault(model: type[BaseModel], detail: Any) -> str:
 
 def _known_keys(model: type[BaseModel], path: list[str]) -> list[str]:
     for part in path:
+        if part.isdigit():
+            continue  # a place in a list, whose members are of the model already
         fields = {field.alias or name: field for name, field in model.model_fields.items()}
         annotation = fields[part].annotation if part in fields else None
         while get_origin(annotation) is not None and get_args(annotation):

@@ -33,6 +33,7 @@ LeagueError
 ├── DeadlineExceeded          a request that was not answered in its time
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
+├── BoundExceeded             returns that differ by more than a gate was told they can
 ├── WorkerLost                worker processes that die again and again
 ├── VerdictRefuted            a verdict whose record is not what its games say
 ├── ParityError               an exported graph that acts otherwise than the trained module
@@ -244,6 +245,12 @@ class GameHung(LeagueError):
     """A game of a match that has not ended after `play.max_moves` actions."""
 
     code = "game_hung"
+
+
+class BoundExceeded(LeagueError):
+    """Returns of a block that differ by more than `gate.return_bound`."""
+
+    code = "bound_exceeded"
 
 
 class VerdictRefuted(LeagueError):

@@ -97,3 +97,8 @@ class PolicyRef:
 def parse_ref(text: str) -> CheckpointRef | ScriptRef:
     """Read any contestant: `connect_four@7`, `connect_four@champion` or `script:random`."""
     return ScriptRef.parse(text) if text.startswith("script:") else CheckpointRef.parse(text)
+
+
+def of_league(ref: str, league: str) -> str:
+    """`@3` is short for a version of the league itself."""
+    return league + ref if ref.startswith("@") else ref

@@ -153,3 +153,35 @@ def test_every_serving_setting_is_explained_with_its_default() -> None:
     rows = dict(re.findall(r"^\| `(\w+)` \| `(.*?)` \|", OPERATIONS, flags=re.M))
     defaults = {name: field.default for name, field in ServeSettings.model_fields.items()}
     assert {name: yaml.safe_load(value) for name, value in rows.items()} == defaults
+
+
+JOB = yaml.safe_load((ROOT / "deploy/nightly/cronjob.yaml").read_text())
+POD = JOB["spec"]["jobTemplate"]["spec"]["template"]["spec"]
+
+
+def test_the_night_of_a_cluster_works_on_what_the_cluster_serves() -> None:
+    (container,) = POD["containers"]
+    (server,) = HEAD["spec"]["containers"]
+    assert container["image"] == server["image"]
+    served = {entry["name"]: entry for entry in server["env"]}
+    for entry in container["env"]:
+        if entry["name"] in ("LEAGUE_HOME", "LEAGUE_ARTIFACTS", "LEAGUE_DATABASE_URL"):
+            assert entry == served[entry["name"]]
+    mounted = {mount["name"] for mount in container["volumeMounts"]}
+    assert mounted == {volume["name"] for volume in POD["volumes"]}
+    assert JOB["spec"]["concurrencyPolicy"] == "Forbid"
+
+
+def test_schedulers_run_commands_that_there_are_and_know_their_exit_codes() -> None:
+    from cli.nightly import BUSY, FAULTS
+
+    unit = (ROOT / "deploy/nightly/league-nightly.service").read_text()
+    assert f"SuccessExitStatus={BUSY}\n" in unit
+    (rule,) = [r for r in JOB["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
+    assert rule["onExitCodes"]["values"] == [FAULTS, 2]
+    (line,) = [line for line in (ROOT / "deploy/nightly/crontab").read_text().splitlines() if line[:1].isdigit()]
+    assert re.fullmatch(r"(\S+ ){5}cd .* \.venv/bin/league nightly >> .*", line)
+    assert POD["containers"][0]["command"] == ["league", "nightly"]
+    assert re.search(
+        r"^OnCalendar=\*-\*-\* \d\d:\d\d$", (ROOT / "deploy/nightly/league-nightly.timer").read_text(), flags=re.M
+    )

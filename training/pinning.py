@@ -3,7 +3,7 @@
 from league.config import LeagueConfig
 from league.interface import Interface
 from league.policies.loading import contestant
-from league.refs import CheckpointRef, parse_ref
+from league.refs import CheckpointRef, of_league, parse_ref
 from league.registry.registry import Registry
 
 
@@ -27,8 +27,3 @@ def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
         opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in config.training.opponents
     ]
     return config.with_training(opponents=opponents)
-
-
-def of_league(ref: str, league: str) -> str:
-    """`@3` is short for a version of the league itself."""
-    return league + ref if ref.startswith("@") else ref

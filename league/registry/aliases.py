@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 
 from league.errors import AliasMoved, NothingToRollBack
 from league.refs import check_alias
-from league.registry import leagues, rows, versions
+from league.registry import leagues, rows, verdicts, versions
 from league.registry.tables import Alias, AliasEvent
 
 
@@ -58,10 +58,12 @@ def move(
 
     Returns the event in force: an alias that is there already is left alone, for a rollback
     must lead elsewhere.
-    Raises UnknownLeague, UnknownVersion, and AliasMoved if it points elsewhere.
+    Raises UnknownLeague, UnknownVersion, AliasMoved if it points elsewhere, and Conflict if `verdict` is closed.
     """
     check_alias(alias)
     leagues.lock(session, league)
+    if verdict is not None:
+        verdicts.require_open(session, verdict)
     versions.require(session, league, version)
     last = _in_force(session, league, alias)
     found = last.version if last else None

@@ -1,7 +1,7 @@
 """The face of the registry: each method is one transaction, or a version's whole way to being published."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import MappingProxyType
@@ -14,8 +14,10 @@ from league.refs import CHAMPION, CheckpointRef
 from league.registry import (
     acknowledgements,
     aliases,
+    exclusion,
     keys,
     leagues,
+    nights,
     publishing,
     reports,
     shadows,
@@ -34,6 +36,7 @@ from league.registry.rows import (
     AliasEvent,
     KeyRow,
     LeagueRow,
+    NightRow,
     Portion,
     Shadowing,
     Traffic,
@@ -358,6 +361,14 @@ class Registry:
         with self.database.write() as session:
             verdicts.close(session, verdict, outcome, evidence)
 
+    def void_verdict(self, verdict: str, note: str) -> VerdictRow:
+        """End a verdict for a reason beside its games, or take back one that has fallen. Raises NotFound or Conflict.
+
+        Its alpha is spent. A promotion that it led to stays.
+        """
+        with self.database.write() as session:
+            return verdicts.void(session, verdict, note)
+
     def verdict(self, verdict: str) -> VerdictRow:
         """A verdict by its id. Raises NotFound."""
         with self.database.read() as session:
@@ -367,3 +378,29 @@ class Registry:
         """All verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
         with self.database.read() as session:
             return verdicts.every(session, league)
+
+    # Nights
+
+    @contextmanager
+    def alone(self, name: str) -> Iterator[None]:
+        """Only one process at a time, on any machine that shares the database. Raises AlreadyRunning or StorageError.
+
+        The lock goes with the process, however that ends.
+        """
+        with exclusion.alone(self.database.engine, self.storage.home, name):
+            yield
+
+    def open_night(self, league: str, candidates: Collection[int], alpha: float) -> NightRow:
+        """Open a night that judges `candidates`, or find the one that an earlier process left open."""
+        with self.database.write() as session:
+            return nights.start(session, league, candidates, alpha)
+
+    def close_night(self, night: int, report: dict[str, Any] | None) -> None:
+        """End a night and record what came of it; twice is once."""
+        with self.database.write() as session:
+            nights.close(session, night, report)
+
+    def nights(self, league: str) -> list[NightRow]:
+        """All nights of a league, oldest first. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return nights.every(session, league)

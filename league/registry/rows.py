@@ -183,3 +183,23 @@ class VerdictRow:
     @property
     def schedule(self) -> str:
         return self.id
+
+    @property
+    def alpha(self) -> float:
+        """What it spends of a year's alpha."""
+        return float(self.settings["gate"]["alpha"])
+
+
+@dataclass(frozen=True, slots=True)
+class NightRow:
+    """One night of a league; `ended_at` and `report` are None while it goes on."""
+
+    id: int
+    league: str
+    candidates: tuple[int, ...]
+    """Versions to be judged."""
+    alpha: float
+    """What each of their verdicts may spend."""
+    report: dict[str, Any] | None
+    began_at: datetime
+    ended_at: datetime | None

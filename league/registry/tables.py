@@ -248,6 +248,8 @@ class Schedule(Table):
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), index=True)
     document: Mapped[str] = mapped_column(Text)
     opened_at: Mapped[datetime] = mapped_column(Utc)
+    purged_at: Mapped[datetime | None] = mapped_column(Utc)
+    """From then on its matches count for nothing, though they stay."""
 
 
 class Match(Table):
@@ -282,3 +284,20 @@ class Verdict(Table):
     evidence: Mapped[dict[str, Any] | None] = mapped_column(JSON)
     opened_at: Mapped[datetime] = mapped_column(Utc)
     closed_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
+class Night(Table):
+    """One night of a league: who was to be judged, and what came of it. Open until `ended_at`."""
+
+    __tablename__ = "nights"
+    __table_args__ = (Index("ix_nights_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    candidates: Mapped[list[int]] = mapped_column(JSON)
+    """Version numbers."""
+    alpha: Mapped[float] = mapped_column(Double)
+    """What each of their verdicts may spend."""
+    report: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    began_at: Mapped[datetime] = mapped_column(Utc)
+    ended_at: Mapped[datetime | None] = mapped_column(Utc)

@@ -1,4 +1,6 @@
-"""Verdicts: opened before the first match that they count, closed once, never changed after."""
+"""Verdicts: opened before the first match that they count, closed once; after that, a person may void one, and nothing
+else is ever changed.
+"""
 
 from datetime import UTC, datetime
 from typing import Any
@@ -9,7 +11,9 @@ from sqlalchemy.orm import Session
 from league.errors import Conflict, NotFound
 from league.registry import leagues, rows, versions
 from league.registry.database import insert
-from league.registry.tables import Verdict
+from league.registry.tables import AliasEvent, Verdict
+
+VOID = "void"
 
 
 def start(
@@ -36,6 +40,32 @@ def close(session: Session, verdict: str, outcome: str, evidence: dict[str, Any]
             raise Conflict(f"verdict {verdict} is {row.outcome!r} already, it cannot become {outcome!r}")
         return
     row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
+
+
+def void(session: Session, verdict: str, note: str) -> rows.VerdictRow:
+    """End a verdict for a reason beside its games, or take back one that has fallen; twice is once.
+
+    What it has shown stays in its evidence, and its alpha is spent. A promotion that it led to is not undone.
+    Raises NotFound, or Conflict for one whose promotion is just being applied.
+    """
+    row = session.get(Verdict, verdict, with_for_update=True)
+    if row is None:
+        raise NotFound(f"there is no verdict {verdict!r}")
+    if row.outcome is None:
+        leagues.lock(session, row.league)
+        if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
+            raise Conflict(f"the promotion of verdict {verdict} is just being applied: void it when it is closed")
+    if row.outcome != VOID:
+        row.outcome, row.evidence = VOID, {**(row.evidence or {}), "note": note}
+        row.closed_at = row.closed_at or datetime.now(UTC)
+    return _row(row)
+
+
+def require_open(session: Session, verdict: str) -> None:
+    """Raise Conflict if it has been closed, such as by a person."""
+    row = session.get(Verdict, verdict)
+    if row is not None and row.outcome is not None:
+        raise Conflict(f"verdict {verdict} is {row.outcome!r}: it promotes nobody")
 
 
 def one(session: Session, verdict: str) -> rows.VerdictRow:

@@ -1,10 +1,10 @@
 """The append-only store of what was played. It takes what its schedules ask for, and each match once."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from typing import Any, TypeVarTuple
 
-from sqlalchemy import Select, select
+from sqlalchemy import Select, select, update
 from sqlalchemy.orm import Session
 
 from league.errors import NotFound
@@ -48,6 +48,16 @@ class Ledger:
         """One schedule by its id. Raises NotFound."""
         with self._database.read() as session:
             return _schedule(session, schedule)
+
+    def purge(self, schedules: Collection[str]) -> None:
+        """Let the matches of these schedules count for nothing from now on. They stay, and can be replayed."""
+        with self._database.write() as session:
+            table = tables.Schedule
+            session.execute(
+                update(table)
+                .where(table.id.in_(schedules), table.purged_at.is_(None))
+                .values(purged_at=datetime.now(UTC))
+            )
 
     def append(self, match: Match) -> bool:
         """Store a match; False if it is there already. Raises LedgerRefusal if it breaks its schedule."""
@@ -93,7 +103,10 @@ class Ledger:
             return set(session.scalars(select(tables.Match.position).filter_by(schedule=schedule)))
 
     def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
-        """The matches of a league without their moves, in schedule order; of one environment if given."""
+        """The matches of a league without their moves, in schedule order; of one environment if given.
+
+        Those of purged schedules are not among them.
+        """
         match = tables.Match
         columns = match.schedule, match.position, match.games, match.scores, match.returns
         with self._database.read() as session:
@@ -102,7 +115,7 @@ class Ledger:
                 for known in _schedules(session, league)
                 if environment_digest in (None, known.environment_digest)
             }
-            found = session.execute(_in_order(select(*columns), league))
+            found = session.execute(_in_order(select(*columns), league).where(tables.Schedule.purged_at.is_(None)))
             return [
                 BlockResult(
                     schedule=of,

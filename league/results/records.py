@@ -31,7 +31,7 @@ class Schedule:
     id: str
     league: str
     kind: str
-    """`verdict`, `round_robin` or `gauntlet`"""
+    """`verdict`, `anchor`, `confirmation`, `round_robin` or `gauntlet`"""
     seed: int
     environment_digest: str
     sides: tuple[str, ...]

@@ -34,9 +34,10 @@ def config(**parts: object) -> LeagueConfig:
         "league": LEAGUE,
         "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
         "play": {"opening_plies": 2},
-        "gate": {"elo1": 100, "max_blocks": 300},
     }
-    return LeagueConfig.from_mapping(document | parts)
+    gate = {"elo1": 100, "max_blocks": 300, "nights": None, "confirmation_blocks": 20}
+    gate |= parts.pop("gate", {})  # type: ignore[arg-type]
+    return LeagueConfig.from_mapping(document | parts | {"gate": gate})
 
 
 def registry(home: Path, **parts: object) -> Registry:

@@ -1,4 +1,5 @@
 import json
+import math
 import shutil
 import signal
 import subprocess
@@ -15,7 +16,9 @@ from sqlalchemy.orm import Session
 from evaluation import tournament, verdicts
 from evaluation.nightly import nightly
 from evaluation.report import NightReport, Progress, VerdictReport
+from evaluation.verification import verify
 from league.config import LeagueConfig
+from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError
 from league.histograms import BOUNDS
 from league.registry.database import Database
@@ -52,6 +55,7 @@ def state(registry: Registry) -> dict[str, Any]:
         "matches": Ledger(registry).matches(league=examples.LEAGUE),
         "verdicts": [(v.id, v.outcome, v.evidence) for v in registry.verdicts(examples.LEAGUE)],
         "champions": [(e.version, e.previous, e.verdict) for e in registry.history(examples.LEAGUE)],
+        "nights": [(n.candidates, n.alpha, n.ended_at is None) for n in registry.nights(examples.LEAGUE)],
     }
 
 
@@ -166,7 +170,8 @@ def crashing_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[lis
 def test_a_night_that_died_after_any_of_its_writes_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After each single transaction in turn: what stands in the end is what an undisturbed night leaves."""
     monkeypatch.setattr("evaluation.nightly.RATING_BLOCKS", 6)
-    config = examples.config(gate={"elo1": 150, "max_blocks": 100}, play={"opening_plies": 2, "copies": 4})
+    gate = {"elo1": 150, "max_blocks": 100, "nights": 2, "alpha": 0.2, "anchors": ["script:random"], "margin": 150}
+    config = examples.config(gate=gate, play={"opening_plies": 2, "copies": 4})
     league_of(tmp_path / "fresh", MIDDLING, STRONG, config=config).close()
     quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
     with crashing_after(0, monkeypatch) as count:
@@ -336,3 +341,142 @@ def test_where_there_is_no_champion_there_is_nothing_to_be_the_shadow_of(tmp_pat
     registry = league_of(tmp_path / "home", STRONG, config=config)
     assert outcomes(nightly(config, registry=registry)) == [("tictactoe@1", "script:random", "promote", True)]
     registry.close()
+
+
+def spending(**gate: Any) -> LeagueConfig:
+    return examples.config(play={"opening_plies": 2, "copies": 4}, gate={"nights": 365, "max_blocks": 1000} | gate)
+
+
+def test_a_night_shares_its_part_of_a_years_alpha_among_its_candidates(tmp_path: Path) -> None:
+    config = spending()
+    registry = league_of(tmp_path, MIDDLING, STRONG, config=config)
+    report = nightly(config, registry=registry)
+    assert [verdict.alpha for verdict in report.verdicts] == [pytest.approx(0.05 / 365 / 2)] * 2
+    assert report.alpha_spent == pytest.approx(0.05 / 365)
+    assert report.verdicts[0].bounds[1] == pytest.approx(math.log(0.95 / (0.05 / 730)))
+    assert report.champion == "tictactoe@2"
+    examples.publish(registry, STRONGEST)
+    second = nightly(config, registry=registry)
+    assert [verdict.alpha for verdict in second.verdicts] == [pytest.approx(0.05 / 365)]
+    first_row, second_row = registry.nights(examples.LEAGUE)
+    assert (first_row.candidates, second_row.candidates) == ((1, 2), (3,))
+    assert second_row.report == second.to_json()
+
+
+def test_when_a_years_alpha_is_spent_nobody_is_judged_and_the_report_says_what_to_set(tmp_path: Path) -> None:
+    config = spending(nights=1)
+    registry = league_of(tmp_path, MIDDLING, config=config)
+    nightly(config, registry=registry)
+    examples.publish(registry, STRONG)
+    report = nightly(config, registry=registry)
+    assert (report.verdicts, report.alpha_spent) == ((), pytest.approx(0.05))
+    assert "have spent all of gate.alpha (0.05); where more than 1 nights a year are held" in report.faults[0]
+    enough = spending(nights=1, alpha=0.1)
+    assert nightly(enough, registry=registry).champion == "tictactoe@2"
+
+
+def test_versions_that_come_during_a_night_wait_for_the_next_and_are_not_forgotten(tmp_path: Path) -> None:
+    """A night is killed with one of its two candidates judged; a third comes before it is started again."""
+    config = spending()
+    registry = league_of(tmp_path, MIDDLING, STRONG, config=config)
+
+    def die(told: Progress | VerdictReport) -> None:
+        if isinstance(told, VerdictReport):
+            raise Crash
+
+    with pytest.raises(Crash):
+        nightly(config, registry=registry, listener=die)
+    examples.publish(registry, STRONGEST)
+    report = nightly(config, registry=registry)
+    part = 0.05 / 365
+    assert [(v.candidate, v.alpha) for v in report.verdicts] == [
+        ("tictactoe@2", pytest.approx(part / 2)),
+        ("tictactoe@3", pytest.approx(part)),
+    ]
+    assert [row.candidates for row in registry.nights(examples.LEAGUE)] == [(1, 2), (3,)]
+    assert all(row.ended_at for row in registry.nights(examples.LEAGUE))
+
+
+def test_a_verdict_that_a_person_stops_is_void_and_its_alpha_is_spent(tmp_path: Path) -> None:
+    config = spending(elo0=-20, elo1=20)
+    registry = league_of(tmp_path, STRONG, STRONG, STRONG, config=config)
+    registry.set_alias(examples.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+
+    def stop(told: Progress | VerdictReport) -> None:
+        if isinstance(told, Progress) and told.what == "tictactoe@2 against tictactoe@1" and told.played:
+            verdicts.void(registry, registry.verdicts(examples.LEAGUE)[0].id, actor="me", reason="looks bad")
+
+    report = nightly(config, registry=registry, listener=stop)
+    stopped, other = report.verdicts
+    assert (stopped.outcome, stopped.note) == ("void", "voided by me: looks bad")
+    assert 0 < stopped.blocks < 1000
+    assert other.outcome != "void"
+    assert report.alpha_spent == pytest.approx(stopped.alpha + other.alpha) == pytest.approx(0.05 / 365)
+    again = nightly(config, registry=registry)
+    assert [verdict.candidate for verdict in again.verdicts] == ["tictactoe@2"], "judged again, on other games"
+    assert again.alpha_spent == pytest.approx(2 * 0.05 / 365)
+
+
+def test_purged_games_count_for_nothing_and_stay(registry: Registry) -> None:
+    first = nightly(CONFIG, registry=registry).verdicts[1]
+    before = len(Ledger(registry).results(examples.LEAGUE))
+    verdicts.void(registry, first.verdict, actor="me", reason="a broken machine", purge=True)
+    row = registry.verdict(first.verdict)
+    assert row.outcome == "void"
+    own = [row.schedule, row.settings["confirmation"], *(anchor["schedule"] for anchor in row.settings["anchors"])]
+    played = sum(len(Ledger(registry).positions(schedule)) for schedule in own)
+    assert len(Ledger(registry).results(examples.LEAGUE)) == before - played
+    assert len(Ledger(registry).matches(league=examples.LEAGUE, schedule=row.schedule)) >= first.blocks
+    assert verify(first.verdict, registry=registry).outcome == "void"
+
+
+def test_a_promotion_is_confirmed_by_fresh_games_of_fixed_length(registry: Registry) -> None:
+    report = nightly(CONFIG, registry=registry)
+    promoted = [verdict for verdict in report.verdicts if verdict.promoted]
+    assert [gain.verdict for gain in report.confirmations] == [verdict.verdict for verdict in promoted]
+    for gain, verdict in zip(report.confirmations, promoted, strict=True):
+        low, high = gain.interval
+        assert gain.games == 40
+        assert low is not None
+        assert high is not None
+        assert low < gain.elo < high
+        row = registry.verdict(verdict.verdict)
+        fresh = Ledger(registry).matches(league=examples.LEAGUE, schedule=row.settings["confirmation"])
+        counted = Ledger(registry).matches(league=examples.LEAGUE, schedule=row.schedule)
+        assert {match.seed for match in fresh}.isdisjoint(match.seed for match in counted)
+    assert nightly(CONFIG, registry=registry).confirmations == ()
+
+
+def test_returns_are_tested_by_betting_where_the_gate_says_so(tmp_path: Path) -> None:
+    """Where everybody plays alone, and how much better matters: returns of mpe2.simple are between -100 and 0 here."""
+    gate = {"model": "returns", "return_bound": 100, "margin": 10, "nights": None, "confirmation_blocks": 10}
+    environment = {"entry_point": "mpe2.simple_v3", "kwargs": {"max_cycles": 12}}
+    config = LeagueConfig.from_mapping({"league": "kind", "environment": environment, "gate": gate})
+    registry = Registry.open(Storage.at(tmp_path))
+    registry.register(config, interface(config))
+    spaces = registry.league("kind").interface.of_policy("shared")
+    for graph in (examples.linear(spaces, 3), examples.chasing(spaces), examples.linear(spaces, 3)):
+        examples.publish(registry, graph, "kind")
+    registry.set_alias("kind", "champion", 1, expected=None, actor="me", reason="first")
+    report = nightly(config, registry=registry, workers=0)
+    assert report.faults == ()
+    better, worse = report.verdicts
+    assert (better.outcome, better.bounds) == ("promote", pytest.approx((-math.log(20), math.log(20))))
+    assert better.difference is not None
+    assert better.difference.mean > 0
+    assert worse.outcome == "reject"
+    assert report.confirmations[0].difference is not None
+    for verdict in report.verdicts:
+        verify(verdict.verdict, registry=registry, replays=3)
+
+
+def test_a_bound_that_returns_exceed_is_named_and_the_verdict_can_be_voided(tmp_path: Path) -> None:
+    gate = {"model": "returns", "return_bound": 0.5, "margin": 0.2}
+    config = examples.config(gate=gate)
+    registry = league_of(tmp_path, STRONG, config=config)
+    report = nightly(config, registry=registry)
+    assert report.verdicts == ()
+    assert "gate.return_bound is 0.5, but the returns of a block differ by" in report.faults[0]
+    verdicts.void(registry, registry.verdicts(examples.LEAGUE)[0].id, actor="me", reason="bound")
+    mended = examples.config(gate=gate | {"return_bound": 2})
+    assert nightly(mended, registry=registry).verdicts[0].outcome == "promote"
