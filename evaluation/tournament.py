@@ -19,6 +19,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from evaluation.contestants import baselines, pinned
 from evaluation.gate import distinct_games
+from evaluation.ordering import InOrder
 from evaluation.payoff import tabulate
 from evaluation.player import player
 from evaluation.report import EvaluationReport, Listener, Progress
@@ -174,17 +175,15 @@ def _in_ray(
     job = ray.put((schedule, storage, config))
     waiting = enumerate(chunks)
     flying: dict[ray.ObjectRef, int] = {}
-    done: dict[int, list[Match]] = {}
-    due = 0
-    while due < len(chunks):
+    done: InOrder[list[Match]] = InOrder()
+    while done.due < len(chunks):
         room = min(workers + 1 - len(flying), 4 * workers - len(flying) - len(done))
         flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, max(0, room))}
-        if due in done:
-            yield done.pop(due)
-            due += 1
+        if (chunk := done.take()) is not None:
+            yield chunk
             continue
         for ref in ray.wait(list(flying))[0]:
-            done[flying.pop(ref)] = _result(ref)
+            done.put(flying.pop(ref), _result(ref))
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]

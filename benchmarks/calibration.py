@@ -1,0 +1,181 @@
+"""Are the verdicts what they promise? Simulations of gates, years, traps and intervals, and gates through real play.
+
+Every part prints what was measured beside what is asked for. All are seeded: the same numbers come out anywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import binomtest
+
+from benchmarks import coverage, golden, null_play
+from benchmarks.shuffled_order import verdicts_of_shuffled_completion
+from benchmarks.simulated_gates import CELLS, EQUALS, simulate, stronger
+from benchmarks.simulated_years import boundary, chance, walk
+from evaluation.findings import Anchored, found
+from evaluation.gate import Decision, decide
+from evaluation.sequential import expected_games
+from evaluation.spending import NIGHTS, spent_by
+from league.config import GateConfig
+from tests.evaluation import examples
+
+CANDIDATES = 8
+SINGLE = GateConfig(elo0=0, elo1=60, max_blocks=1000, nights=None)
+
+
+def gates(quick: bool) -> bool:
+    """20,000 gates at each hypothesis, for three kinds of games."""
+    number, met = 1_000 if quick else 20_000, True
+    theory = expected_games(SINGLE.elo0, SINGLE.elo1, SINGLE.elo0, SINGLE.alpha, SINGLE.beta)
+    for kind, shares in EQUALS.items():
+        null = simulate(SINGLE, np.asarray(shares), number, seed=1)
+        better = simulate(SINGLE, stronger(shares, SINGLE.elo1), number, seed=2)
+        false, high = null.promoted.mean(), _high(int(null.promoted.sum()), number)
+        lengths = [2 * float(each.blocks.mean()) / theory for each in (null, better)]
+        print(
+            f"  {kind}: {number} gates at H0: {false:.2%} promoted, upper 95 % bound {high:.2%} (≤ 5 %, ≤ 5.3 %);"
+            f" at H1: {better.promoted.mean():.2%} (≥ 95 %); mean length {lengths[0]:.3f}× and {lengths[1]:.3f}×"
+            f" of the {theory:.0f} games of theory (within 10 %)"
+        )
+        met &= high <= 0.053 and better.promoted.mean() >= 0.95 and all(abs(each - 1) <= 0.1 for each in lengths)
+    return bool(met)
+
+
+def years(quick: bool) -> bool:
+    """Years of 365 nights with 8 candidates that are no better, and one that is, on night 300."""
+    alpha = spent_by(CANDIDATES, 0.05)
+    settings = SINGLE.of_one_verdict(alpha)
+    null, better = (np.asarray(p)[[0, 2, 4]] for p in (EQUALS["decisive"], stronger(EQUALS["decisive"], 60)))
+    ends = boundary(settings, [null, better])
+    each = chance(ends, null)
+    exact = 1 - (1 - each) ** (NIGHTS * CANDIDATES)
+    print(f"  alpha of a verdict {alpha:.3g}; chance of its false promotion {each:.3g}, of any in a year {exact:.2%}")
+    number, rng = 100 if quick else 1_000, np.random.default_rng(3)
+    false = [int(walk(settings, ends, null, NIGHTS * CANDIDATES, rng)[0].sum()) for _ in range(number)]
+    with_any = sum(count > 0 for count in false)
+    low, high = binomtest(with_any, number).proportion_ci(0.95)
+    print(
+        f"  {number} simulated years, {sum(false)} of {number * NIGHTS * CANDIDATES} verdicts false: any in"
+        f" {with_any / number:.2%} [{low:.2%}, {high:.2%}] of years (≤ 5 %)"
+    )
+    promoted, blocks = walk(settings, ends, better, 20_000, rng)
+    anchor = settings.against_anchor(50.0)
+    anchored = boundary(anchor, [better])
+    passed = [walk(anchor, anchored, better, 20_000, rng) for _ in range(2)]
+    both = promoted & passed[0][0] & passed[1][0]
+    games = 2 * (blocks + passed[0][1] + passed[1][1])
+    print(
+        f"  night 300, +{settings.elo1:g}: beats the champion {promoted.mean():.2%}, and is not inferior to two earlier"
+        f" champions as strong as that one {both.mean():.2%} (≥ 90 %), in {games.mean():.0f} games on average, 95 %"
+        f" within {np.quantile(games, 0.95):.0f} (at most {2 * settings.max_blocks} a test)"
+    )
+    return exact <= 0.05 and bool(both.mean() >= 0.9)
+
+
+def traps(quick: bool) -> bool:
+    """Challengers that beat the champion by 100 Elo and lose to an anchor by 100 Elo beyond the margin."""
+    number, margin, rng = 100 if quick else 1_000, 50.0, np.random.default_rng(4)
+    settings = GateConfig(elo0=0, elo1=30, max_blocks=4000, margin=margin).of_one_verdict(spent_by(1, 0.05))
+    against_champion = stronger(EQUALS["decisive"], 100)
+    against_anchor = stronger(EQUALS["decisive"], -margin - 100)
+    beaten = promoted = 0
+    for _ in range(number):
+        champion = _decided(settings, against_champion, rng)
+        anchor = _decided(settings.against_anchor(None), against_anchor, rng)
+        seen = found(champion, [Anchored("trap@1", margin, "s", anchor)], asked=1, forfeits=0)
+        beaten += champion.outcome == "promote"
+        promoted += seen.outcome == "promote"
+    print(f"  {number} traps: {beaten} beat the champion, {promoted} promoted (0)")
+    return promoted == 0 and beaten > 0.95 * number
+
+
+def _decided(settings: GateConfig, shares: np.ndarray, rng: np.random.Generator) -> Decision:
+    scores: list[float] = []
+    while (decision := decide(settings, scores)).outcome is None:
+        scores += CELLS[rng.choice(5, p=shares, size=200)].tolist()
+    return decision
+
+
+def play(quick: bool) -> bool:
+    """Gates through real play between equals."""
+    number, met = 20 if quick else 200, True
+    for same, words in ((True, "one policy under two numbers"), (False, "one policy, and the same on a turned board")):
+        with tempfile.TemporaryDirectory() as home:
+            registry = examples.registry(Path(home), play={"opening_plies": 2, "copies": 100})
+            promoted = null_play.promoted(registry, same, number)
+            registry.close()
+        low, high = binomtest(promoted, number).proportion_ci(0.95)
+        print(
+            f"  {number} gates, {words}: {promoted} promoted, {promoted / number:.1%} [{low:.1%}, {high:.1%}] (≤ 5 %)"
+        )
+        met &= low <= 0.05
+    return met
+
+
+def order(quick: bool) -> bool:
+    """Games whose durations depend on their outcome, on workers that finish them in any order."""
+    number = 100 if quick else 1_000
+    found = verdicts_of_shuffled_completion(number)
+    print(f"  {number} orders of completion, durations by outcome: {len(found)} different verdict(s) (1): {found}")
+    return len(found) == 1
+
+
+def intervals(quick: bool) -> bool:
+    """Nominal 95 % intervals, at fixed length."""
+    number, met = 500 if quick else 5_000, True
+    parts: dict[str, Callable[[int, int], float]] = {
+        "Elo, 200 blocks": coverage.elo,
+        "Bradley–Terry ratings, 200 blocks a pair": coverage.rating,
+        "IQM, 40 runs on 5 tasks": coverage.interquartile_mean,
+        "probability of improvement, 40 runs on 5 tasks": coverage.improvement,
+    }
+    for words, part in parts.items():
+        share = part(number, 5)
+        error = math.sqrt(share * (1 - share) / number)
+        print(f"  {words}: {share:.2%} ± {error:.2%} of {number} simulations covered (94 to 96 %)")
+        met &= 0.94 <= share <= 0.96
+    return met
+
+
+PARTS: dict[str, Callable[[bool], bool]] = {
+    "golden": lambda _: golden.run(),
+    "gates": gates,
+    "years": years,
+    "traps": traps,
+    "order": order,
+    "play": play,
+    "intervals": intervals,
+}
+
+
+def main() -> int:
+    """Print each part; 1 if any missed what is asked of it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a twentieth of the simulations, for a look")
+    parser.add_argument("--only", choices=PARTS, help="one part")
+    options = parser.parse_args()
+    missed = []
+    for name in [options.only] if options.only else PARTS:
+        print(f"{name}:", flush=True)
+        began = time.monotonic()
+        if not PARTS[name](options.quick):
+            missed.append(name)
+        print(f"  ({time.monotonic() - began:.0f} s)", flush=True)
+    print(f"missed: {', '.join(missed) or 'nothing'}")
+    return bool(missed)
+
+
+def _high(found: int, number: int) -> float:
+    return float(binomtest(found, number).proportion_ci(0.95).high)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""Sequential tests on simulated blocks: which share is promoted, and after how many blocks.
+
+Blocks are drawn from shares of the five cells (LL, LD, DD or WL, WD, WW). Shares of a stronger challenger are those of
+equals, tilted exponentially until the effect of a game is the one that is wanted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from evaluation.gate import limits_of
+from evaluation.sequential import ELO_PER_EFFECT, gsprt_llr, score_of
+from league.config import GateConfig
+
+CELLS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+EQUALS = {
+    "decisive": (0.25, 0.0, 0.5, 0.0, 0.25),
+    "first mover wins": (0.08, 0.06, 0.72, 0.06, 0.08),
+    "drawish": (0.03, 0.17, 0.6, 0.17, 0.03),
+}
+"""Shares of the cells between equals."""
+AT_ONCE = 50
+"""Blocks between two looks at which tests have ended."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Gates:
+    """What many tests came to: `promoted` and `blocks` of each."""
+
+    promoted: NDArray[np.bool_]
+    blocks: NDArray[np.int64]
+
+
+def stronger(shares: tuple[float, ...], elo: float, model: str = "normalized") -> Floats:
+    """The shares of somebody who is `elo` stronger, in Elo of `model`."""
+
+    def gap(theta: float) -> float:
+        p = _tilted(shares, theta)
+        mean = float(p @ CELLS)
+        if model == "logistic":
+            return mean - score_of(elo)
+        deviation = float(np.sqrt(p @ (CELLS - mean) ** 2))
+        return (mean - 0.5) / deviation - elo / ELO_PER_EFFECT * np.sqrt(2)
+
+    return _tilted(shares, brentq(gap, -9, 9))
+
+
+def _tilted(shares: tuple[float, ...], theta: float) -> Floats:
+    weighted = np.asarray(shares) * np.exp(theta * CELLS)
+    return np.asarray(weighted / weighted.sum())
+
+
+def simulate(settings: GateConfig, shares: Floats, gates: int, seed: int) -> Gates:
+    """Many tests over random blocks, each ended where `evaluation.gate.decide` ends it."""
+    rng = np.random.default_rng(seed)
+    lower, upper = limits_of(settings)
+    assert settings.model != "returns"
+    counts = np.zeros((gates, 5))
+    promoted, blocks = np.zeros(gates, dtype=bool), np.full(gates, settings.max_blocks)
+    running = np.arange(gates)
+    for start in range(0, settings.max_blocks, AT_ONCE):
+        steps = min(AT_ONCE, settings.max_blocks - start)
+        drawn = rng.choice(5, p=shares, size=(len(running), steps))
+        prefixes = np.eye(5)[drawn].cumsum(axis=1) + counts[running, None]
+        curves = gsprt_llr(prefixes, settings.elo0, settings.elo1, settings.model)
+        outside = (curves <= lower) | (curves >= upper)
+        ended, at = outside.any(axis=1), outside.argmax(axis=1)
+        blocks[running[ended]] = start + at[ended] + 1
+        promoted[running[ended]] = curves[ended, at[ended]] >= upper
+        counts[running] = prefixes[:, -1]
+        running = running[~ended]
+        if not running.size:
+            break
+    return Gates(promoted, blocks)
