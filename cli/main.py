@@ -12,6 +12,7 @@ from cli.evaluation import evaluate, nightly, verify
 from cli.keys import app as keys
 from cli.output import errors
 from cli.replay import replay
+from cli.report import report
 from cli.serving import act, serve
 from cli.traffic import traffic
 from cli.training import sweep, train
@@ -44,6 +45,7 @@ for command in (
     history,
     traffic,
     replay,
+    report,
     serve,
     act,
 ):

@@ -152,12 +152,17 @@ def distinct_games(matches: Iterable[Match], contestant: str | None = None) -> i
     """
     return len(
         {
-            (frozenset(match.contestants), _frozen(game.opening), _frozen(game.actions), frozenset(game.returns))
+            identity(match, game)
             for match in matches
             for game in match.games
             if contestant is None or _took_part(match, game, contestant)
         }
     )
+
+
+def identity(match: Match, game: Game) -> Hashable:
+    """What is equal for two games that are the same game."""
+    return frozenset(match.contestants), _frozen(game.opening), _frozen(game.actions), frozenset(game.returns)
 
 
 def _took_part(match: Match, game: Game, contestant: str) -> bool:
