@@ -62,15 +62,15 @@ class Flipbook(Document):
     fault: str | None
 
 
-def flipbooks(registry: Registry, surprises: Sequence[Surprise], pictures: bool) -> tuple[Flipbook, ...]:
-    """The games, played again from their seeds in one environment; all are of one league.
+def flipbooks(registry: Registry, league: str, surprises: Sequence[Surprise], pictures: bool) -> tuple[Flipbook, ...]:
+    """Games of a league, played again from their seeds in one environment.
 
     A game that cannot be played again has a fault, and the others are shown all the same.
     """
     if not surprises:
         return ()
     try:
-        config = recorded(surprises[0].match, surprises[0].game, registry).config.environment
+        config = registry.league(league).config.environment
         draws = pictures and "rgb_array" in render_modes(config)
         environment = stepping(config, 1, render_mode="rgb_array" if draws else None)
     except Exception as error:  # an environment's own code: whatever it raises, the rest of the report stands
@@ -158,9 +158,8 @@ def _words(caption: Caption, is_opening: bool) -> str:
 
 def _line(line: Line) -> str:
     """`player_1 plays 4`; of a crowd how often each action was taken."""
-    return (
-        f"{line.name} {line.action or ', '.join(f'{action} ({share:.0%})' for action, share in line.chances)}".strip()
-    )
+    did = line.action or ", ".join(f"{action} ({share:.0%})" for action, share in line.chances)
+    return f"{line.name} plays {did}" if did else line.name
 
 
 def _picture(pixels: NDArray) -> str:

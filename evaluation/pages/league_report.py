@@ -6,6 +6,7 @@ league's present environment, by its present sides. How it looks is page.py's co
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -162,7 +163,7 @@ def league_report(
         versions=tuple(_rated(version, standings, events) for version in versions),
         verdicts=tuple(_judgement(registry, verdict, events) for verdict in reversed(verdicts) if verdict.id in shown),
         promotions=tuple(_promotion(event) for event in events),
-        surprises=flipbooks(registry, played.surprises.greatest(), pictures),
+        surprises=flipbooks(registry, league, played.surprises.greatest(), pictures),
         left_out=tuple(_left_out(len(standings), len(verdicts))),
     )
 
@@ -261,8 +262,8 @@ def _judgement(registry: Registry, verdict: VerdictRow, events: Sequence[AliasEv
         distinct_games=decision.distinct_games or 0,
         counts=decision.counts,
         score=decision.score,
-        elo=estimate.elo if estimate else None,
-        interval=(estimate.low, estimate.high) if estimate else None,
+        elo=_finite(estimate.elo) if estimate else None,
+        interval=(_finite(estimate.low), _finite(estimate.high)) if estimate else None,
         difference=paired_difference(matches[: decision.blocks], candidate) if sided else None,
         alpha=evidence.get("alpha"),
         anchors=tuple(evidence.get("anchors") or ()),
@@ -307,6 +308,10 @@ def _left_out(contestants: int, verdicts: int) -> Iterator[str]:
         yield f"The payoff table has the best {MOST_CONTESTANTS} of {contestants} contestants."
     if verdicts > MOST_VERDICTS:
         yield f"Of {verdicts} verdicts the newest {MOST_VERDICTS} are told."
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _when(moment: datetime) -> str:

@@ -23,6 +23,7 @@ from evaluation.pages.flipbook import Flipbook
 from evaluation.pages.league_report import OPEN, Judgement, LeagueReport
 from evaluation.report import Difference, Standing
 from league.errors import StorageError
+from league.results.records import Scoring
 
 TEMPLATES = Path(__file__).parent / "templates"
 MOST_ROWS = 500
@@ -81,6 +82,7 @@ def _templates() -> Environment:
     )
     environment.globals["bar"] = charts.bar
     environment.filters |= {
+        "alpha": _alpha,
         "bounds": _bounds,
         "cell": _cell,
         "cells": _cells,
@@ -181,10 +183,11 @@ def _elo(rating: float | None) -> str:
 
 
 def _interval(interval: Interval) -> str:
-    """`[+98, +240]`"""
+    """`[+98, +240]`; a side that is None is infinite."""
     if interval is None:
         return "–"
-    return f"[{', '.join('∞' if bound is None else _elo(bound) for bound in interval)}]"
+    low, high = interval
+    return f"[{'−∞' if low is None else _elo(low)}, {'+∞' if high is None else _elo(high)}]"
 
 
 def _bounds(bounds: Interval) -> str:
@@ -202,6 +205,10 @@ def _signed(value: float | None) -> str:
 
 def _plain(value: float | None) -> str:
     return "–" if value is None else _minus(f"{value:g}")
+
+
+def _alpha(value: float) -> str:
+    return _minus(f"{value:.2g}")
 
 
 def _score(value: float) -> str:
@@ -260,10 +267,10 @@ def _confirmation(found: Mapping[str, Any]) -> str:
     return ", ".join(parts) or "–"
 
 
-def _told(game: Flipbook) -> str:
+def _told(game: Flipbook, scoring: Scoring) -> str:
     """`script:random won against connect_four@3`"""
-    did = {1.0: "won against", 0.5: "drew with"}.get(game.score, "scored against")
-    return f"{game.better} {did} {game.other}"
+    did = {"game": ("won against", "drew with"), "side": ("did better than", "did as well as")}[scoring]
+    return f"{game.better} {did[0] if game.score > 0.5 else did[1]} {game.other}"
 
 
 def _players(game: Flipbook) -> list[str]:

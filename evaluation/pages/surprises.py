@@ -10,6 +10,9 @@ from evaluation.gate import identity
 from evaluation.sequential import score_of
 from league.results.records import Game, Match
 
+LEAST = 0.4
+"""A score that is higher than expected by less surprises nobody."""
+
 
 @dataclass(frozen=True, slots=True)
 class Surprise:
@@ -67,7 +70,7 @@ class Surprises:
 def _surprise_of(
     match: Match, index: int, game: Game, opening_plies: int, ratings: Mapping[str, float]
 ) -> Surprise | None:
-    """From the view of who did better than expected; None if nobody did."""
+    """From the view of who did better than expected; None if nobody did by much."""
     found = None
     for own, score in enumerate(game.scores):
         if score is None:
@@ -75,7 +78,7 @@ def _surprise_of(
         better, other = match.contestants[own], match.contestants[1 - own]
         expected = score_of(ratings[better] - ratings[other])
         each = Surprise(match.id, index, opening_plies, better, other, expected, score)
-        if each.size > (found.size if found else 0.0):
+        if each.size > (found.size if found else LEAST):
             found = each
     return found
 
