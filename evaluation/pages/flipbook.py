@@ -75,23 +75,22 @@ def flipbooks(registry: Registry, league: str, surprises: Sequence[Surprise], pi
         environment = stepping(config, 1, render_mode="rgb_array" if draws else None)
     except Exception as error:  # an environment's own code: whatever it raises, the rest of the report stands
         return tuple(_faulty(surprise, error) for surprise in surprises)
-    room = MOST_BYTES // len(surprises) if draws else None
+    room = MOST_BYTES // len(surprises) if draws else 0
     with closing(environment):
         return tuple(_flipbook(registry, surprise, environment, room) for surprise in surprises)
 
 
-def _flipbook(registry: Registry, surprise: Surprise, environment: BatchedEnvironment, room: int | None) -> Flipbook:
-    """room: bytes of its pictures; None: without any."""
+def _flipbook(registry: Registry, surprise: Surprise, environment: BatchedEnvironment, room: int) -> Flipbook:
+    """room: bytes of its pictures; 0: without any."""
     try:
         show = recorded(surprise.match, surprise.game, registry)
         captions, kept, last = Captions(show.title, show.interface, show.cast), _Kept(room), None
         for last in show.play(environment):
             caption = captions.of(last)
             did = _words(caption, is_opening=0 < last.step <= surprise.opening_plies)
-            wanted = kept.wants(last.step) or last.is_over
-            picture = _picture(environment.render(0)) if wanted and room is not None else None
-            if wanted:
-                kept.add(Step(last.step, did, picture))
+            if kept.wants(last.step) or last.is_over:
+                picture = _picture(environment.render(0)) if room else None
+                kept.add(Step(last.step, did, picture), is_last=last.is_over)
         assert last is not None, "a game has a beginning"
     except Exception as error:  # as above
         return _faulty(surprise, error)
@@ -131,7 +130,7 @@ def _faulty(surprise: Surprise, error: Exception) -> Flipbook:
 class _Kept:
     """Steps of a game of unknown length: when they become too many, or too large, every second one goes."""
 
-    def __init__(self, room: int | None) -> None:
+    def __init__(self, room: int) -> None:
         self._room = room
         self.every = 1
         self.steps: list[Step] = []
@@ -139,16 +138,15 @@ class _Kept:
     def wants(self, step: int) -> bool:
         return step % self.every == 0
 
-    def add(self, step: Step) -> None:
+    def add(self, step: Step, is_last: bool) -> None:
         self.steps.append(step)
-        while len(self.steps) > MOST_STEPS or (self._room is not None and self._bytes() > self._room > 0):
-            if len(self.steps) <= 2:
-                break
+        while self._are_too_many():
             self.every *= 2
-            self.steps = [each for each in self.steps[:-1] if self.wants(each.step)] + self.steps[-1:]
+            self.steps = [each for each in self.steps if self.wants(each.step) or (is_last and each is step)]
 
-    def _bytes(self) -> int:
-        return sum(len(step.picture or "") for step in self.steps)
+    def _are_too_many(self) -> bool:
+        size = sum(len(step.picture or "") for step in self.steps)
+        return len(self.steps) > 2 and (len(self.steps) > MOST_STEPS or size > self._room)
 
 
 def _words(caption: Caption, is_opening: bool) -> str:

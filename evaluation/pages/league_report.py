@@ -183,11 +183,12 @@ class _Played:
         results = [result for result in ledger.results(league.slug) if result.schedule in schedules]
         self.games = 0
         self.standings: tuple[Standing, ...] = ranked(results)
+        self._best = [standing.ref for standing in self.standings[:MOST_CONTESTANTS]]
         self.matches: list[Match] = []
         """Without moves: of the contestants in the payoff table, or all where sides are rated."""
         ratings = {standing.ref: standing.rating for standing in self.standings if standing.rating is not None}
         self.surprises = Surprises(ratings, MOST_SURPRISES)
-        self._seen: set[int] = set()
+        self._seen: set[bytes] = set()
         self._distinct: Counter[str] = Counter()
         for schedule in schedules.values():
             for match in ledger.matches(league=league.slug, schedule=schedule.id):
@@ -195,18 +196,14 @@ class _Played:
         self.distinct_games = len(self._seen)
         self.standings = tuple(replace(each, distinct_games=self._distinct[each.ref]) for each in self.standings)
 
-    @property
-    def _best(self) -> list[str]:
-        return [standing.ref for standing in self.standings[:MOST_CONTESTANTS]]
-
     def _take(self, match: Match, schedule: Schedule) -> None:
         self.surprises.see(match, schedule.opening_plies)
         self.games += len(match.games)
         for game in match.games:
-            if (key := hash(identity(match, game))) not in self._seen:
+            if (key := identity(match, game)) not in self._seen:
                 self._seen.add(key)
                 self._distinct.update({match.contestants[number] for number in game.sides})
-        if self._is_rated_by_side or set(match.contestants) <= set(self._best):
+        if self._is_rated_by_side or all(ref in self._best for ref in match.contestants):
             games = tuple(replace(game, opening=(), actions=()) for game in match.games)
             self.matches.append(replace(match, games=games))
 

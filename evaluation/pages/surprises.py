@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from evaluation.gate import identity
@@ -40,7 +40,7 @@ class Surprises:
     def __init__(self, ratings: Mapping[str, float], most: int) -> None:
         """ratings: reference → Elo. most: how many are asked for in the end."""
         self._ratings, self._most = ratings, most
-        self._kept: defaultdict[tuple[str, ...], dict[Hashable, Surprise]] = defaultdict(dict)
+        self._kept: defaultdict[tuple[str, ...], dict[bytes, Surprise]] = defaultdict(dict)
 
     def see(self, match: Match, opening_plies: int) -> None:
         if any(ref not in self._ratings for ref in match.contestants):

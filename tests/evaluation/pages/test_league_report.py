@@ -10,6 +10,9 @@ from evaluation.pages import league_report as module
 from evaluation.pages.league_report import LeagueReport, league_report
 from evaluation.payoff import tabulate
 from evaluation.standings import standings
+from evaluation.verdicts import open_verdict
+from league.config import LeagueConfig
+from league.environments.building import interface
 from league.errors import UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -116,8 +119,6 @@ def test_a_verdict_s_further_evidence_is_passed_on(tmp_path: Path) -> None:
     with leagues.empty(tmp_path) as registry:
         examples.publish(registry, examples.graph())
         league = registry.league(LEAGUE)
-        from evaluation.verdicts import open_verdict
-
         verdict = open_verdict(registry, league, 1, "script:random")
         (told,) = league_report(registry, LEAGUE).verdicts
         assert (told.outcome, told.reason[:25], told.alpha) == ("open", "It is not decided yet: af", None)
@@ -160,12 +161,9 @@ def test_what_is_left_out_is_said(registry: Registry, monkeypatch: pytest.Monkey
     )
 
 
-def test_games_of_another_environment_do_not_count(registry: Registry, tmp_path: Path) -> None:
+def test_games_of_another_environment_do_not_count(tmp_path: Path) -> None:
     with leagues.of_unlike_sides(tmp_path) as other:
         before = league_report(other, LEAGUE, pictures=False)
-        from league.config import LeagueConfig
-        from league.environments.building import interface
-
         document = other.league(LEAGUE).config.model_dump(mode="json", by_alias=True)
         document["environment"]["kwargs"] = {"max_cycles": 9}
         changed = LeagueConfig.from_mapping(document)

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from evaluation.pages import page as module
-from evaluation.pages.league_report import LeagueReport, league_report
+from evaluation.pages.flipbook import MOST_BYTES, MOST_STEPS
+from evaluation.pages.league_report import MOST_SURPRISES, MOST_VERDICTS, LeagueReport, league_report
 from evaluation.pages.page import page, write
 from league.errors import StorageError
 from tests.evaluation.examples import LEAGUE
@@ -194,8 +195,18 @@ def test_tables_have_headings_and_captions_and_charts_say_what_they_show(read: R
     assert [a["lang"] for a, _ in read.all("html")] == ["en"]
 
 
-def test_it_is_no_larger_than_it_may_be(report: LeagueReport) -> None:
-    assert len(page(report).encode()) < 5_000_000
+def test_a_league_of_a_thousand_versions_is_no_larger_than_it_may_be(report: LeagueReport) -> None:
+    book = report.surprises[0]
+    picture = "data:" + "A" * (MOST_BYTES // MOST_SURPRISES // MOST_STEPS)
+    large = replace(
+        report,
+        standings=report.standings * 200,
+        versions=tuple(replace(report.versions[0], number=number) for number in range(1, 1001)),
+        verdicts=(replace(report.verdicts[0], curve=(0.1, -0.1) * 2000),) * MOST_VERDICTS,
+        promotions=report.promotions * 250,
+        surprises=(replace(book, steps=(replace(book.steps[0], picture=picture),) * MOST_STEPS),) * MOST_SURPRISES,
+    )
+    assert 3_000_000 < len(page(large).encode()) < 5_000_000
 
 
 def test_what_else_a_verdict_has_is_shown(report: LeagueReport) -> None:
