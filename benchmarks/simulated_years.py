@@ -2,8 +2,9 @@
 
 A year of 365 nights with 8 candidates is 2,920 tests, and 1,000 years are three million: too many to compute each
 block's likelihood ratio. Where every game has a winner, a block is lost, shared or won, and where a test stands depends
-on three counts alone. So the gate is asked once for each state that a test can be in, and tests are walks over that table. The
-same table gives the chance of a false promotion without any sampling error, by adding up the chances of all walks.
+on three counts alone. So the gate is asked once for each state that a test can be in, and tests are walks over that
+table. The same table gives the chance of a false promotion without any sampling error, by adding up the chances of all
+walks.
 """
 
 from __future__ import annotations

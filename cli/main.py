@@ -13,6 +13,7 @@ from cli.keys import app as keys
 from cli.nightly import nightly
 from cli.output import errors
 from cli.replay import replay
+from cli.report import report
 from cli.serving import act, serve
 from cli.traffic import traffic
 from cli.training import sweep, train
@@ -47,6 +48,7 @@ for command in (
     history,
     traffic,
     replay,
+    report,
     serve,
     act,
 ):

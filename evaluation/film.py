@@ -19,6 +19,7 @@ from PIL.TiffImagePlugin import AppendingTiffWriter
 from evaluation.captions import Caption, Captions
 from evaluation.frames import Frames
 from evaluation.shows import Show
+from league.config import EnvironmentConfig
 from league.environments.building import build
 from league.environments.lockstep import stepping
 from league.errors import ConfigError, EnvironmentMismatch, StorageError
@@ -103,11 +104,16 @@ def watch(show: Show, fps: float | None = None, listener: Listener | None = None
     return Film(last.step, last.returns, last.is_over)
 
 
-def _require(show: Show, mode: str) -> None:
-    environment = build(show.config.environment)
+def render_modes(config: EnvironmentConfig) -> list[str]:
+    """How an environment can be shown, by its own account."""
+    environment = build(config)
     metadata = getattr(environment, "metadata", None) or {}
     environment.close()
-    modes = [str(known) for known in metadata.get("render_modes") or ()]
+    return [str(known) for known in metadata.get("render_modes") or ()]
+
+
+def _require(show: Show, mode: str) -> None:
+    modes = render_modes(show.config.environment)
     if mode not in modes:
         raise EnvironmentMismatch(
             f"{show.config.environment.entry_point} cannot be shown: it has no render_mode {mode!r}"

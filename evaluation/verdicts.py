@@ -238,7 +238,7 @@ def report_of(registry: Registry, verdict: VerdictRow, outcome: str, seen: Findi
         interval=(estimate.low, estimate.high) if estimate else None,
         promoted=promotion.is_applied(registry, verdict),
         alpha=verdict.alpha,
-        anchors=tuple(_anchor_report(anchor) for anchor in seen.anchors),
+        anchors=tuple(anchor_report(anchor) for anchor in seen.anchors),
         difference=_difference(registry, verdict, seen),
         note=note,
     )
@@ -247,7 +247,8 @@ def report_of(registry: Registry, verdict: VerdictRow, outcome: str, seen: Findi
 OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "inconclusive", None: "open"}
 
 
-def _anchor_report(anchor: Anchored) -> AnchorReport:
+def anchor_report(anchor: Anchored) -> AnchorReport:
+    """What is told of one test of non-inferiority."""
     decision, estimate = anchor.decision, anchor.decision.estimate
     return AnchorReport(
         ref=anchor.ref,

@@ -77,7 +77,7 @@ class Ledger:
         after: only those at later positions than this.
         """
         with self._database.read() as session:
-            schedules = {known.id: known for known in _schedules(session, league)}
+            schedules = {known.id: known for known in _schedules(session, league, schedule)}
             query = _in_order(select(tables.Match.schedule, tables.Match.position, tables.Match.moves), league)
             if schedule is not None:
                 query = query.where(tables.Match.schedule == schedule)
@@ -130,9 +130,11 @@ class Ledger:
             ]
 
 
-def _schedules(session: Session, league: str) -> list[Schedule]:
+def _schedules(session: Session, league: str, only: str | None = None) -> list[Schedule]:
     leagues.require(session, league)
     query = select(tables.Schedule.document).filter_by(league=league).order_by(tables.Schedule.sequence)
+    if only is not None:
+        query = query.filter_by(id=only)
     return [load_schedule(document) for document in session.scalars(query)]
 
 

@@ -1,0 +1,1 @@
+"""What a person looks at: a league as one page."""
