@@ -131,19 +131,26 @@ class Pulse:
 def _joined(order: Order) -> Iterator[None]:
     """Be a job of the Ray at `order.address`: what that starts for it ends with this process."""
     if order.address is not None:
-        hook = {"worker_process_setup_hook": "evaluation.job.step_aside"} if order.workers > 1 else None
         ray.init(
             address=order.address,
             namespace="evaluations",
             log_to_driver=False,
             logging_level=logging.ERROR,
-            runtime_env=hook,
+            runtime_env=_aside() if order.workers > 1 else None,
         )
     try:
         yield
     finally:
         if ray.is_initialized():
             ray.shutdown()
+
+
+def _aside() -> dict[str, Any]:
+    """The environment of tasks: they find the modules that this process finds, and give way as it does."""
+    return {
+        "worker_process_setup_hook": "evaluation.job.step_aside",
+        "env_vars": {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
+    }
 
 
 def step_aside() -> None:
