@@ -21,7 +21,8 @@ class Tournament(_Asked):
     kind: Literal["tournament"] = "tournament"
     schedule: Literal["round_robin"] = "round_robin"
     contestants: tuple[str, ...] = Field(default=(), max_length=MOST_CONTESTANTS)
-    """References to versions and scripts; every version of the league if there are none."""
+    """References to versions and scripts; if there are none, every version that was trained in the environment that the
+    league has now."""
     blocks: int = Field(default=32, ge=1, le=MOST_BLOCKS)
     """Matches of each pair."""
     seed: int = Field(default=0, ge=0, lt=2**63)

@@ -97,11 +97,15 @@ class EvaluationRoutes:
 
 def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
     """What is kept: with versions that are the same when it is played, or played on after a fault."""
-    registry.league(league)
+    row = registry.league(league)
     document = asked.root.model_dump(mode="json", exclude={"reason"})
     if isinstance(asked.root, Tournament):
         refs = [pinned(ref, league, registry) for ref in asked.root.contestants]
-        document["contestants"] = refs or [version.ref for version in registry.versions(league)]
+        document["contestants"] = refs or [
+            version.ref
+            for version in registry.versions(league)
+            if version.manifest.environment_digest == row.environment_digest
+        ]
     return document
 
 

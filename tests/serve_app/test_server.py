@@ -404,7 +404,7 @@ def test_a_night_that_finds_another_at_work_says_so_and_the_next_one_promotes(
     with FileLock(locks / "nightly-tictactoe.lock"):
         refused = ended(evaluator, start(evaluator, kind="nightly", reason="first"))
     assert (refused["state"], refused["error"]["code"]) == ("failed", "already_running")
-    assert "another `league nightly` is at work on tictactoe" in refused["error"]["message"]
+    assert "nightly-tictactoe.lock" in refused["error"]["message"]
     night = ended(evaluator, start(evaluator, kind="nightly", reason="second"))
     assert (night["state"], night["result"]["champion"]) == ("done", "tictactoe@2")
     assert served.aliases("tictactoe")["champion"] == 2
