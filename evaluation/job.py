@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import ray
+from ray.exceptions import RayError
 
 from evaluation.nightly import nightly
 from evaluation.report import EvaluationReport, Listener, NightReport, Progress, VerdictReport
@@ -44,17 +45,21 @@ class Stopped(Exception):
 def play(order: Order, registry: Registry) -> None:
     """Play an evaluation and record how it ended.
 
-    Raises StorageError, and whatever is a bug: then nothing is recorded, and it is played on by another process.
+    Raises StorageError and RayError: then nothing is recorded, and it is played on by another process.
     """
     with Pulse(registry, order) as pulse:
         try:
             report = _report(registry.evaluation(order.league, order.evaluation), registry, order.workers, pulse.tell)
         except Stopped:
             pulse.finish("stopped")
-        except StorageError:
+        except (StorageError, RayError):
             raise
         except LeagueError as error:
             pulse.finish("failed", error={"code": error.code, "message": str(error)})
+        except Exception as error:  # of an environment, or a bug: it would come again
+            logger.exception("evaluation %d failed", order.evaluation)
+            message = " ".join(f"{type(error).__name__}: {error}".split())[:500]
+            pulse.finish("failed", error={"code": "internal_error", "message": message})
         else:
             pulse.finish("done", result=report.to_json())
 

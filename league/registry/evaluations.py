@@ -39,7 +39,10 @@ def ask(
     reason: str | None,
     most: int,
 ) -> EvaluationRow:
-    """Queue an evaluation. Raises UnknownLeague, or TooManyEvaluations where `most` are queued or running."""
+    """Queue an evaluation. Raises UnknownLeague, or TooManyEvaluations where `most` are queued or running.
+
+    Two that come at the same moment for different leagues may both be the last one.
+    """
     leagues.lock(session, league)
     waiting = session.scalar(select(func.count()).where(Evaluation.state.in_((QUEUED, RUNNING)))) or 0
     if waiting >= most:

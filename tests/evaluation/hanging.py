@@ -1,4 +1,4 @@
-"""Tic-tac-toe whose first move never ends."""
+"""Tic-tac-toe whose first move never ends, or raises."""
 
 from threading import Event
 from typing import Any
@@ -11,4 +11,6 @@ class Hanging(tictactoe_v3.raw_env):
         Event().wait()
 
 
-env = Hanging
+class Raising(tictactoe_v3.raw_env):
+    def step(self, action: Any) -> None:
+        raise ValueError("the board is gone")

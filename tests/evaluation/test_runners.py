@@ -56,6 +56,12 @@ def ask(registry: Registry, blocks: int) -> Callable[[], EvaluationRow]:
     return lambda: registry.evaluation(examples.LEAGUE, number)
 
 
+def plays(registry: Registry, environment: str) -> None:
+    """Give the league another environment, with the same spaces."""
+    config = examples.config(environment={"entry_point": f"tests.evaluation.hanging:{environment}"})
+    registry.register(config, registry.league(examples.LEAGUE).interface)
+
+
 def positions(registry: Registry, blocks: int) -> list[int]:
     row = registry.league(examples.LEAGUE)
     schedule = round_robin(
@@ -76,10 +82,7 @@ def test_several_workers_are_tasks_of_the_ray_that_the_process_joins(registry: R
 
 def test_one_that_does_not_stop_is_killed(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runners, "GRACE", timedelta(seconds=0.5))
-    registry.register(
-        examples.config(environment={"entry_point": "tests.evaluation.hanging:env"}),
-        registry.league(examples.LEAGUE).interface,
-    )
+    plays(registry, "Hanging")
     evaluation = ask(registry, blocks=8)
     with at_work(registry):
         until(lambda: evaluation().progress is not None)
@@ -87,6 +90,17 @@ def test_one_that_does_not_stop_is_killed(registry: Registry, monkeypatch: pytes
         registry.stop_evaluation(examples.LEAGUE, evaluation().id, actor="ada")
         until(lambda: evaluation().state == "stopped")
         assert process not in jobs_below(os.getpid())
+
+
+def test_what_an_environment_raises_is_told(registry: Registry) -> None:
+    plays(registry, "Raising")
+    evaluation = ask(registry, blocks=8)
+    with at_work(registry):
+        until(lambda: evaluation().ended_at is not None)
+    error = evaluation().error
+    assert evaluation().state == "failed"
+    assert error is not None
+    assert "the board is gone" in error["message"]
 
 
 STUDIO = """
