@@ -155,7 +155,7 @@ def _kill(stage: Stage, name: str, count: int | None = None) -> float:
 
 def replica_killed(stage: Stage) -> float:
     """One of two."""
-    since = _kill(stage, "ServeReplica", 1)
+    since = _kill(stage, "PolicyServer", 1)
     stage.promote()
     return since
 
@@ -222,7 +222,7 @@ def home_moved(stage: Stage) -> float:
 
 def disk_full(stage: Stage) -> float:
     """For the replicas."""
-    limits = {pid: resource.prlimit(pid, resource.RLIMIT_FSIZE) for pid in stage.processes("ServeReplica")}
+    limits = {pid: resource.prlimit(pid, resource.RLIMIT_FSIZE) for pid in stage.processes("PolicyServer")}
     for pid, (_, hard) in limits.items():
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
     time.sleep(stage.seconds)

@@ -9,12 +9,19 @@ def of_haproxy() -> set[int]:
 
 
 def of_replicas() -> list[psutil.Process]:
-    """The replicas of Ray Serve below this process."""
-    return [process for process in _below() if _name(process).startswith("ray::ServeRepl")]
+    """The replicas of Ray Serve below this process that serve actions."""
+    return [process for process in _below() if _is_replica(process)]
 
 
 def _below() -> list[psutil.Process]:
     return psutil.Process().children(recursive=True)
+
+
+def _is_replica(process: psutil.Process) -> bool:
+    try:
+        return "PolicyServer" in process.cmdline()[0]
+    except (psutil.NoSuchProcess, IndexError):
+        return False
 
 
 def _name(process: psutil.Process) -> str:

@@ -9,10 +9,11 @@ import sys
 
 from scipy.stats import binomtest
 
-from evaluation.contestants import baselines, pinned
+from evaluation.contestants import baselines
 from evaluation.player import Player
 from evaluation.schedule import round_robin
 from league.errors import LeagueError
+from league.policies.pinning import pinned
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 

@@ -16,7 +16,7 @@ from league.registry.rows import KeyRow
 app = typer.Typer(
     name="keys",
     no_args_is_help=True,
-    help="API keys: who may ask for actions, look at what is served, and change it.\n\n"
+    help="API keys: who may ask for actions, look at what is served, have games played, and change what is served.\n\n"
     "As soon as there is one, every request needs one: replicas notice within a second.",
 )
 
@@ -31,7 +31,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document.")
 def create(
     name: KeyName,
     scopes: Annotated[
-        list[str], typer.Option("--scope", help="What for: act, read or promote. May be given several times.")
+        list[str], typer.Option("--scope", help="What for: act, read, evaluate or promote. May be given several times.")
     ],
     leagues: Annotated[
         list[str] | None, typer.Option("--league", help="Only for this league. May be given several times.")

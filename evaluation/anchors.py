@@ -6,9 +6,9 @@ scissors and scissors beat paper, paper that beats rock is no progress.
 
 from __future__ import annotations
 
-from evaluation.contestants import pinned
 from league.config import AnchorConfig
 from league.errors import UnknownAlias
+from league.policies.pinning import pinned
 from league.refs import of_league
 from league.registry.registry import Registry
 from league.registry.rows import LeagueRow

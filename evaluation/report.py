@@ -185,7 +185,7 @@ class NightReport(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class Progress(Document):
     """How far the games of one schedule are.
 
     what: a person's words for it, such as `connect_four@3 against connect_four@2`.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from evaluation.contestants import pinned
 from evaluation.exhibition import Moment, exhibit
 from evaluation.play import sides_of
 from evaluation.replay import replay
@@ -14,6 +13,7 @@ from league.environments.stepping import BatchedEnvironment
 from league.errors import InvalidReference
 from league.interface import Interface
 from league.policies.loading import contestant
+from league.policies.pinning import pinned
 from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.results.ledger import Ledger

@@ -17,7 +17,7 @@ from itertools import islice, pairwise
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from evaluation.contestants import baselines, pinned
+from evaluation.contestants import baselines
 from evaluation.gate import distinct_games
 from evaluation.ordering import InOrder
 from evaluation.payoff import tabulate
@@ -26,6 +26,7 @@ from evaluation.report import EvaluationReport, Listener, Progress
 from evaluation.schedule import round_robin
 from evaluation.standings import by_side, ranked
 from league.errors import LeagueError, WorkerLost
+from league.policies.pinning import pinned
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match, Schedule

@@ -17,6 +17,7 @@ LeagueError
 │   ├── VersionRetired          a version that is served no more
 │   ├── UnknownAlias
 │   ├── UnknownPolicy
+│   ├── UnknownEvaluation
 │   └── UnknownKey
 ├── Conflict                  the world has moved on
 │   ├── AliasMoved              a compare-and-set lost
@@ -30,6 +31,7 @@ LeagueError
 ├── Forbidden                 an API key that is not for this
 ├── RateLimited               an API key that calls more often than it may
 ├── Overloaded                more requests at once than a server takes
+│   └── TooManyEvaluations      more evaluations at once than it takes
 ├── DeadlineExceeded          a request that was not answered in its time
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
@@ -38,6 +40,7 @@ LeagueError
 ├── VerdictRefuted            a verdict whose record is not what its games say
 ├── ParityError               an exported graph that acts otherwise than the trained module
 ├── NotReady                  a policy that nothing serves yet
+│   └── NoStudio                a server without what plays games
 ├── RemoteError               a policy server that cannot be reached or failed
 └── StorageError              disk full, read-only, database gone
 """
@@ -147,6 +150,12 @@ class UnknownPolicy(NotFound):
     code = "unknown_policy"
 
 
+class UnknownEvaluation(NotFound):
+    """The league has no evaluation of that number."""
+
+    code = "unknown_evaluation"
+
+
 class UnknownKey(NotFound):
     """There is no API key of that name."""
 
@@ -229,6 +238,12 @@ class Overloaded(LeagueError):
     code = "overloaded"
 
 
+class TooManyEvaluations(Overloaded):
+    """More evaluations that are queued or running than a server takes."""
+
+    code = "too_many_evaluations"
+
+
 class DeadlineExceeded(LeagueError):
     """A request that was not answered in the time that it had."""
 
@@ -275,6 +290,12 @@ class NotReady(LeagueError):
     """A policy that exists but is not served (yet)."""
 
     code = "not_ready"
+
+
+class NoStudio(NotReady):
+    """A server that was deployed without the studio, which plays games."""
+
+    code = "no_studio"
 
 
 class RemoteError(LeagueError):

@@ -1,9 +1,10 @@
-"""The composition root that deploy.yaml names: one deployment whose replicas hold every served policy.
+"""The composition root that deploy.yaml names: a deployment whose replicas hold every served policy, and the studio.
 
     HAProxy → replica: uvicorn → Ray Serve → the Starlette application below
+                                               └ what needs an environment: → the studio, by handle
 
-Nothing stands behind the ingress: a request is answered in the process that it first reaches. Requests for actions do
-without Ray Serve's part on that way (middleware.py).
+A request is answered in the process that it first reaches. Requests for actions do without Ray Serve's part on that way
+(middleware.py).
 """
 
 import gc
@@ -11,14 +12,17 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
+from importlib import import_module
 
 import ray
 from ray import serve
 from ray.serve import Application
+from ray.serve.handle import DeploymentHandle
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.routing import Route, WebSocketRoute
 
+from league.errors import ConfigError
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app import http_protocol, websocket_protocol
@@ -41,6 +45,7 @@ from serve_app.models import Models
 from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute, Shortcut
 from serve_app.routes.docs import DocsRoutes
+from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.metrics import MetricsRoute
@@ -50,6 +55,7 @@ from serve_app.routes.traffic import TrafficRoutes
 from serve_app.settings import ServeSettings
 from serve_app.shadow import Shadow
 from serve_app.streams import StreamParts
+from serve_app.studio import Studio, StudioHandle
 from serve_app.traffic import Traffic
 from serve_app.versions import Versions
 
@@ -62,7 +68,19 @@ default of 5 ms would be the time that the slowest requests wait."""
 def build_app(args: ServeSettings) -> Application:
     """The Serve application. `args` in deploy.yaml are fields of ServeSettings."""
     deployment = serve.deployment(serve.ingress()(PolicyServer))
-    return deployment.bind(args)
+    return deployment.bind(args, _studio(args))
+
+
+def _studio(args: ServeSettings) -> Application | None:
+    """The deployment that plays games: found by its name, for a replica must load nothing of it. Raises ConfigError."""
+    if args.studio is None:
+        return None
+    module, _, name = args.studio.partition(":")
+    try:
+        bound: Application = getattr(import_module(module), name)(args.evaluation_workers, args.evaluations_at_once)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"deploy.yaml: args: studio {args.studio!r} cannot be imported: {error}") from error
+    return bound
 
 
 def _node_address() -> str:
@@ -74,12 +92,19 @@ def _node_address() -> str:
 class PolicyServer:
     """One replica. Where its leagues live, LEAGUE_HOME and its siblings say."""
 
-    def __init__(self, settings: ServeSettings) -> None:
+    def __init__(self, settings: ServeSettings, studio: DeploymentHandle | None = None) -> None:
         sys.setswitchinterval(SWITCH)
         replica = serve.get_replica_context().replica_id.unique_id
         # A replica that starts while the database is elsewhere must not put an empty one into its place.
         registry = Registry.open(Storage.from_environment(), create=False)
-        self._server = Server(registry, settings, replica, machine=_node_address(), is_exposed=serves_other_machines())
+        self._server = Server(
+            registry,
+            settings,
+            replica,
+            machine=_node_address(),
+            is_exposed=serves_other_machines(),
+            studio=studio and StudioHandle(studio),
+        )
 
     def __serve_build_asgi_app__(self) -> Starlette:
         application = self._server.application()
@@ -99,7 +124,7 @@ class PolicyServer:
 class Server:
     """The parts of a replica, put together. Knows nothing of Ray.
 
-    `machine` is the address of its node; `is_exposed`: whether other machines reach it.
+    `machine` is the address of its node; `is_exposed`: whether other machines reach it; `studio`: what plays games.
     """
 
     def __init__(
@@ -109,6 +134,7 @@ class Server:
         replica: str,
         machine: str = LOOPBACK,
         is_exposed: bool = False,
+        studio: Studio | None = None,
     ) -> None:
         self.registry = registry
         self.settings = settings
@@ -132,6 +158,7 @@ class Server:
         self.stream = StreamRoute(parts, replica)
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
+        self.evaluations = EvaluationRoutes(self.models, settings, studio)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
             self.inference, self.catalogue, self.watcher, self.doors, settings, machine, self.metrics.failed
@@ -160,6 +187,10 @@ class Server:
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
                 Route("/v1/leagues/{league}/traffic", traffic.show),
                 Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
+                Route("/v1/leagues/{league}/evaluations", self.evaluations.every),
+                Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
+                Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.one),
+                Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),

@@ -41,6 +41,9 @@ METRICS = {
     "league_faults": Definition("gauge", "1 while an alias is not served as it should be.", ("league",)),
     "league_swaps_total": Definition("counter", "Hot swaps: times that an alias got another version.", ("league",)),
     "league_requests_in_flight": Definition("gauge", "Requests begun and not answered yet.", ("api",)),
+    "league_evaluations": Definition(
+        "gauge", "Evaluations over HTTP that are queued or running; of no replica.", ("league", "state")
+    ),
     "league_replica_start_time_seconds": Definition("gauge", "When the replica started, since 1970."),
     "league_replica_resident_bytes": Definition("gauge", "Memory of the replica's process."),
     "league_canary_share": Definition("gauge", "Share of keys that the canary answers.", ("league",)),

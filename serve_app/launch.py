@@ -266,15 +266,16 @@ def _deploy(document: dict[str, Any], on_ready: Callable[[str], None] | None) ->
     )
     client.deploy_apps(schema, _blocking=False)
     url = f"http://{schema.http_options.host}:{schema.http_options.port}"
-    _await_replicas(schema.applications[0].name, url.replace("0.0.0.0", "127.0.0.1"))
+    (application,) = schema.applications
+    _await_replicas(application.name, application.deployments[0].name, url.replace("0.0.0.0", "127.0.0.1"))
     if on_ready is not None:
         on_ready(url)
     while True:
         signal.pause()
 
 
-def _await_replicas(application: str, url: str) -> None:
-    """Return when every replica answers through HAProxy. Raises NotReady."""
+def _await_replicas(application: str, deployment: str, url: str) -> None:
+    """Return when every replica of a deployment answers through HAProxy. Raises NotReady."""
     from ray import serve
 
     deadline = time.monotonic() + START
@@ -287,7 +288,7 @@ def _await_replicas(application: str, url: str) -> None:
             if status is not None and status.status in ("DEPLOY_FAILED", "UNHEALTHY"):
                 raise NotReady(f"the replicas did not start: {_reason(status)}")
             if status is not None and status.status == "RUNNING":
-                wanted = sum(d.replica_states.get("RUNNING", 0) for d in status.deployments.values())
+                wanted = status.deployments[deployment].replica_states.get("RUNNING", 0)
                 answered |= _replica_that_answers(client, url)
             time.sleep(0.05)
 

@@ -2,6 +2,7 @@
 
 act      POST …/action, …/infer; a stream
 read     GET (HEAD) of anything else; the index of models
+evaluate POST and DELETE of evaluations, even where no other request needs a key
 promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
          thought of is not the one that is open
 nothing  health; the description of the server, which tells strangers nothing of a league
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 HEALTH = ("/v1/health/", "/v2/health/")
 DESCRIPTION = ("/docs", "/openapi.json")
+ALIASES = ("aliases", "rollback", "traffic")
 
 
 class Need(NamedTuple):
@@ -23,7 +25,7 @@ class Need(NamedTuple):
     is_of_all: bool = False
     """Whether it is about all leagues."""
     is_change: bool = False
-    """Whether it changes what is served."""
+    """Whether it changes what is served, or what is played: that needs a key, and so somebody's name, always."""
 
 
 NOTHING = Need(None, None)
@@ -36,7 +38,8 @@ def of_request(kind: str, method: str, path: str) -> Need:
         return NOTHING
     league = league_of(path)
     scope = _scope(kind, method, path)
-    return Need(scope, league, league is None and path != "/v2", scope == "promote" and _is_of_alias(path))
+    is_change = scope == "evaluate" or (scope == "promote" and _is_below_league(path, ALIASES))
+    return Need(scope, league, league is None and path != "/v2", is_change)
 
 
 @lru_cache(maxsize=4096)
@@ -56,13 +59,16 @@ def _scope(kind: str, method: str, path: str) -> str:
         return "read"
     is_action = path.startswith("/v1/policies/") and path.endswith("/action")
     is_inference = path.startswith("/v2/models/") and path.endswith("/infer")
-    return "act" if is_action or is_inference else "promote"
+    if is_action or is_inference:
+        return "act"
+    is_evaluation = method in ("POST", "DELETE") and _is_below_league(path, ("evaluations",))
+    return "evaluate" if is_evaluation else "promote"
 
 
-def _is_of_alias(path: str) -> bool:
-    """Whether a path is `/v1/leagues/L/aliases/A`, `/v1/leagues/L/rollback` or `/v1/leagues/L/traffic`."""
+def _is_below_league(path: str, names: tuple[str, ...]) -> bool:
+    """Whether a path is `/v1/leagues/L/name`, or below it, for one of the names."""
     parts = path.split("/")
-    return parts[1:3] == ["v1", "leagues"] and parts[4:5] in (["aliases"], ["rollback"], ["traffic"])
+    return parts[1:3] == ["v1", "leagues"] and len(parts) > 4 and parts[4] in names
 
 
 def league_of(path: str) -> str | None:

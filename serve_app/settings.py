@@ -64,6 +64,15 @@ class ServeSettings(BaseModel):
     """Requests that may wait to be mirrored to a shadow; beyond them they are not mirrored, and counted as dropped."""
     shadow_load: float = Field(default=0.1, gt=0, lt=1)
     """Share of a core that mirrored requests may take. What does not fit is dropped."""
+    studio: str | None = None
+    """What plays games, by import string: `evaluation.studio:deployment`, as deploy.yaml has it. None: nobody does, and
+    evaluations are answered 503."""
+    evaluation_workers: int = Field(default=1, ge=1)
+    """Processes that play the matches of one evaluation. They give way to replicas, but share their cores."""
+    evaluations_at_once: int = Field(default=1, ge=1)
+    """Evaluations that are played at the same time; the others wait in their order."""
+    max_evaluations: int = Field(default=16, ge=1)
+    """Evaluations that may be queued or running, of all leagues; one more is refused with 429."""
     inline: float = Field(default=0.001, gt=0)
     """Inference that takes longer runs in a thread, so that it holds up neither other requests nor health checks."""
 

@@ -37,7 +37,7 @@ def exports() -> dict[str, str]:
 def test_the_cluster_serves_what_one_machine_does() -> None:
     expected = json.loads(json.dumps(DEPLOY))
     expected["http_options"]["host"] = "0.0.0.0"
-    expected["applications"][0]["args"] = {"grpc_local_only": False}
+    expected["applications"][0]["args"] |= {"grpc_local_only": False}
     expected["applications"][0]["deployments"][0]["num_replicas"] = 4
     assert expected == SERVED
 

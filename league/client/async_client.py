@@ -121,6 +121,35 @@ class AsyncClient:
         await self._await_followers(moved, wait)
         return moved
 
+    async def evaluate(
+        self,
+        league: str,
+        *,
+        reason: str | None = None,
+        idempotency_key: str | None = None,
+        wait: float = 0.0,
+        **asked: Any,
+    ) -> Document:
+        """See `Client.evaluate`."""
+        told = await self.send(calls.evaluate(league, asked, reason, idempotency_key))
+        deadline = time.monotonic() + wait
+        while not calls.has_ended(told) and time.monotonic() < deadline:
+            await asyncio.sleep(LOOK)
+            told = await self.evaluation(league, told["evaluation"])
+        return told
+
+    async def evaluation(self, league: str, number: int) -> Document:
+        """See `Client.evaluation`."""
+        return await self.send(calls.evaluation(league, number))
+
+    async def evaluations(self, league: str, *, before: int | None = None, limit: int = 20) -> list[Document]:
+        """See `Client.evaluations`."""
+        return await self.send(calls.evaluations(league, before, limit))
+
+    async def stop_evaluation(self, league: str, number: int) -> Document:
+        """See `Client.stop_evaluation`."""
+        return await self.send(calls.stop_evaluation(league, number))
+
     async def is_live(self) -> bool:
         """See `Client.is_live`."""
         return await self._is("live")

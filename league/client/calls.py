@@ -26,6 +26,8 @@ class Call(Generic[T]):
     body: bytes | None = None
     """Of a POST; None is a GET."""
     headers: Mapping[str, str] = field(default_factory=dict)
+    is_removal: bool = False
+    """A DELETE, which has no body."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,38 @@ def promote(ref: str, alias: str, expected: int | None, reason: str | None, key:
 def rollback(slug: str, reason: str | None, key: str | None) -> Call[Promotion]:
     """Go back to the champion before."""
     return _change(f"/v1/leagues/{check_slug('league', slug)}/rollback", {}, reason, key)
+
+
+def evaluate(slug: str, asked: Mapping[str, Any], reason: str | None, key: str | None) -> Call[Document]:
+    """Start an evaluation; `asked` is what the body of POST …/evaluations may hold."""
+    document = dict(asked) if reason is None else {**asked, "reason": reason}
+    headers = {"idempotency-key": key or str(uuid4())}
+    return Call(_evaluations(slug), lambda reply, _: reply, to_json(document), headers)
+
+
+def evaluation(slug: str, number: int) -> Call[Document]:
+    """Ask how an evaluation is."""
+    return Call(f"{_evaluations(slug)}/{number:d}", lambda reply, _: reply)
+
+
+def evaluations(slug: str, before: int | None, limit: int) -> Call[list[Document]]:
+    """Ask for a league's evaluations."""
+    older = "" if before is None else f"&before={before:d}"
+    return Call(f"{_evaluations(slug)}?limit={limit:d}{older}", lambda reply, _: reply["evaluations"])
+
+
+def stop_evaluation(slug: str, number: int) -> Call[Document]:
+    """Ask for the end of an evaluation."""
+    return Call(f"{_evaluations(slug)}/{number:d}", lambda reply, _: reply, is_removal=True)
+
+
+def has_ended(told: Document) -> bool:
+    """Whether an evaluation goes on no more."""
+    return told["state"] not in ("queued", "running")
+
+
+def _evaluations(slug: str) -> str:
+    return f"/v1/leagues/{check_slug('league', slug)}/evaluations"
 
 
 def late(told: Document, alias: str, version: int) -> list[str]:

@@ -150,6 +150,39 @@ class Client:
         self._await_followers(moved, wait)
         return moved
 
+    def evaluate(
+        self,
+        league: str,
+        *,
+        reason: str | None = None,
+        idempotency_key: str | None = None,
+        wait: float = 0.0,
+        **asked: Any,
+    ) -> Document:
+        """Start an evaluation; needs a key of scope `evaluate`. Returns it as GET …/evaluations/{evaluation} shows it.
+
+        asked: keys of the body of POST …/evaluations: `contestants=["connect_four@3"], blocks=64`, `kind="nightly"`.
+        wait: seconds for its end, whereupon it is returned as it is then; needs the scope `read` besides.
+        """
+        told = self.send(calls.evaluate(league, asked, reason, idempotency_key))
+        deadline = time.monotonic() + wait
+        while not calls.has_ended(told) and time.monotonic() < deadline:
+            time.sleep(LOOK)
+            told = self.evaluation(league, told["evaluation"])
+        return told
+
+    def evaluation(self, league: str, number: int) -> Document:
+        """An evaluation: how far it is, and its result once it is `done`."""
+        return self.send(calls.evaluation(league, number))
+
+    def evaluations(self, league: str, *, before: int | None = None, limit: int = 20) -> list[Document]:
+        """A league's evaluations, newest first, without results; those older than number `before`."""
+        return self.send(calls.evaluations(league, before, limit))
+
+    def stop_evaluation(self, league: str, number: int) -> Document:
+        """Ask for the end of an evaluation, which comes within seconds; what has ended stays as it is."""
+        return self.send(calls.stop_evaluation(league, number))
+
     def is_live(self) -> bool:
         """Whether a replica answers. Asks once."""
         return self._is("live")

@@ -59,7 +59,7 @@ class Endpoint:
         headers = self._headers if call.body is None else self._post_headers
         if call.headers:
             headers = httpx.Headers({**headers, **call.headers})
-        method = "GET" if call.body is None else "POST"
+        method = "DELETE" if call.is_removal else "GET" if call.body is None else "POST"
         url = _url(self.url + call.path)
         return httpx.Request(method, url, headers=headers, content=call.body, extensions=self._extensions)
 
@@ -69,7 +69,7 @@ class Endpoint:
         if not isinstance(outcome, httpx.Response):
             raise RemoteError(f"{where} cannot be reached: {str(outcome) or type(outcome).__name__}") from outcome
         document = told(outcome)
-        if outcome.status_code == 200 and document is not None:
+        if outcome.status_code in (200, 202) and document is not None:
             return call.read(document, outcome.headers.get("x-league-replica", ""))
         raise fault(outcome, where)
 

@@ -22,8 +22,8 @@ from league.registry.database import insert
 from league.registry.tables import ApiKey
 
 PREFIX = "plk"
-SCOPES = ("act", "read", "promote")
-"""What a key may be for: asking for actions, reading what is served, changing what is served."""
+SCOPES = ("act", "read", "evaluate", "promote")
+"""What a key may be for: asking for actions, reading what is served, having games played, changing what is served."""
 TOKEN_LENGTH = len(PREFIX) + 1 + 8 + 1 + 64
 
 

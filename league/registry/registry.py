@@ -14,6 +14,7 @@ from league.refs import CHAMPION, CheckpointRef
 from league.registry import (
     acknowledgements,
     aliases,
+    evaluations,
     exclusion,
     keys,
     leagues,
@@ -34,6 +35,8 @@ from league.registry.manifest import Manifest
 from league.registry.rows import (
     Acknowledgement,
     AliasEvent,
+    EvaluationRow,
+    EvaluationState,
     KeyRow,
     LeagueRow,
     NightRow,
@@ -51,7 +54,7 @@ Build = Callable[[Path, int], Manifest]
 
 
 class Registry:
-    """Leagues, versions, aliases, verdicts and acknowledgements. May be used by several threads.
+    """Leagues, versions, aliases, verdicts, evaluations, acknowledgements. May be used by several threads.
 
     Every method raises StorageError, in one sentence, when the database or the artefact store fails.
     """
@@ -404,3 +407,81 @@ class Registry:
         """All nights of a league, oldest first. Raises UnknownLeague."""
         with self.database.read() as session:
             return nights.every(session, league)
+
+    # Evaluations
+
+    def ask_evaluation(
+        self,
+        league: str,
+        asked: dict[str, Any],
+        *,
+        actor: str,
+        key: str | None = None,
+        reason: str | None = None,
+        most: int,
+        call: Call | None = None,
+    ) -> EvaluationRow:
+        """Queue an evaluation, unless `call` did so: then return what became of that.
+
+        key: the id of the API key that asks. most: evaluations that may be queued or running, of all leagues.
+        Raises UnknownLeague, TooManyEvaluations or KeyReused.
+        """
+        with self.database.write() as session:
+            return once(
+                session,
+                league,
+                call,
+                lambda: evaluations.ask(session, league, asked, actor=actor, key=key, reason=reason, most=most),
+            )
+
+    def evaluation(self, league: str, number: int) -> EvaluationRow:
+        """One evaluation. Raises UnknownLeague or UnknownEvaluation."""
+        with self.database.read() as session:
+            return evaluations.one(session, league, number)
+
+    def evaluations(self, league: str, *, before: int | None = None, limit: int = 20) -> list[EvaluationRow]:
+        """A league's evaluations, newest first, those older than number `before`. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return evaluations.newest(session, league, before, limit)
+
+    def evaluation_counts(self) -> dict[str, dict[str, int]]:
+        """league → state → evaluations that are queued and running."""
+        with self.database.read() as session:
+            return evaluations.counts(session)
+
+    def stop_evaluation(self, league: str, number: int, *, actor: str) -> EvaluationRow:
+        """Ask for the end of an evaluation. Raises UnknownLeague or UnknownEvaluation."""
+        with self.database.write() as session:
+            return evaluations.stop(session, league, number, actor)
+
+    def claim_evaluation(self, runner: str, workers: int) -> EvaluationRow | None:
+        """Give the oldest evaluation that waits, or whose runner has died, to `runner`; None if there is none."""
+        with self.database.read() as session:
+            if not evaluations.wait(session):
+                return None
+        with self.database.write() as session:
+            return evaluations.claim(session, runner, workers)
+
+    def beat_evaluation(self, number: int, runner: str, progress: dict[str, Any] | None = None) -> EvaluationRow:
+        """Say that a runner lives, and how far it is; returns the evaluation, which another may run by now."""
+        with self.database.write() as session:
+            return evaluations.beat(session, number, runner, progress)
+
+    def finish_evaluation(
+        self,
+        number: int,
+        runner: str,
+        state: EvaluationState,
+        *,
+        progress: dict[str, Any] | None = None,
+        result: dict[str, Any] | None = None,
+        error: dict[str, str] | None = None,
+    ) -> None:
+        """Record how an evaluation ended, unless another runner has it."""
+        with self.database.write() as session:
+            evaluations.finish(session, number, runner, state, progress=progress, result=result, error=error)
+
+    def release_evaluation(self, number: int, runner: str) -> None:
+        """Say that a runner is gone: another may go on."""
+        with self.database.write() as session:
+            evaluations.release(session, number, runner)

@@ -203,3 +203,32 @@ class NightRow:
     report: dict[str, Any] | None
     began_at: datetime
     ended_at: datetime | None
+
+
+EvaluationState = Literal["queued", "running", "done", "failed", "stopped"]
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationRow:
+    """An evaluation that was asked of the service."""
+
+    id: int
+    league: str
+    asked: dict[str, Any]
+    state: EvaluationState
+    progress: dict[str, Any] | None
+    """`what`, `played`, `of`: of the games that are played now."""
+    result: dict[str, Any] | None
+    """The report, once it is done."""
+    error: dict[str, str] | None
+    """`code` and `message`, where it failed."""
+    actor: str
+    reason: str | None
+    workers: int | None
+    runner: str | None
+    created_at: datetime
+    started_at: datetime | None
+    heartbeat_at: datetime | None
+    stop_at: datetime | None
+    stopped_by: str | None
+    ended_at: datetime | None

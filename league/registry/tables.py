@@ -225,7 +225,7 @@ class ApiKey(Table):
 
 
 class IdempotentCall(Table):
-    """A change that a caller named, and the event that it led to: of an alias, or of traffic."""
+    """A change that a caller named, and what it led to: an event of an alias or of traffic, or an evaluation."""
 
     __tablename__ = "idempotent_calls"
 
@@ -235,6 +235,7 @@ class IdempotentCall(Table):
     """Of what was asked."""
     event: Mapped[int | None] = mapped_column(ForeignKey("alias_events.id"))
     traffic: Mapped[int | None] = mapped_column(ForeignKey("traffic_events.id"))
+    evaluation: Mapped[int | None] = mapped_column(ForeignKey("evaluations.id"))
     at: Mapped[datetime] = mapped_column(Utc, index=True)
 
 
@@ -300,4 +301,38 @@ class Night(Table):
     """What each of their verdicts may spend."""
     report: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     began_at: Mapped[datetime] = mapped_column(Utc)
+    ended_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
+class Evaluation(Table):
+    """An evaluation that was asked of the service: what it is to play, who plays it, how far it is, what it brought."""
+
+    __tablename__ = "evaluations"
+    __table_args__ = (Index("ix_evaluations_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    asked: Mapped[dict[str, Any]] = mapped_column(JSON)
+    """What league/evaluations.py reads."""
+    state: Mapped[str] = mapped_column(String(16), index=True)
+    progress: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    result: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    error: Mapped[dict[str, str] | None] = mapped_column(JSON(none_as_null=True))
+    """`code` and `message` of what made it fail."""
+    actor: Mapped[str] = mapped_column(Text)
+    key: Mapped[str | None] = mapped_column(ForeignKey("api_keys.id"))
+    """The API key that asked for it."""
+    reason: Mapped[str | None] = mapped_column(Text)
+    workers: Mapped[int | None]
+    """Processes that play at once."""
+    runner: Mapped[str | None] = mapped_column(String(64))
+    """The process that plays it, or did last."""
+    attempts: Mapped[int]
+    """Runners that began since it last got on."""
+    created_at: Mapped[datetime] = mapped_column(Utc)
+    started_at: Mapped[datetime | None] = mapped_column(Utc)
+    heartbeat_at: Mapped[datetime | None] = mapped_column(Utc)
+    stop_at: Mapped[datetime | None] = mapped_column(Utc)
+    """When somebody asked for its end."""
+    stopped_by: Mapped[str | None] = mapped_column(Text)
     ended_at: Mapped[datetime | None] = mapped_column(Utc)

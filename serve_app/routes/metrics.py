@@ -6,8 +6,12 @@ from starlette.responses import Response
 
 from league.registry.registry import Registry
 from serve_app.exposition import text
+from serve_app.metrics import Report
 from serve_app.models import Models
 from serve_app.settings import ACKNOWLEDGED_WITHIN
+
+NOBODY = ""
+"""The replica of what is true of all: to Prometheus a label that is empty is none."""
 
 
 class MetricsRoute:
@@ -25,4 +29,10 @@ class MetricsRoute:
 
 
 def _metrics(registry: Registry) -> bytes:
-    return text(registry.reports(since=ACKNOWLEDGED_WITHIN))
+    return text(registry.reports(since=ACKNOWLEDGED_WITHIN) | {NOBODY: _of_all(registry)})
+
+
+def _of_all(registry: Registry) -> Report:
+    counts = registry.evaluation_counts()
+    samples = [[[league, state], count] for league, states in counts.items() for state, count in states.items()]
+    return {"league_evaluations": samples}

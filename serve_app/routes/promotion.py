@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
@@ -52,7 +52,7 @@ class Return(Change):
     """The body of a rollback."""
 
 
-B = TypeVar("B", bound=Change)
+B = TypeVar("B", bound=BaseModel)
 
 
 class PromotionRoutes:
@@ -97,7 +97,7 @@ class PromotionRoutes:
         return JSONResponse(_document(event))
 
 
-def call_of(request: Request, body: Change) -> tuple[Key, Call]:
+def call_of(request: Request, body: BaseModel) -> tuple[Key, Call]:
     """Who calls, and the name of the call. Raises InvalidInput."""
     key: Key = request.scope[KEY]
     asked = f"{request.url.path} {body.model_dump_json(exclude_unset=True)}"
@@ -121,7 +121,8 @@ def parse(kind: type[B], body: bytes) -> B:
         return kind.model_validate_json(body)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the body"
+        loc = first["loc"][1:] if issubclass(kind, RootModel) else first["loc"]  # without which of several it is
+        where = ".".join(str(part) for part in loc) or "the body"
         raise InvalidInput(f"{where}: {first['msg']}") from None
 
 

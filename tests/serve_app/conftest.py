@@ -51,4 +51,11 @@ def unchanging(storage: Storage) -> Iterator[TestClient]:
 
 def replica(storage: Storage, settings: ServeSettings = QUICK) -> TestClient:
     """The application of a replica of its own; enter it to start."""
-    return TestClient(Server(Registry.open(storage), settings, "replica-1").application())
+    return TestClient(Server(Registry.open(storage), settings, "replica-1", studio=Closed()).application())
+
+
+class Closed:
+    """A studio where nobody is at work: what is asked of it waits in the registry."""
+
+    def look(self) -> None:
+        """Do nothing."""

@@ -13,7 +13,7 @@ from league.settings import Storage
 from serve_app import http_protocol, websocket_protocol
 from serve_app.app import Server
 from serve_app.settings import ServeSettings
-from tests.serve_app.conftest import QUICK
+from tests.serve_app.conftest import QUICK, Closed
 
 
 @dataclass
@@ -40,7 +40,7 @@ def listening(
     """A replica in a thread of its own, on a port of this machine, by default a free one. options: of uvicorn."""
     http_protocol.install()
     websocket_protocol.install(settings.max_body)
-    server = Server(Registry.open(storage), settings, replica)
+    server = Server(Registry.open(storage), settings, replica, studio=Closed())
     config = uvicorn.Config(
         server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
     )

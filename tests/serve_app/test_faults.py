@@ -89,7 +89,7 @@ def haproxies(registry: Registry) -> list[int]:
 
 def test_a_replica(url: str, registry: Registry) -> None:
     with under_load(url):
-        kill(registry, "ServeReplica", 1)
+        kill(registry, "PolicyServer", 1)
         follows(registry, 2)
 
 
@@ -120,7 +120,7 @@ def test_a_database_that_is_moved_away(url: str, registry: Registry) -> None:
         until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")
         assert client.get("/v1/leagues").status_code == 503
         assert client.get("/v1/health/ready").status_code == 200
-        kill(registry, "ServeReplica", 1)  # the one that comes instead must not make a database of its own
+        kill(registry, "PolicyServer", 1)  # the one that comes instead must not make a database of its own
         more(seen, 500)
         assert not path.exists()
         path.with_name("away").rename(path)

@@ -51,6 +51,7 @@ REAL = {
     "league": ["board", "memory", "duo", "empty"],
     "alias": ["champion", "candidate"],
     "version": ["1", "2", "champion"],
+    "evaluation": [1, 2, 3],
 }
 
 
@@ -65,7 +66,7 @@ def storage_to_fuzz(tmp_path_factory: pytest.TempPathFactory) -> Storage:
 def fuzzed(storage_to_fuzz: Storage) -> Iterator[TestClient]:
     """A replica whose client has a key for everything. What it serves changes, as it is asked to."""
     registry = Registry.open(storage_to_fuzz)
-    _, token = registry.create_key("fuzz", ["act", "read", "promote"])
+    _, token = registry.create_key("fuzz", ["act", "read", "evaluate", "promote"])
     registry.close()
     with replica(storage_to_fuzz) as client:
         client.headers["x-api-key"] = token

@@ -23,7 +23,7 @@ def test_a_taken_port(storage: Storage, which: str) -> None:
 
 def test_settings_that_are_none(storage: Storage, tmp_path: Path) -> None:
     deploy = tmp_path / "deploy.yaml"
-    deploy.write_text(DEPLOY_YAML.read_text().replace("args: {}", "args: {max_body: 1}"))
+    deploy.write_text(DEPLOY_YAML.read_text().replace("    args:\n", "    args:\n      max_body: 1\n"))
     with pytest.raises(ConfigError, match="max_body"), running(storage, deploy=deploy):
         pass
 

@@ -14,34 +14,51 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from filelock import FileLock
 from websockets.exceptions import ConnectionClosed
 
+from evaluation.report import EvaluationReport
+from evaluation.tournament import evaluate
 from league.client import Client
 from league.client.conversation import Conversation
 from league.client.stream import Stream
+from league.environments.building import interface
 from league.errors import UnknownLeague
 from league.policies.onnx import OnnxPolicy
 from league.policies.remote import RemotePolicy
 from league.registry.following import await_traffic
 from league.registry.registry import Registry
 from league.registry.rows import Portion
+from league.results.ledger import Ledger
+from league.results.records import Match
 from league.settings import Storage
 from serve_app import haproxy
 from serve_app.launch import running
+from tests.evaluation import examples
 from tests.league.policies.graphs import masked_mlp
 from tests.serve_app.leagues import everything, promote, publish
 from tests.serve_app.scaling import scale
 from tests.serve_app.test_action import BOARD
 
 ACTION = "/v1/policies/board/action"
+EVALUATIONS = "/v1/leagues/tictactoe/evaluations"
 BATCH = {"observation": np.zeros((1, 6, 7, 2), np.int8), "action_mask": np.ones((1, 7), np.int8)}
 
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
     registry = everything(Storage.at(tmp_path_factory.mktemp("served")))
+    tictactoe(registry)
     yield registry
     registry.close()
+
+
+def tictactoe(registry: Registry) -> None:
+    """A league that can be played, with two versions."""
+    league = examples.config(play={"opening_plies": 2, "copies": 2})
+    registry.register(league, interface(league))
+    for graph in (examples.graph(), examples.graph(wins=True)):
+        examples.publish(registry, graph)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +66,8 @@ def url(served: Registry) -> Iterator[str]:
     with pytest.MonkeyPatch.context() as environment:
         # A replica that is to stop stays open for 30 s else.
         environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
-        with running(served.storage, replicas=2) as url:
+        # There is a key, for evaluations. The others do without.
+        with running(served.storage, replicas=2, insecure=True) as url:
             yield url
     until(lambda: not processes(served.storage, ""), seconds=10)  # a server that stopped leaves no process
 
@@ -222,14 +240,14 @@ def test_a_hundred_megabytes_are_refused(url: str, served: Registry, has_length:
 def memory(storage: Storage) -> int:
     """The largest resident size that a replica ever had, in bytes."""
     peaks = []
-    for pid in processes(storage, "ServeReplica"):
+    for pid in processes(storage, "PolicyServer"):
         status = Path(f"/proc/{pid}/status").read_text()
         peaks += [int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM")]
     return max(peaks)
 
 
 def test_the_death_of_a_replica_costs_our_client_no_request(url: str, served: Registry) -> None:
-    victim = processes(served.storage, "ServeReplica")[0]
+    victim = processes(served.storage, "PolicyServer")[0]
 
     def caller() -> Callable[[], int]:
         client = Client(url)
@@ -241,7 +259,7 @@ def test_the_death_of_a_replica_costs_our_client_no_request(url: str, served: Re
         after = seen.versions.total()
         until(lambda: seen.versions.total() > after + 2000)
     assert seen.failures == []
-    until(lambda: len(set(processes(served.storage, "ServeReplica")) - {victim}) == 2)
+    until(lambda: len(set(processes(served.storage, "PolicyServer")) - {victim}) == 2)
 
 
 def test_promotions_end_no_stream(url: str, served: Registry) -> None:
@@ -265,12 +283,12 @@ def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> N
             assert [stream.act([1.0]) for stream in streams] == [0] * 6
         assert len(replicas(streams)) == 2
         with ended_streams() as codes:
-            scale(processes(served.storage, "ServeReplica"), processes(served.storage, "raylet")[0], 1)
+            scale(processes(served.storage, "PolicyServer"), processes(served.storage, "raylet")[0], 1)
             until(lambda: [stream.act([0.0]) for stream in streams] and len(replicas(streams)) == 1)
         assert codes
         assert set(codes) == {1012}
         assert [stream.act([1.0]) for stream in streams] == [1] * 6
-        scale(processes(served.storage, "ServeReplica"), processes(served.storage, "raylet")[0], 2)
+        scale(processes(served.storage, "PolicyServer"), processes(served.storage, "raylet")[0], 2)
     until(lambda: serving(served, 1) >= 2)
 
 
@@ -308,6 +326,88 @@ def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
             assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 1
         graph.write_bytes(whole)
         until(lambda: serving(served, new) >= 2)
+
+
+@pytest.fixture(scope="module")
+def evaluator(url: str, served: Registry) -> Iterator[httpx.Client]:
+    """Has a key that may start evaluations and nights."""
+    _, token = served.create_key("night-owl", ["read", "evaluate", "promote"])
+    with httpx.Client(base_url=url, headers={"x-api-key": token}) as client:
+        until(lambda: client.delete(f"{EVALUATIONS}/99").status_code == 404)  # both replicas know it soon
+        yield client
+
+
+def start(client: httpx.Client, **body: Any) -> str:
+    """Where the evaluation can be followed."""
+    headers = {"idempotency-key": str(body)}
+    until(lambda: client.post(EVALUATIONS, json=body, headers=headers).status_code == 202)
+    return client.post(EVALUATIONS, json=body, headers=headers).headers["location"]
+
+
+def ended(client: httpx.Client, place: str) -> dict[str, Any]:
+    until(lambda: client.get(place).json()["state"] not in ("queued", "running"))
+    return dict(client.get(place).json())
+
+
+def at_home(directory: Path, blocks: int) -> tuple[EvaluationReport, list[Match]]:
+    """What `league evaluate` plays of the same versions."""
+    registry = Registry.open(Storage.at(directory))
+    tictactoe(registry)
+    report = evaluate(examples.LEAGUE, registry=registry, blocks=blocks)
+    matches = Ledger(registry).matches(league=examples.LEAGUE)
+    registry.close()
+    return report, matches
+
+
+def test_an_evaluation_that_is_killed_goes_on_and_is_what_league_evaluate_plays(
+    evaluator: httpx.Client, served: Registry, tmp_path: Path
+) -> None:
+    report, matches = at_home(tmp_path, blocks=150)
+
+    def played() -> list[Match]:
+        return Ledger(served).matches(league=examples.LEAGUE, schedule=report.schedule)
+
+    place = start(evaluator, blocks=150)
+    until(lambda: Ledger(served).positions(report.schedule) if known(served, report.schedule) else False)
+    (first,) = processes(served.storage, "evaluation.job")
+    os.kill(first, signal.SIGKILL)
+    left = played()
+    assert 0 < len(left) < len(matches)
+    assert left == matches[: len(left)]
+    until(lambda: set(processes(served.storage, "evaluation.job")) - {first})
+    document = ended(evaluator, place)
+    assert (document["state"], document["error"]) == ("done", None)
+    assert document["result"] == report.to_json()
+    assert (document["progress"]["played"], document["progress"]["of"]) == (len(matches), len(matches))
+    assert played() == matches
+
+
+def known(registry: Registry, schedule: str) -> bool:
+    return schedule in [each.id for each in Ledger(registry).schedules(examples.LEAGUE)]
+
+
+def test_an_evaluation_is_stopped_between_chunks(evaluator: httpx.Client, served: Registry) -> None:
+    place = start(evaluator, blocks=20_000)
+    until(lambda: evaluator.get(place).json()["progress"])
+    assert evaluator.delete(place).json()["stopped_by"] == "night-owl"
+    document = ended(evaluator, place)
+    assert (document["state"], document["result"]) == ("stopped", None)
+    assert 0 < document["progress"]["played"] < document["progress"]["of"]
+    until(lambda: not processes(served.storage, "evaluation.job"))
+
+
+def test_a_night_that_finds_another_at_work_says_so_and_the_next_one_promotes(
+    evaluator: httpx.Client, served: Registry
+) -> None:
+    locks = served.storage.home / "locks"
+    locks.mkdir(exist_ok=True)
+    with FileLock(locks / "nightly-tictactoe.lock"):
+        refused = ended(evaluator, start(evaluator, kind="nightly", reason="first"))
+    assert (refused["state"], refused["error"]["code"]) == ("failed", "already_running")
+    assert "nightly-tictactoe.lock" in refused["error"]["message"]
+    night = ended(evaluator, start(evaluator, kind="nightly", reason="second"))
+    assert (night["state"], night["result"]["champion"]) == ("done", "tictactoe@2")
+    assert served.aliases("tictactoe")["champion"] == 2
 
 
 def test_a_server_that_was_killed_can_be_started_again(storage: Storage) -> None:

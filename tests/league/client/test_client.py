@@ -21,6 +21,7 @@ from league.errors import (
     RateLimited,
     RemoteError,
     Unauthenticated,
+    UnknownEvaluation,
     UnknownLeague,
     UnknownVersion,
 )
@@ -234,6 +235,28 @@ def test_promotions_are_applied_once_and_followed_everywhere(connect: Connect, r
         assert client.act("board@candidate", BOARD).version == 1
         with pytest.raises(InvalidInput, match="expected the number"):
             client.promote("board@candidate")
+
+
+def test_evaluations_are_started_once_followed_and_stopped(connect: Connect, registry: Registry) -> None:
+    _, token = registry.create_key("operator", ["read", "evaluate"])
+    with listening(registry.storage) as listener:
+        client = connect(listener.url, key=token)
+        same = [client.evaluate("board", contestants=["board@champion"], idempotency_key="once") for _ in range(2)]
+        assert same[0] == same[1]
+        number = same[0]["evaluation"]
+        assert (same[0]["state"], same[0]["asked"]["contestants"]) == ("queued", ["board@1"])
+        other = client.evaluate("board", blocks=2, reason="try", wait=0.1)
+        assert (other["state"], other["reason"]) == ("queued", "try")
+        assert [each["evaluation"] for each in client.evaluations("board")] == [other["evaluation"], number]
+        assert [each["evaluation"] for each in client.evaluations("board", before=other["evaluation"])] == [number]
+        assert client.stop_evaluation("board", number)["state"] == "stopped"
+        assert client.evaluation("board", number)["stopped_by"] == "operator"
+        with pytest.raises(UnknownVersion):
+            client.evaluate("board", contestants=["board@9"])
+        with pytest.raises(Forbidden, match="scope promote as well"):
+            client.evaluate("board", kind="nightly")
+        with pytest.raises(UnknownEvaluation):
+            client.evaluation("board", 99)
 
 
 def test_a_caller_stays_with_one_version_while_a_canary_is_tried(

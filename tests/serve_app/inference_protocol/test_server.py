@@ -78,7 +78,7 @@ def test_a_promotion_reaches_both_protocols(address: Address, served: Registry) 
 
 def test_the_death_of_a_replica_costs_no_call_that_is_repeated(address: Address, served: Registry) -> None:
     arrays = {"observation": np.zeros((1, 2), np.float32)}
-    victim = processes(served.storage, "ServeReplica")[0]
+    victim = processes(served.storage, "PolicyServer")[0]
 
     def caller() -> Callable[[], int]:
         client = tritonclient.grpc.InferenceServerClient(address.grpc)
@@ -101,4 +101,4 @@ def test_the_death_of_a_replica_costs_no_call_that_is_repeated(address: Address,
         after = seen.versions.total()
         until(lambda: seen.versions.total() > after + 1000)
     assert seen.failures == []
-    until(lambda: len(set(processes(served.storage, "ServeReplica")) - {victim}) == 2)
+    until(lambda: len(set(processes(served.storage, "PolicyServer")) - {victim}) == 2)

@@ -1,0 +1,56 @@
+"""The studio: a Serve deployment for what needs an environment. The service calls it by handle; it plays evaluations.
+
+deploy.yaml names it by import string, and the service's replicas never load it. It holds nothing: what was asked, and
+how far it is, is in the registry, so that it may die and be started again at any time.
+"""
+
+from typing import Any
+
+
+class Studio:
+    """One replica. Where its leagues live, LEAGUE_HOME and its siblings say."""
+
+    def __init__(self, workers: int, at_once: int) -> None:
+        import ray
+
+        from evaluation.runners import Runners
+        from league.registry.registry import Registry
+        from league.settings import Storage
+
+        registry = Registry.open(Storage.from_environment(), create=False)
+        address = ray.get_runtime_context().gcs_address
+        self._runners = Runners(registry, workers=workers, at_once=at_once, address=address)
+        self._runners.start()
+
+    def __del__(self) -> None:
+        self._runners.close()
+
+    async def look(self) -> None:
+        """There is an evaluation to play, or to stop. It would be found a moment later anyway."""
+        self._runners.look()
+
+    def check_health(self) -> None:
+        """Ray Serve replaces a studio that no longer looks after evaluations."""
+        if not self._runners.are_watched:
+            raise RuntimeError("nobody looks after evaluations")
+
+
+def deployment(workers: int, at_once: int) -> Any:
+    """The studio, bound: `workers` processes play each evaluation, `at_once` of them.
+
+    It reserves no CPU, so that it never keeps a replica from starting. `deployments` of deploy.yaml may say otherwise,
+    by its name, `Studio`.
+    """
+    from ray import serve
+
+    options = serve.deployment(
+        name="Studio",
+        num_replicas=1,
+        ray_actor_options={"num_cpus": 0},
+        health_check_period_s=5,
+        health_check_timeout_s=10,
+        graceful_shutdown_wait_loop_s=0.1,
+        graceful_shutdown_timeout_s=5,
+        logging_config={"log_level": "WARNING", "enable_access_log": False},
+    )
+    return options(Studio).bind(workers, at_once)

@@ -1,0 +1,147 @@
+"""Evaluations: games between a league's versions, played by the studio, followed and stopped from here.
+
+POST    /v1/leagues/{league}/evaluations        {"contestants": ["connect_four@3", "script:one_ply"], "blocks": 64}
+GET     /v1/leagues/{league}/evaluations        newest first; ?limit=20&before={evaluation}
+GET     /v1/leagues/{league}/evaluations/{evaluation}
+DELETE  /v1/leagues/{league}/evaluations/{evaluation}
+
+What is asked is checked at once, written to the registry, and played by whoever runs the studio; any replica can tell
+how far it is. Starting and stopping take a key of scope `evaluate`, a night of scope `promote` as well.
+"""
+
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from league.errors import Forbidden, InvalidInput, NoStudio, UnknownEvaluation
+from league.evaluations import Asked, Night, Tournament
+from league.policies.pinning import pinned
+from league.refs import check_slug
+from league.registry.registry import Registry
+from league.registry.rows import EvaluationRow
+from serve_app.bodies import read_body
+from serve_app.doors import KEY
+from serve_app.keyring import Key
+from serve_app.models import Models
+from serve_app.routes.promotion import call_of, parse
+from serve_app.settings import ServeSettings
+from serve_app.studio import Studio
+
+PAGE, LARGEST_PAGE = 20, 100
+LARGEST = 2**31 - 1
+
+
+class EvaluationRoutes:
+    """The endpoints. Doors lets only keys of scope `evaluate` start and stop."""
+
+    def __init__(self, models: Models, settings: ServeSettings, studio: Studio | None) -> None:
+        self._models = models
+        self._settings = settings
+        self._studio = studio
+
+    async def start(self, request: Request) -> JSONResponse:
+        """Queue an evaluation: 202.
+
+        Raises NoStudio, InvalidInput, Forbidden, InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias,
+        UnknownPolicy, EnvironmentMismatch, TooManyEvaluations or KeyReused.
+        """
+        league = check_slug("league", request.path_params["league"])
+        body = await read_body(request.scope, request.receive, self._settings.max_body)
+        asked = parse(Asked, body or b"{}")
+        key, call = call_of(request, asked)
+        if isinstance(asked.root, Night) and "promote" not in key.scopes:
+            raise Forbidden(f"a night may promote: this needs a key of scope promote as well, which {key.name} is not")
+        if self._studio is None:
+            raise NoStudio("this server plays no games: `studio` is not set in its deploy.yaml")
+
+        def ask(registry: Registry) -> EvaluationRow:
+            return registry.ask_evaluation(
+                league,
+                _pinned(asked, league, registry),
+                actor=key.name,
+                key=key.id,
+                reason=asked.root.reason,
+                most=self._settings.max_evaluations,
+                call=call,
+            )
+
+        row = await self._models.ask(ask)
+        self._studio.look()
+        return JSONResponse(_whole(row), 202, {"location": f"{request.url.path}/{row.id}"})
+
+    async def every(self, request: Request) -> JSONResponse:
+        """A page of a league's evaluations, without their results. Raises UnknownLeague or InvalidInput."""
+        league = check_slug("league", request.path_params["league"])
+        limit = _number(request, "limit", LARGEST_PAGE) or PAGE
+        before = _number(request, "before", LARGEST)
+        rows = await self._models.ask(lambda registry: registry.evaluations(league, before=before, limit=limit + 1))
+        page = [_document(row) for row in rows[:limit]]
+        more = page[-1]["evaluation"] if len(rows) > limit else None
+        return JSONResponse({"league": league, "evaluations": page, "before": more})
+
+    async def one(self, request: Request) -> JSONResponse:
+        """One evaluation: how far it is, and what it has brought. Raises UnknownLeague or UnknownEvaluation."""
+        league, number = _named(request)
+        return JSONResponse(_whole(await self._models.ask(lambda registry: registry.evaluation(league, number))))
+
+    async def stop(self, request: Request) -> JSONResponse:
+        """Ask for its end; what has ended stays as it is. Raises UnknownLeague or UnknownEvaluation."""
+        league, number = _named(request)
+        key: Key = request.scope[KEY]
+        row = await self._models.ask(lambda registry: registry.stop_evaluation(league, number, actor=key.name))
+        if self._studio is not None:
+            self._studio.look()
+        return JSONResponse(_whole(row))
+
+
+def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
+    """What is kept: with versions that are the same when it is played, or played on after a fault."""
+    row = registry.league(league)
+    document = asked.root.model_dump(mode="json", exclude={"reason"})
+    if isinstance(asked.root, Tournament):
+        refs = [pinned(ref, league, registry) for ref in asked.root.contestants]
+        document["contestants"] = refs or [
+            version.ref
+            for version in registry.versions(league)
+            if version.manifest.environment_digest == row.environment_digest
+        ]
+    return document
+
+
+def _named(request: Request) -> tuple[str, int]:
+    league, number = check_slug("league", request.path_params["league"]), request.path_params["evaluation"]
+    if not (number.isascii() and number.isdigit() and len(number) <= 10 and int(number) <= LARGEST):
+        raise UnknownEvaluation(f"league {league} has no evaluation {number[:32]!r}: it is a number")
+    return league, int(number)
+
+
+def _number(request: Request, name: str, largest: int) -> int | None:
+    """A positive number of the query. Raises InvalidInput."""
+    text = request.query_params.get(name)
+    if text is None:
+        return None
+    if not (text.isascii() and text.isdigit() and len(text) <= 10 and 1 <= int(text) <= largest):
+        raise InvalidInput(f"{name} must be a number from 1 to {largest}, got {text[:32]!r}")
+    return int(text)
+
+
+def _document(row: EvaluationRow) -> dict[str, Any]:
+    instants = {"created_at": row.created_at, "started_at": row.started_at, "ended_at": row.ended_at}
+    return {
+        "league": row.league,
+        "evaluation": row.id,
+        "state": row.state,
+        "asked": row.asked,
+        "progress": row.progress,
+        "error": row.error,
+        "actor": row.actor,
+        "reason": row.reason,
+        "workers": row.workers,
+        "stopped_by": row.stopped_by,
+        "heartbeat_at": row.heartbeat_at and row.heartbeat_at.isoformat(),
+    } | {name: instant and instant.isoformat() for name, instant in instants.items()}
+
+
+def _whole(row: EvaluationRow) -> dict[str, Any]:
+    return _document(row) | {"result": row.result}

@@ -1,0 +1,191 @@
+"""Evaluations over HTTP, as far as no game is played: what is asked, refused, listed and stopped."""
+
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from league.registry.registry import Registry
+from serve_app.app import Server
+from tests.serve_app.conftest import QUICK, replica
+from tests.serve_app.leagues import promote
+
+BOARD = "/v1/leagues/board/evaluations"
+
+
+@pytest.fixture
+def evaluator(client: TestClient, registry: Registry) -> TestClient:
+    """The client, with a key that may start evaluations but no night."""
+    return with_key(client, registry, "bot", ["evaluate", "read"])
+
+
+def with_key(client: TestClient, registry: Registry, name: str, scopes: list[str]) -> TestClient:
+    _, token = registry.create_key(name, scopes)
+    client.headers["x-api-key"] = token
+    while client.get("/v1/leagues").status_code == 401 or client.post(BOARD, content=b"x").status_code == 401:
+        pass
+    return client
+
+
+def start(
+    client: TestClient, body: Any = None, call: str = "a", path: str = BOARD, status: int = 202
+) -> dict[str, Any]:
+    content = {"content": body} if isinstance(body, bytes) else {"json": body or {}}
+    reply = client.post(path, headers={"idempotency-key": call}, **content)
+    assert reply.status_code == status, reply.text
+    return dict(reply.json())
+
+
+def test_what_is_asked_is_queued_with_references_that_stay(evaluator: TestClient, registry: Registry) -> None:
+    contestants = ["board@champion", "board@3", "script:random"]
+    reply = evaluator.post(
+        BOARD,
+        json={"contestants": contestants, "blocks": 4, "reason": "try"},
+        headers={"idempotency-key": "a"},
+    )
+    document = reply.json()
+    promote(registry, "board", 2)
+    assert (reply.status_code, reply.headers["location"]) == (202, f"{BOARD}/{document['evaluation']}")
+    assert document["asked"] == {
+        "kind": "tournament",
+        "schedule": "round_robin",
+        "contestants": ["board@1", "board@3", "script:random"],
+        "blocks": 4,
+        "seed": 0,
+    }
+    assert (document["state"], document["actor"], document["reason"]) == ("queued", "bot", "try")
+    assert evaluator.get(reply.headers["location"]).json() == document
+
+
+def test_by_default_every_version_plays(evaluator: TestClient) -> None:
+    assert start(evaluator, b"")["asked"]["contestants"] == ["board@1", "board@2", "board@3"]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status", "code"),
+    [
+        ("/v1/leagues/chess/evaluations", {}, 404, "unknown_league"),
+        (BOARD, {"contestants": ["board@9"]}, 404, "unknown_version"),
+        (BOARD, {"contestants": ["board@candidate"]}, 404, "unknown_alias"),
+        (BOARD, {"contestants": ["script:clever"]}, 404, "unknown_policy"),
+        (BOARD, {"contestants": ["memory@1"]}, 400, "environment_mismatch"),
+        ("/v1/leagues/vector/evaluations", {"contestants": ["script:one_ply"]}, 400, "environment_mismatch"),
+        (BOARD, {"contestants": ["board"]}, 400, "invalid_reference"),
+        (BOARD, {"contestants": "board@1"}, 400, "invalid_input"),
+        (BOARD, {"contestants": ["board@1"] * 300}, 400, "invalid_input"),
+        (BOARD, {"blocks": 0}, 400, "invalid_input"),
+        (BOARD, {"blocks": "4"}, 400, "invalid_input"),
+        (BOARD, {"seed": 2**63}, 400, "invalid_input"),
+        (BOARD, {"games": 100}, 400, "invalid_input"),
+        (BOARD, {"schedule": "lottery"}, 400, "invalid_input"),
+        (BOARD, {"kind": "yearly"}, 400, "invalid_input"),
+        (BOARD, {"kind": "nightly", "blocks": 4}, 400, "invalid_input"),
+        (BOARD, {"kind": "nightly"}, 403, "forbidden"),
+        (BOARD, b"[1]", 400, "invalid_input"),
+        (BOARD, b"nonsense", 400, "invalid_input"),
+    ],
+)
+def test_what_cannot_be_played_is_refused_at_once(
+    evaluator: TestClient, registry: Registry, path: str, body: Any, status: int, code: str
+) -> None:
+    error = start(evaluator, body, path=path, status=status)
+    assert error["code"] == code
+    assert registry.evaluations("board") == []
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"kind": "yearly"}, "kind must be 'tournament' or 'nightly'"),
+        ({"blocks": 0}, "blocks: Input should be greater than or equal to 1"),
+        ({"contestants": ["memory@1"]}, "memory@1 is not a version of league board"),
+    ],
+)
+def test_the_sentence_names_what_is_wrong(evaluator: TestClient, body: Any, words: str) -> None:
+    assert words in start(evaluator, body, status=400)["message"]
+
+
+def test_a_night_takes_a_key_that_may_promote(client: TestClient, registry: Registry) -> None:
+    promoter = with_key(client, registry, "owl", ["evaluate", "promote"])
+    assert start(promoter, {"kind": "nightly"})["asked"] == {"kind": "nightly"}
+
+
+@pytest.mark.parametrize(("scopes", "status"), [(["read", "act", "promote"], 403), (["read"], 403)])
+def test_other_keys_start_and_stop_nothing(
+    client: TestClient, registry: Registry, scopes: list[str], status: int
+) -> None:
+    other = with_key(client, registry, "other", scopes)
+    start(other, status=status)
+    assert other.delete(f"{BOARD}/1").status_code == status
+
+
+def test_without_a_key_nothing_is_started_even_where_none_is_asked_for(client: TestClient) -> None:
+    assert client.get(BOARD).json() == {"league": "board", "evaluations": [], "before": None}
+    assert start(client, status=401)["code"] == "unauthenticated"
+    assert client.delete(f"{BOARD}/1").status_code == 401
+
+
+def test_a_call_that_comes_again_starts_nothing(evaluator: TestClient, registry: Registry) -> None:
+    first = start(evaluator, {"blocks": 4})
+    assert start(evaluator, b' {"blocks" : 4} ') == first
+    assert start(evaluator, {"blocks": 5}, status=409)["code"] == "idempotency_key_reused"
+    assert evaluator.post(BOARD, json={}).status_code == 400, "it takes a key for the call"
+    assert len(registry.evaluations("board")) == 1
+
+
+def test_they_are_listed_newest_first_by_pages(evaluator: TestClient) -> None:
+    numbers = [start(evaluator, call=str(i))["evaluation"] for i in range(5)]
+    page = evaluator.get(BOARD, params={"limit": 2}).json()
+    assert [each["evaluation"] for each in page["evaluations"]] == numbers[:2:-1]
+    assert "result" not in page["evaluations"][0]
+    rest = evaluator.get(BOARD, params={"before": page["before"], "limit": 3}).json()
+    assert ([each["evaluation"] for each in rest["evaluations"]], rest["before"]) == (numbers[2::-1], None)
+
+
+@pytest.mark.parametrize("query", ["limit=0", "limit=101", "limit=x", "before=-1", "before=99999999999"])
+def test_a_page_that_is_none_is_refused(evaluator: TestClient, query: str) -> None:
+    assert evaluator.get(f"{BOARD}?{query}").json()["code"] == "invalid_input"
+
+
+def test_what_waits_is_stopped_at_once_and_twice_is_once(evaluator: TestClient) -> None:
+    number = start(evaluator)["evaluation"]
+    stopped = evaluator.delete(f"{BOARD}/{number}")
+    assert (stopped.status_code, stopped.json()["state"], stopped.json()["stopped_by"]) == (200, "stopped", "bot")
+    assert evaluator.delete(f"{BOARD}/{number}").json() == stopped.json()
+
+
+@pytest.mark.parametrize("number", ["7", "0", "x", "9" * 20, "-1"])
+def test_an_evaluation_that_is_not_there(evaluator: TestClient, number: str) -> None:
+    start(evaluator)
+    for reply in (evaluator.get(f"{BOARD}/{number}"), evaluator.delete(f"{BOARD}/{number}")):
+        assert (reply.status_code, reply.json()["code"]) == (404, "unknown_evaluation")
+
+
+def test_one_of_another_league_is_not_there(evaluator: TestClient) -> None:
+    number = start(evaluator)["evaluation"]
+    reply = evaluator.get(f"/v1/leagues/memory/evaluations/{number}")
+    assert reply.json()["code"] == "unknown_evaluation"
+
+
+def test_more_than_a_server_takes_are_refused_until_there_is_room(registry: Registry) -> None:
+    with replica(registry.storage, QUICK.model_copy(update={"max_evaluations": 2})) as client:
+        evaluator = with_key(client, registry, "bot", ["evaluate", "read"])
+        first = start(evaluator, call="a")["evaluation"]
+        start(evaluator, call="b")
+        assert start(evaluator, call="c", status=429)["code"] == "too_many_evaluations"
+        evaluator.delete(f"{BOARD}/{first}")
+        start(evaluator, call="c")
+
+
+def test_a_server_without_a_studio_says_so(registry: Registry) -> None:
+    server = Server(Registry.open(registry.storage), QUICK, "replica-1")
+    with TestClient(server.application()) as client:
+        evaluator = with_key(client, registry, "bot", ["evaluate", "read"])
+        error = start(evaluator, status=503)
+        assert error["code"] == "no_studio"
+        assert evaluator.get(BOARD).json()["evaluations"] == []
+
+
+def test_how_many_wait_is_a_metric(evaluator: TestClient) -> None:
+    start(evaluator)
+    assert 'league_evaluations{league="board",replica="",state="queued"} 1.0' in evaluator.get("/metrics").text
