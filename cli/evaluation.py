@@ -60,6 +60,8 @@ def evaluate(
         say(f"\nAs {side}:")
         _show_standings(standings)
     _show_payoff(report)
+    for ref, lost in report.forfeits.items():
+        errors.print(f"{ref} forfeited {lost} games: it had no legal action to give", markup=False, soft_wrap=True)
 
 
 def nightly(

@@ -18,6 +18,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from evaluation.contestants import baselines, pinned
+from evaluation.forfeits import forfeits
 from evaluation.gate import distinct_games
 from evaluation.payoff import tabulate
 from evaluation.player import player
@@ -54,7 +55,7 @@ def run(
     workers: Ray tasks at once; 0 plays in this process. Without a Ray in this process a local one is started, and left
         running: `cluster` is its owner.
     enough: ends the schedule before its length; asked after each chunk, and before the first.
-    Raises EnvironmentMismatch, IllegalAction, GameHung, whatever loading a contestant raises, and WorkerLost.
+    Raises EnvironmentMismatch, IllegalMask, GameHung, whatever loading a contestant raises, and WorkerLost.
     """
     ledger = Ledger(registry)
     schedule = ledger.open(schedule)
@@ -114,6 +115,7 @@ def evaluate(
         payoff=tabulate([standing.ref for standing in table], schedule.sides, matches),
         scoring=schedule.scoring,
         by_side=by_side(schedule.sides, matches) if rated_by_side else {},
+        forfeits={ref: lost for ref in contestants if (lost := forfeits(matches, ref))},
     )
 
 
@@ -190,7 +192,7 @@ def _in_ray(
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
 def _play_chunk(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
     schedule, storage, config = job
-    return player(storage, config).play(schedule, chunk)
+    return player(storage, config).play(schedule, chunk, expendable=True)
 
 
 def _result(ref: ray.ObjectRef) -> list[Match]:

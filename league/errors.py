@@ -241,7 +241,7 @@ class ArtifactCorrupt(LeagueError):
 
 
 class GameHung(LeagueError):
-    """A game of a match that has not ended after `play.max_moves` actions."""
+    """A game of a match that has not ended after `play.max_moves` steps, or `play.game_seconds` of its environment."""
 
     code = "game_hung"
 
