@@ -19,7 +19,7 @@ from evaluation.deadline import Deadline, Expired, watched
 from evaluation.match import GamePlan, plan
 from evaluation.running import Running, State, contestant_returns, recall
 from league.environments.stepping import Batch, BatchedEnvironment, Episode, Turn
-from league.errors import EnvironmentMismatch, GameHung
+from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError
 from league.interface import Interface
 from league.policies.policy import Policy
 from league.policies.scripted import script
@@ -53,9 +53,9 @@ def play(
     roster: everybody that `schedule.contestants_at` names at those positions. Checkpoints play greedily.
     max_moves: steps of the environment; in one where several agents act at once their actions are one step.
     Raises GameHung, naming the contestants, after `max_moves` steps of one game or when its environment has worked on
-    it for longer than the deadline (and is then to be thrown away: it may have been interrupted anywhere); IllegalMask
-    if the environment allows an agent no action; and EnvironmentMismatch if openings of `schedule.opening_plies` steps
-    always end the game.
+    it for longer than the deadline; GameCrashed if its environment raises (both leave an environment that is not to be
+    used again); IllegalMask if it allows an agent no action; and EnvironmentMismatch if openings of
+    `schedule.opening_plies` steps always end the game.
     """
     positions = list(positions)
     table = _Table(schedule, positions, environment, interface, roster, max_moves, deadline.seconds)
@@ -64,6 +64,10 @@ def play(
             table.run()
     except Expired as expired:
         raise expired.error from None
+    except Exception as error:
+        if isinstance(error, LeagueError) or environment.busy is None:
+            raise
+        raise table.crashed(environment.busy, error) from error
     return [schedule.match(position, table.block(position)) for position in positions]
 
 
@@ -210,13 +214,17 @@ class _Table:
             self._running[copy] = None
         return copies
 
-    def _hung(self, copy: int) -> GameHung:
-        game = self._coming[copy]
-        assert game is not None, "an idle copy is not at work"
-        return GameHung(f"{self._words(game)} has not ended after {self._max_seconds:g} s of its environment's work")
+    def crashed(self, copy: int, error: Exception) -> GameCrashed:
+        """What is told of an environment that raised."""
+        return GameCrashed(f"{self._words(copy)} cannot go on: its environment raised {type(error).__name__}: {error}")
 
-    def _words(self, game: Running) -> str:
-        """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)`"""
+    def _hung(self, copy: int) -> GameHung:
+        return GameHung(f"{self._words(copy)} has not ended after {self._max_seconds:g} s of its environment's work")
+
+    def _words(self, copy: int) -> str:
+        """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)`, which is the one that a copy has begun last."""
+        game = self._coming[copy]
+        assert game is not None, "an idle copy plays no game"
         players = " and ".join(game.plan.contestants)
         return f"a game of {players} (game {game.plan.index} of match {self._match_id(game.plan.position)})"
 
@@ -227,7 +235,7 @@ class _Table:
             if game.end_step(self._plies):
                 self._environment.assign(copy, self._groups(game))
             elif game.steps > self._max_moves:
-                raise GameHung(f"{self._words(game)} has not ended after {self._max_moves} moves")
+                raise GameHung(f"{self._words(copy)} has not ended after {self._max_moves} moves")
             if self._environment.seconds(copy) > self._max_seconds:
                 raise self._hung(copy)
 

@@ -55,7 +55,7 @@ def run(
     workers: Ray tasks at once; 0 plays in this process. Without a Ray in this process a local one is started, and left
         running: `cluster` is its owner.
     enough: ends the schedule before its length; asked after each chunk, and before the first.
-    Raises EnvironmentMismatch, IllegalMask, GameHung, whatever loading a contestant raises, and WorkerLost.
+    Raises what `Player.play` does, and WorkerLost.
     """
     ledger = Ledger(registry)
     schedule = ledger.open(schedule)
@@ -186,7 +186,8 @@ def _in_ray(
             due += 1
             continue
         for ref in ray.wait(list(flying))[0]:
-            done[flying.pop(ref)] = _result(ref)
+            index = flying.pop(ref)
+            done[index] = _result(ref, schedule, chunks[index])
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
@@ -195,7 +196,7 @@ def _play_chunk(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]
     return player(storage, config).play(schedule, chunk, expendable=True)
 
 
-def _result(ref: ray.ObjectRef) -> list[Match]:
+def _result(ref: ray.ObjectRef, schedule: Schedule, chunk: range) -> list[Match]:
     try:
         matches: list[Match] = ray.get(ref)
     except RayTaskError as error:
@@ -204,5 +205,9 @@ def _result(ref: ray.ObjectRef) -> list[Match]:
             raise error.cause from None
         raise
     except RayError as error:
-        raise WorkerLost(f"workers died {RETRIES + 1} times over one chunk of matches: {error}") from error
+        players = " and ".join(dict.fromkeys(ref for position in chunk for ref in schedule.contestants_at(position)))
+        raise WorkerLost(
+            f"workers died {RETRIES + 1} times over matches {chunk.start} to {chunk.stop - 1} of {schedule.id}, of"
+            f" {players}; their logs say where they were: {error}"
+        ) from error
     return matches

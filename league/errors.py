@@ -33,6 +33,7 @@ LeagueError
 ├── DeadlineExceeded          a request that was not answered in its time
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
+├── GameCrashed               a game whose environment raised
 ├── WorkerLost                worker processes that die again and again
 ├── VerdictRefuted            a verdict whose record is not what its games say
 ├── ParityError               an exported graph that acts otherwise than the trained module
@@ -244,6 +245,12 @@ class GameHung(LeagueError):
     """A game of a match that has not ended after `play.max_moves` steps, or `play.game_seconds` of its environment."""
 
     code = "game_hung"
+
+
+class GameCrashed(LeagueError):
+    """A game of a match whose environment raised, in a reset or at a legal action."""
+
+    code = "game_crashed"
 
 
 class VerdictRefuted(LeagueError):

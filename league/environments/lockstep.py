@@ -70,6 +70,7 @@ class Lockstep:
     def start(self, next_episode: NextEpisode) -> Turn:
         self._next_episode = next_episode
         self._abandoned.clear()
+        self._busy = None
         turn = Turn()
         rows: Rows = {}
         for copy in range(self.copies):
@@ -131,11 +132,10 @@ class Lockstep:
     def _timed(self, copy: int, call: Callable[[Given], list[Report]], given: Given) -> list[Report]:
         self._since = perf_counter()
         self._busy = copy
-        try:
-            return call(given)
-        finally:
-            self._busy = None
-            self._seconds[copy] += perf_counter() - self._since
+        reports = call(given)
+        self._busy = None
+        self._seconds[copy] += perf_counter() - self._since
+        return reports
 
     def _restart(self, copy: int, turn: Turn, rows: Rows) -> None:
         episode = self._next_episode(copy)
@@ -198,6 +198,7 @@ class Lockstep:
             type(error).__name__,
             error,
         )
+        self._busy = None
         with contextlib.suppress(Exception):
             self._copies[copy].close()
         self._copies[copy] = copy_of(self._make(), self._splits)

@@ -119,7 +119,8 @@ class BatchedEnvironment(Protocol):
 
     @property
     def busy(self) -> int | None:
-        """The copy whose environment is at work at this moment: for who looks from a signal handler."""
+        """The copy whose environment is at work at this moment, for who looks from a signal handler; or whose
+        environment raised what came out of the last call."""
         ...
 
     def seconds(self, copy: int) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.forfeits import forfeits
+from evaluation.forfeits import by_rule, forfeits
 from evaluation.paired import paired_difference
 from evaluation.play import Roster, play
 from evaluation.replay import replay
@@ -334,7 +334,8 @@ def test_compared_by_side_a_forfeit_loses_the_block(kind: Kind, first: int, seco
     for match in matches:
         admit(match, schedule)
         assert (match.score(0), match.score(1)) == (expected, 1 - expected)
-        assert all(score in (None, 0.0, 1.0, 0.5) for game in match.games for score in game.scores)
+        assert by_rule(match, "kind@a") == 2 * expected - 1
+        assert by_rule(match, "kind@b") == 1 - 2 * expected
         for index, game in enumerate(match.games):
             assert all(forfeit.reason == "not_finite" for forfeit in game.forfeits)
             last = list(replay(environment, kind.config, kind.interface, match, index))[-1]
@@ -350,6 +351,7 @@ def test_what_was_collected_until_then_is_no_return() -> None:
     table = {standing.ref: standing for standing in ranked(match.result() for match in matches)}
     assert (table["kind@a"].mean_return, table["kind@a"].score, table["kind@a"].games) == (None, 0.0, len(matches))
     _, whole = meet(ALONE, NEVER, NEVER)
+    assert {by_rule(match, "kind@a") for match in whole} == {None}
     mixed = ranked(match.result() for match in [*matches, *whole])
     assert mixed[0].mean_return == pytest.approx(np.mean([match.mean_return(0) for match in whole]))
 
