@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from filelock import FileLock, Timeout
 
 from evaluation import tournament, verdicts
-from evaluation.contestants import ANCHOR, baselines
+from evaluation.contestants import ANCHOR, baselines, eligible
 from evaluation.report import Listener, NightReport, VerdictReport
 from evaluation.schedule import gauntlet
 from evaluation.standings import standings
@@ -117,7 +117,7 @@ class _Night:
             for schedule in ledger.schedules(self._league.slug)
             if schedule.kind == "gauntlet" and schedule.environment_digest == digest
         }
-        versions = self._registry.versions(self._league.slug)
+        versions = eligible(self._registry, self._league.slug)
         for previous, version in zip([None, *versions], versions, strict=False):
             schedule = begun.get(version.ref) or self._gauntlet(version, previous)
             if len(ledger.positions(schedule.id)) < schedule.length:
@@ -140,9 +140,12 @@ class _Night:
 
     def _gauntlet(self, version: VersionRow, previous: VersionRow | None) -> Schedule:
         """Against the baselines, the champion, and the version before it."""
-        rivals = [*baselines(self._league.interface), self.champion(), previous.ref if previous else None]
-        opponents = list(dict.fromkeys(ref for ref in rivals if ref is not None and ref != version.ref))
-        return gauntlet(self._league.config, self._league.interface, [version.ref], opponents, RATING_BLOCKS)
+        versions = {each.ref for each in eligible(self._registry, self._league.slug)} - {version.ref}
+        rivals = (self.champion(), previous.ref if previous else None)
+        opponents = [*baselines(self._league.interface), *(ref for ref in rivals if ref and ref in versions)]
+        return gauntlet(
+            self._league.config, self._league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS
+        )
 
     @contextmanager
     def _faults_of(self, who: str) -> Iterator[None]:

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from functools import lru_cache
 
+from evaluation.contestants import check_eligible
 from evaluation.deadline import Deadline
 from evaluation.play import Roster, play
 from league.config import LeagueConfig
@@ -56,8 +57,12 @@ class Player:
         return matches
 
     def contestant(self, ref: str) -> dict[str, tuple[str, Policy]]:
-        """agent → (policy id, policy) of a pinned reference, loaded and verified once."""
+        """agent → (policy id, policy) of a pinned reference, loaded and verified once.
+
+        Raises what loading does, and EnvironmentMismatch for a version that was trained in another environment.
+        """
         if ref not in self._contestants:
+            check_eligible(ref, self._registry, self.config)
             self._contestants[ref] = contestant(ref, self._registry, self.interface)
         self._contestants.move_to_end(ref)
         if len(self._contestants) > MOST_CONTESTANTS:

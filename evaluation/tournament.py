@@ -17,7 +17,7 @@ from itertools import islice, pairwise
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from evaluation.contestants import baselines, pinned
+from evaluation.contestants import baselines, check_eligible, eligible, pinned
 from evaluation.forfeits import forfeits
 from evaluation.gate import distinct_games
 from evaluation.payoff import tabulate
@@ -92,12 +92,15 @@ def evaluate(
 ) -> EvaluationReport:
     """A round robin of `refs` and the scripted baselines, every pair meeting in `blocks` matches.
 
-    refs: versions, aliases (pinned to what they name now) and scripts; by default every version of the league.
+    refs: versions, aliases (pinned to what they name now) and scripts; by default every version that was trained in the
+        league's present environment.
     seed: other games for another seed; the same arguments again find their matches in the ledger and play nothing.
     Raises UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and what `run` raises.
     """
     row = registry.league(league)
-    asked = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in registry.versions(league)]
+    asked = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
+    for ref in asked:
+        check_eligible(ref, registry, row.config)
     contestants = list(dict.fromkeys([*asked, *baselines(row.interface)]))
     schedule = round_robin(row.config, row.interface, contestants, blocks, seed)
     with cluster():
