@@ -19,6 +19,7 @@ ORDER = (
     "fuzz",
     "fresh_machine",
     "strength",
+    "evaluation",
 )
 
 

@@ -47,8 +47,8 @@ def eligible(registry: Registry, league: str) -> list[VersionRow]:
 
 
 def check_eligible(ref: str, registry: Registry, config: LeagueConfig) -> None:
-    """Raise EnvironmentMismatch if `ref` is a version of another league, or, saying what differs, one that was trained in
-    another environment.
+    """Raise EnvironmentMismatch if `ref` is a version of another league or, saying what differs, one that was trained
+    in another environment.
 
     Raises UnknownVersion, UnknownAlias and UnknownLeague, too.
     """
