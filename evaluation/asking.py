@@ -88,7 +88,7 @@ def _one_by_one(
     policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
 ) -> Answer:
     rows = len(batch.copies)
-    actions = np.zeros((rows, *space.shape), space.dtype)
+    given: dict[int, NDArray] = {}
     states: list[State] = [{} for _ in range(rows)]
     faults: dict[int, Fault] = {}
     for row in range(rows):
@@ -103,8 +103,12 @@ def _one_by_one(
         except Exception as error:
             faults[row] = Fault("crashed", f"{type(error).__name__}: {error}")
         else:
-            actions[row] = answer.actions[0]
+            given[row] = answer.actions[0]
             states[row] = answer.states[0] if answer.states else {}
+    # In the type that the policy gives them in, as in a whole batch: that is how they are recorded.
+    actions = np.zeros((rows, *space.shape), np.result_type(*given.values()) if given else space.dtype)
+    for row, action in given.items():
+        actions[row] = action
     return Answer(actions, states if any(states) else None, faults)
 
 

@@ -59,10 +59,12 @@ def watched(look: Callable[[], None], deadline: Deadline) -> Iterator[None]:
         yield
         return
     every = min(max(deadline.seconds / 4, MOST_OFTEN), LEAST_OFTEN)
+    is_over = False
 
     def tick(signum: int, frame: FrameType | None) -> None:  # noqa: ARG001  signal's own form
-        _outlive(deadline)
-        look()
+        if not is_over:
+            _outlive(deadline)
+            look()
 
     began = time.monotonic()
     handler = signal.signal(signal.SIGALRM, tick)
@@ -71,6 +73,7 @@ def watched(look: Callable[[], None], deadline: Deadline) -> Iterator[None]:
     try:
         yield
     finally:
+        is_over = True
         signal.setitimer(signal.ITIMER_REAL, 0)
         if deadline.expendable:
             faulthandler.cancel_dump_traceback_later()

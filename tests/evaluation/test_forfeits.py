@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from evaluation.forfeits import by_rule, forfeits
 from evaluation.paired import paired_difference
@@ -314,6 +316,30 @@ def test_who_both_forfeit_at_once_draw() -> None:
             assert game.scores == (0.5, 0.5)
 
 
+@dataclass
+class Steady:
+    """Always acts alike, in another type of number than the space's."""
+
+    def act(self, observations: Arrays, *, state: Any = None, explore: bool = False, rng: Any = None) -> Actions:
+        return Actions(np.full((len(observations["observation"]), 5), 0.1, np.float64))
+
+
+def test_actions_are_recorded_in_the_policys_own_numbers_whoever_fails_beside_them() -> None:
+    """Where a batch fails, rows are asked for alone: which games that happens to must not show."""
+    schedule = FREE.schedule(["kind@a", "kind@b"], plies=0, blocks=6)
+    cast = {"kind@a": Flawed(Steady(), lambda seen: bool(seen[2] > 0.8), raises), "kind@b": Steady()}
+    everybody = {ref: dict.fromkeys(FREE.interface.agents, ("shared", policy)) for ref, policy in cast.items()}
+
+    def meeting(copies: int) -> list[Match]:
+        environment = stepping(FREE.config.environment, copies)
+        return play(schedule, range(schedule.length), environment, FREE.interface, everybody)
+
+    alone = meeting(1)
+    assert 0 < forfeits(alone, "kind@a") < 12
+    assert {number for match in alone for game in match.games for action in game.actions for number in action} == {0.1}
+    assert meeting(4) == meeting(12) == alone
+
+
 ALONE = KINDS["continuous team"]
 ROLES = Kind(
     "mpe2.simple_adversary_v3",
@@ -360,38 +386,26 @@ def test_what_was_collected_until_then_is_no_return() -> None:
 
 
 def reckless(crashes: bool) -> bytes:
-    """A graph that takes the square which it likes best, whether it is free or not; or that has no answer then."""
-    import onnx
-    from onnx import helper, numpy_helper
-
+    """A graph that takes the centre whether it is free or not; or, if it `crashes`, has no answer where it is taken:
+    it then looks a number up in a table of one at place 1.
+    """
     model = onnx.load_model_from_string(examples.graph(order=examples.CENTRE_FIRST))
-    for node in model.graph.node:
-        if node.op_type == "Where":
-            del node.input[:]
-            node.op_type = "Identity"
-            node.input.append("wanted")
+    (masking,) = (node for node in model.graph.node if node.op_type == "Where")
+    masking.CopyFrom(helper.make_node("Identity", ["wanted"], masking.output))
     if crashes:
-        # Legal is 1, and there is a number 1 to be gathered; where the best square is taken there is no number 0 - 9.
-        model.graph.initializer.append(numpy_helper.from_array(np.zeros(2, np.float32), "table"))
-        model.graph.initializer.append(numpy_helper.from_array(np.array([[4]], np.int64), "centre"))
-        model.graph.initializer.append(numpy_helper.from_array(np.array(-9, np.int64), "beyond"))
-        action = model.graph.node[-1]
-        assert action.op_type == "ArgMax"
-        action.output[0] = "chosen"
+        (choosing,) = (node for node in model.graph.node if node.op_type == "ArgMax")
+        choosing.output[0] = "centre"
+        constants = {"four": np.array(4), "one": np.array(1), "table": np.array([0])}
+        model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
         model.graph.node.extend(
             [
-                helper.make_node("Cast", ["action_mask"], ["free"], to=7),
-                helper.make_node("Gather", ["free", "centre"], ["centre_free"], axis=1),
-                helper.make_node("Sub", ["one_more", "centre_free"], ["index"]),
-                helper.make_node("Mul", ["index", "beyond"], ["place"]),
+                helper.make_node("Gather", ["action_mask", "four"], ["is_free"], axis=1),
+                helper.make_node("Cast", ["is_free"], ["free"], to=TensorProto.INT64),
+                helper.make_node("Sub", ["one", "free"], ["place"]),
                 helper.make_node("Gather", ["table", "place"], ["nothing"]),
-                helper.make_node("Cast", ["nothing"], ["zeros"], to=7),
-                helper.make_node("Squeeze", ["zeros", "axes"], ["flat_zeros"]),
-                helper.make_node("Add", ["chosen", "flat_zeros"], ["action"]),
+                helper.make_node("Add", ["centre", "nothing"], ["action"]),
             ]
         )
-        model.graph.initializer.append(numpy_helper.from_array(np.array(1, np.int64), "one_more"))
-        model.graph.initializer.append(numpy_helper.from_array(np.array([1, 2], np.int64), "axes"))
     return bytes(model.SerializeToString())
 
 
@@ -408,6 +422,8 @@ def test_a_tournament_goes_on_beside_a_version_that_cannot_play(tmp_path: Path, 
     assert report.forfeits == {"tictactoe@2": forfeits(matches, "tictactoe@2")}
     assert standings(registry, examples.LEAGUE)[-1].ref == "tictactoe@2"
     match, index = next((m, i) for m in matches for i, game in enumerate(m.games) if game.forfeits)
+    told = ranked(match.result() for match in matches)
+    assert {standing.ref: standing.mean_return for standing in told}["tictactoe@1"] is not None
     note = recorded(match.id, index, registry).note
     assert note is not None
     assert note.startswith("forfeited by tictactoe@2 as player_")
