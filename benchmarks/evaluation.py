@@ -1,10 +1,11 @@
 """How fast matches are played, and whether more workers help. Connect four, networks of configs/connect_four.yaml.
 
-Parts: throughput (on one core, everything from the schedule to the Match records, ONNX policies on both sides; against
-the stock `env()` with random legal moves and no network at all, and against the stock `env()` whose moves come from the
-same networks as RLModules, `forward_inference` one move at a time), workers (a tournament, ledger included, by two Ray
-workers against one). What is compared takes turns within a round; a rate is the median over the rounds. Networks are
-untrained: what they play is no better than chance, and takes them as long.
+Parts: throughput (on one core, in seconds of the processor, everything from the schedule to the Match records, ONNX
+policies on both sides; against the stock `env()` with random legal moves and no network at all, and against the stock
+`env()` whose moves come from the same networks as RLModules, `forward_inference` one move at a time), workers (a
+tournament, ledger included, by two Ray workers against one, by the clock). What is compared takes turns within a round;
+a rate is the median over the rounds. Networks are untrained: what they play is no better than chance, and takes them as
+long.
 """
 
 import argparse
@@ -55,7 +56,7 @@ def throughput(quick: bool) -> bool:
         )
         registry.close()
     print(f"ours {rates['ours']:,.0f}, the stock environment with random legal moves {rates['stock']:,.0f},")
-    print(f"with RLModule.forward_inference for each move {rates['forward']:,.0f} moves/s")
+    print(f"with RLModule.forward_inference for each move {rates['forward']:,.0f} moves/s of one core")
     return all(
         [
             _told("ours against the stock environment alone", rates["ours"] / rates["stock"], 0.75),
@@ -142,9 +143,9 @@ def _by_network(modules: Sequence[ActorCritic]) -> Callable[[str, Any], int]:
 
 
 def _per_second(play: Callable[[], int], seconds: float) -> float:
-    """Moves per second of what `play` plays again and again."""
-    moves, began = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
+    """Moves per second of the processor, of what `play` plays again and again."""
+    moves, began = 0, time.process_time()
+    while (elapsed := time.process_time() - began) < seconds:
         moves += play()
     return moves / elapsed
 
