@@ -20,6 +20,7 @@ ORDER = (
     "fresh_machine",
     "strength",
     "calibration",
+    "evaluation",
 )
 
 

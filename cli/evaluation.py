@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli.output import elo, emit, say, table
+from cli.output import elo, emit, errors, say, table
 from cli.watching import difference, watched
 from evaluation.report import EvaluationReport, Standing
 from league.refs import check_slug
@@ -57,6 +57,8 @@ def evaluate(
         say(f"\nAs {side}:")
         show_standings(standings)
     _show_payoff(report)
+    for ref, lost in report.forfeits.items():
+        errors.print(f"{ref} forfeited {lost} games: it had no legal action to give", markup=False, soft_wrap=True)
 
 
 def show_standings(standings: tuple[Standing, ...]) -> None:

@@ -81,4 +81,5 @@ def _ending(show: "Show", done: "Film") -> str:
     else:
         own = {ref: [agent for agent in show.cast if show.cast[agent] == ref] for ref in show.cast.values()}
         got = [f"{ref} {sum(map(done.returns.__getitem__, a)) / len(a):+.3g} on average" for ref, a in own.items()]
-    return f"{done.steps} steps; returns: {', '.join(got)}"
+    note = f"; {show.note}" if show.note and done.is_whole else ""
+    return f"{done.steps} steps; returns: {', '.join(got)}{note}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from league.config import AnchorConfig
 from league.errors import UnknownAlias
-from league.policies.pinning import pinned
+from league.policies.pinning import check_eligible, pinned
 from league.refs import of_league
 from league.registry.registry import Registry
 from league.registry.rows import LeagueRow
@@ -28,6 +28,7 @@ def anchors_of(registry: Registry, league: LeagueRow, candidate: int, champion: 
             ref = pinned(of_league(anchor.ref, league.slug), league.slug, registry)
         except UnknownAlias:
             continue
+        check_eligible(ref, registry, league.config)
         if ref not in (f"{league.slug}@{candidate}", champion):
             found.setdefault(ref, anchor.model_copy(update={"ref": ref}))
     return list(found.values())

@@ -37,7 +37,8 @@ class Moment:
     """One step of a game, and what has come of it; the first moment is the beginning, without moves.
 
     moves: of all that acted in it, in the environment's order of agents.
-    endings: of all that it led out of the game. returns: agent → return so far. is_over: whether nobody is left to act.
+    endings: of all that it led out of the game. returns: agent → return so far. is_over: whether nobody is left to act,
+    or the game was broken off here. acting: who acts next.
     """
 
     step: int
@@ -45,6 +46,7 @@ class Moment:
     endings: tuple[Ending, ...]
     returns: dict[str, float]
     is_over: bool
+    acting: tuple[str, ...] = ()
 
 
 def exhibit(environment: BatchedEnvironment, players: Mapping[str, Policy], seed: int) -> Iterator[Moment]:
@@ -57,7 +59,7 @@ def exhibit(environment: BatchedEnvironment, players: Mapping[str, Policy], seed
     cast = {agent: _Actor(agent, players[agent], seed) for agent in agents}
     returns = dict.fromkeys(agents, 0.0)
     turn, step = environment.start(lambda _: next(episodes, None)), 0
-    yield Moment(step, (), tuple(turn.endings), dict(returns), not turn.batches)
+    yield Moment(step, (), tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
     while turn.batches:
         batches = sorted(turn.batches.items(), key=_place)
         answers = {agent: cast[agent].act(batch) for agent, batch in batches}
@@ -68,7 +70,7 @@ def exhibit(environment: BatchedEnvironment, players: Mapping[str, Policy], seed
         for ending in turn.endings:
             returns[agents[ending.agent]] += ending.reward
         moves = tuple(move for _, move in answers.values())
-        yield Moment(step, moves, tuple(turn.endings), dict(returns), not turn.batches)
+        yield Moment(step, moves, tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
 
 
 def first_observation(config: LeagueConfig, interface: Interface, policy: str | None, seed: int = 0) -> Any:

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.forfeits import by_rule
 from evaluation.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config import GateConfig
 from league.errors import BoundExceeded
@@ -98,7 +99,7 @@ def decide(
 
 def judge(settings: GateConfig, matches: Sequence[Match], challenger: str) -> Decision:
     """Decide on matches in schedule order, and count the distinct games among those that count."""
-    differences = _differences(matches, challenger) if settings.model == "returns" else ()
+    differences = _differences(settings, matches, challenger) if settings.model == "returns" else ()
     decision = decide(settings, *_block_scores(matches, challenger), differences)
     return replace(decision, distinct_games=distinct_games(matches[: decision.blocks]))
 
@@ -166,7 +167,7 @@ class Watch:
         return gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
 
     def _wealth(self, new: Sequence[Match]) -> NDArray[np.float64]:
-        self._differences += _differences(new, self._challenger)
+        self._differences += _differences(self._settings, new, self._challenger)
         return _wealth(self._settings, self._differences)
 
 
@@ -236,12 +237,20 @@ def _block_scores(matches: Sequence[Match], challenger: str) -> tuple[list[float
     return scores, matches[0].result().games if matches else GAMES_PER_BLOCK
 
 
-def _differences(matches: Sequence[Match], challenger: str) -> list[float]:
-    """By how much the challenger's mean return exceeds the other's in each block."""
-    gaps = []
+def _differences(settings: GateConfig, matches: Sequence[Match], challenger: str) -> list[float]:
+    """By how much the challenger's mean return exceeds the other's in each block; by all that it can, either way, where
+    one of them forfeited a game.
+    """
+    bound, gaps = settings.return_bound or 0.0, list[float]()
     for match in matches:
+        if (ruled := by_rule(match, challenger)) is not None:
+            gaps.append(ruled * bound)
+            continue
         own = match.contestants.index(challenger)
-        gaps.append(match.mean_return(own) - match.mean_return(1 - own))
+        mine, other = match.mean_return(own), match.mean_return(1 - own)
+        assert mine is not None
+        assert other is not None
+        gaps.append(mine - other)
     return gaps
 
 

@@ -23,11 +23,13 @@ from league.errors import (
     ArtifactCorrupt,
     BoundExceeded,
     EnvironmentMismatch,
+    GameCrashed,
     GameHung,
-    IllegalAction,
     NotFound,
     ObservationError,
+    WorkerLost,
 )
+from league.policies.pinning import eligible
 from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.registry.rows import LeagueRow, NightRow, VerdictRow, VersionRow
@@ -41,10 +43,11 @@ CONTESTANT_FAULTS = (
     ArtifactCorrupt,
     BoundExceeded,
     EnvironmentMismatch,
+    GameCrashed,
     GameHung,
-    IllegalAction,
     NotFound,
     ObservationError,
+    WorkerLost,
 )
 """What is wrong with one version, and no reason to leave the others unjudged."""
 
@@ -174,7 +177,7 @@ class _Night:
             for schedule in ledger.schedules(self._league.slug)
             if schedule.kind == "gauntlet" and schedule.environment_digest == digest
         }
-        versions = self._registry.versions(self._league.slug)
+        versions = eligible(self._registry, self._league.slug)
         for previous, version in zip([None, *versions], versions, strict=False):
             schedule = begun.get(version.ref) or self._gauntlet(version, previous)
             if len(ledger.positions(schedule.id)) < schedule.length:
@@ -183,7 +186,7 @@ class _Night:
 
     def _unjudged(self) -> list[VersionRow]:
         """Oldest first."""
-        return [each for each in self._registry.versions(self._league.slug) if not self._is_judged(each)]
+        return [each for each in eligible(self._registry, self._league.slug) if not self._is_judged(each)]
 
     def _is_judged(self, version: VersionRow) -> bool:
         """Whether it is champion, or has a verdict that stands: neither void nor refused its promotion."""
@@ -201,9 +204,12 @@ class _Night:
 
     def _gauntlet(self, version: VersionRow, previous: VersionRow | None) -> Schedule:
         """Against the baselines, the champion, and the version before it."""
-        rivals = [*baselines(self._league.interface), self.champion(), previous.ref if previous else None]
-        opponents = list(dict.fromkeys(ref for ref in rivals if ref is not None and ref != version.ref))
-        return gauntlet(self._league.config, self._league.interface, [version.ref], opponents, RATING_BLOCKS)
+        versions = {each.ref for each in eligible(self._registry, self._league.slug)} - {version.ref}
+        rivals = (self.champion(), previous.ref if previous else None)
+        opponents = [*baselines(self._league.interface), *(ref for ref in rivals if ref and ref in versions)]
+        return gauntlet(
+            self._league.config, self._league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS
+        )
 
     @contextmanager
     def _faults_of(self, who: str) -> Iterator[None]:

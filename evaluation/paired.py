@@ -19,12 +19,15 @@ from league.results.records import Match
 def paired_difference(matches: Iterable[Match], contestant: str, confidence: float = 0.95) -> Difference | None:
     """Mean return of `contestant` minus that of its opponent, over `matches` between the two; None without any.
 
+    Blocks with a forfeited game are left out: what was collected until then can be more than a whole game brings.
     After a sequential stop the interval is conditional on having stopped, and tends to be optimistic.
     """
     gaps = []
     for match in matches:
         own = match.contestants.index(contestant)
-        gaps.append(match.mean_return(own) - match.mean_return(1 - own))
+        mine, other = match.mean_return(own), match.mean_return(1 - own)
+        if mine is not None and other is not None:
+            gaps.append(mine - other)
     return student(gaps, confidence) if gaps else None
 
 

@@ -2,27 +2,32 @@
 
 A game depends on its plan alone. Openings and scripts draw from generators of the game's own, a recurrent policy's
 state goes with the agent that it plays, and a policy answers a row whatever the batch around it: so the number of
-copies and the company of other games change nothing.
+copies and the company of other games change nothing. That holds for forfeits, too: who has no legal action to give
+loses that game there and then, and the others go on.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.asking import Answer, Fault, ask
+from evaluation.deadline import Deadline, Expired, watched
 from evaluation.match import GamePlan, plan
-from evaluation.running import Running, contestant_returns, recall
-from league.environments.legality import check_actions
+from evaluation.running import Running, State, contestant_returns, recall
 from league.environments.stepping import Batch, BatchedEnvironment, Episode, Turn
-from league.errors import EnvironmentMismatch, GameHung, IllegalAction
+from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError
 from league.interface import Interface
 from league.policies.policy import Policy
 from league.policies.scripted import script
-from league.results.records import Game, Match, Schedule
+from league.results.records import Forfeit, Game, Match, Reason, Schedule
 from league.results.scoring import scores
+from league.spaces import DictSpace, Leaf, Space
+
+logger = logging.getLogger(__name__)
 
 Roster = Mapping[str, Mapping[str, tuple[str, Policy]]]
 """reference → agent → (policy id, policy)"""
@@ -41,17 +46,28 @@ def play(
     interface: Interface,
     roster: Roster,
     max_moves: int = 10_000,
+    deadline: Deadline = Deadline(),  # noqa: B008  frozen
 ) -> list[Match]:
     """Play the matches at `positions` of a schedule and return them in that order.
 
     roster: everybody that `schedule.contestants_at` names at those positions. Checkpoints play greedily.
     max_moves: steps of the environment; in one where several agents act at once their actions are one step.
-    Raises IllegalAction naming the contestant, GameHung after `max_moves` steps of one game, and
-    EnvironmentMismatch if openings of `schedule.opening_plies` steps always end the game.
+    Raises GameHung, naming the contestants, after `max_moves` steps of one game or when its environment has worked on
+    it for longer than the deadline; GameCrashed if its environment raises (both leave an environment that is not to be
+    used again); IllegalMask if it allows an agent no action; and EnvironmentMismatch if openings of
+    `schedule.opening_plies` steps always end the game.
     """
     positions = list(positions)
-    table = _Table(schedule, positions, environment, interface, roster, max_moves)
-    table.run()
+    table = _Table(schedule, positions, environment, interface, roster, max_moves, deadline.seconds)
+    try:
+        with watched(table.look, deadline):
+            table.run()
+    except Expired as expired:
+        raise expired.error from None
+    except Exception as error:
+        if isinstance(error, LeagueError) or environment.busy is None:
+            raise
+        raise table.crashed(environment.busy, error) from error
     return [schedule.match(position, table.block(position)) for position in positions]
 
 
@@ -62,11 +78,14 @@ class _Actor:
     ref: str
     policy: Policy
 
-    def generators(self, games: Sequence[Running], agents: Sequence[int]) -> list[np.random.Generator] | None:
-        """One per row for what draws; None for checkpoints, which play greedily."""
+    def answer(self, batch: Batch, space: Leaf, state: State | None, games: Sequence[Running]) -> Answer:
+        """What draws has a generator for each row; checkpoints play greedily. An opening is nobody's to forfeit."""
         if self.ref != OPENING and not self.ref.startswith("script:"):
-            return None
-        return [game.draws(agent) for game, agent in zip(games, agents, strict=True)]
+            return ask(self.policy, batch, space, state, None)
+        generators = [game.draws(agent) for game, agent in zip(games, batch.agents, strict=True)]
+        if self.ref != OPENING:
+            return ask(self.policy, batch, space, state, generators)
+        return Answer(self.policy.act(batch.observations, rng=generators).actions, None)
 
 
 class _Table:
@@ -80,10 +99,13 @@ class _Table:
         interface: Interface,
         roster: Roster,
         max_moves: int,
+        max_seconds: float,
     ) -> None:
-        self._environment, self._interface, self._max_moves = environment, interface, max_moves
+        self._environment, self._max_moves, self._max_seconds = environment, max_moves, max_seconds
         self._plies, self._scoring = schedule.opening_plies, schedule.scoring
+        self._match_id = schedule.match_id
         self._agents = environment.agents
+        self._spaces = [_leaf(interface.agents[agent].action) for agent in environment.agents]
         self._side_of = sides_of(environment.agents, interface)
         self._policy_of = [interface.policies[agent] for agent in environment.agents]
         self._roster = roster
@@ -91,25 +113,36 @@ class _Table:
         self._waiting = (game for position in positions for game in plan(schedule, position))
         self._running: list[Running | None] = [None] * environment.copies
         self._coming: dict[int, Running | None] = {}
+        """What each copy has begun last: in a reset, the game that is about to run there."""
         self._remembering: set[Hashable] = set()
         self._finished: dict[int, dict[int, Game]] = {position: {} for position in positions}
+        self._told: set[tuple[str, Reason]] = set()
 
     def run(self) -> None:
         turn = self._environment.start(self._next_episode)
         self._seat(self._coming)
         while turn.batches:
             actions = {group: self._act(group, batch) for group, batch in turn.batches.items()}
+            forfeited = self._forfeited()
+            if forfeited:
+                self._environment.abandon(forfeited)
+                actions = _without(turn, actions, forfeited)
             self._end_step()
-            try:
-                turn = self._environment.step(actions)
-            except IllegalAction as error:
-                raise self._blame(turn, actions, error) from error
+            turn = self._environment.step(actions)
+            self._seat({copy: self._coming[copy] for copy in forfeited})
             self._settle(turn)
+
+    def look(self) -> None:
+        """Raise Expired if the environment is at work, and has been on this game for too long."""
+        copy = self._environment.busy
+        if copy is not None and self._environment.seconds(copy) > self._max_seconds:
+            raise Expired(self._hung(copy))
 
     def block(self, position: int) -> list[Game]:
         """The games at `position` in their order, scored."""
         games = [game for _, game in sorted(self._finished[position].items())]
-        points = scores([game.returns for game in games], self._scoring)
+        forfeits = [{forfeit.contestant for forfeit in game.forfeits} for game in games]
+        points = scores([game.returns for game in games], self._scoring, forfeits)
         return [replace(game, scores=own) for game, own in zip(games, points, strict=True)]
 
     def _next_episode(self, copy: int) -> Episode | None:
@@ -154,14 +187,46 @@ class _Table:
         state = None
         if group in self._remembering:
             state = recall([game.states.get(agent) for game, agent in zip(games, batch.agents, strict=True)])
-        answer = actor.policy.act(batch.observations, state=state, rng=actor.generators(games, batch.agents))
+        answer = actor.answer(batch, self._spaces[batch.agents[0]], state, games)
         for game, agent, action in zip(games, batch.agents, answer.actions.tolist(), strict=True):
             game.act(agent, action)
-        if answer.state is not None:
+        if answer.states is not None:
             self._remembering.add(group)
-            for row, (game, agent) in enumerate(zip(games, batch.agents, strict=True)):
-                game.states[agent] = {name: array[row] for name, array in answer.state.items()}
+            for game, agent, own in zip(games, batch.agents, answer.states, strict=True):
+                game.states[agent] = own
+        for row, fault in answer.faults.items():
+            games[row].faults[batch.agents[row]] = fault.reason
+            self._tell(actor.ref, fault)
         return answer.actions
+
+    def _tell(self, ref: str, fault: Fault) -> None:
+        """Say once why a contestant forfeits: the record has the reason alone."""
+        if (ref, fault.reason) not in self._told:
+            self._told.add((ref, fault.reason))
+            logger.warning("%s forfeits a game (%s): %s", ref, fault.reason, fault.detail)
+
+    def _forfeited(self) -> list[int]:
+        """The copies whose games are over, since somebody in them has no action; they are recorded here."""
+        copies = [copy for copy, game in enumerate(self._running) if game is not None and game.faults]
+        for copy in copies:
+            game = self._game(copy)
+            self._finished[game.plan.position][game.plan.index] = self._record(game)
+            self._running[copy] = None
+        return copies
+
+    def crashed(self, copy: int, error: Exception) -> GameCrashed:
+        """What is told of an environment that raised."""
+        return GameCrashed(f"{self._words(copy)} cannot go on: its environment raised {type(error).__name__}: {error}")
+
+    def _hung(self, copy: int) -> GameHung:
+        return GameHung(f"{self._words(copy)} has not ended after {self._max_seconds:g} s of its environment's work")
+
+    def _words(self, copy: int) -> str:
+        """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)`, which is the one that a copy has begun last."""
+        game = self._coming[copy]
+        assert game is not None, "an idle copy plays no game"
+        players = " and ".join(game.plan.contestants)
+        return f"a game of {players} (game {game.plan.index} of match {self._match_id(game.plan.position)})"
 
     def _end_step(self) -> None:
         for copy, game in enumerate(self._running):
@@ -170,8 +235,9 @@ class _Table:
             if game.end_step(self._plies):
                 self._environment.assign(copy, self._groups(game))
             elif game.steps > self._max_moves:
-                players = " and ".join(game.plan.contestants)
-                raise GameHung(f"a game of {players} has not ended after {self._max_moves} moves")
+                raise GameHung(f"{self._words(copy)} has not ended after {self._max_moves} moves")
+            if self._environment.seconds(copy) > self._max_seconds:
+                raise self._hung(copy)
 
     def _settle(self, turn: Turn) -> None:
         for ending in turn.endings:
@@ -192,6 +258,10 @@ class _Table:
         return game
 
     def _record(self, game: Running) -> Game:
+        forfeits: dict[int, Forfeit] = {}
+        for agent in sorted(game.faults):
+            contestant = game.plan.sides[self._side_of[agent]]
+            forfeits.setdefault(contestant, Forfeit(contestant, self._agents[agent], game.faults[agent]))
         return Game(
             sides=game.plan.sides,
             seed=game.plan.seed,
@@ -199,23 +269,25 @@ class _Table:
             actions=tuple(game.actions[game.opening :]),
             returns=contestant_returns(game.returns, self._side_of, game.plan.sides),
             scores=(),
+            forfeits=tuple(forfeits.values()),
         )
-
-    def _blame(self, turn: Turn, actions: Mapping[Hashable, NDArray], error: IllegalAction) -> IllegalAction:
-        """The same error with the name of the contestant whose action it was."""
-        for group, batch in turn.batches.items():
-            space = self._interface.agents[self._agents[batch.agents[0]]].action
-            try:
-                check_actions(batch, actions[group], space, self._agents)
-            except IllegalAction:
-                return IllegalAction(f"{self._actors[group].ref}: {error}")
-        return error
 
 
 def sides_of(agents: Sequence[str], interface: Interface) -> list[int]:
     """The side of each agent, by number."""
     side = {agent: i for i, members in enumerate(interface.sides.values()) for agent in members}
     return [side[agent] for agent in agents]
+
+
+def _without(turn: Turn, actions: Mapping[Hashable, NDArray], copies: Sequence[int]) -> dict[Hashable, NDArray]:
+    """The actions of the rows that are not of these copies."""
+    kept = {group: batch.without(copies) for group, batch in turn.batches.items()}
+    return {group: actions[group][rows] for group, rows in kept.items() if rows}
+
+
+def _leaf(space: Space) -> Leaf:
+    assert not isinstance(space, DictSpace), "no policy acts in a dictionary"
+    return space
 
 
 def _actors(interface: Interface, roster: Roster, opening: bool) -> dict[Hashable, _Actor]:

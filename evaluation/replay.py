@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from league.spaces import DictSpace, Space
 def replay(
     environment: BatchedEnvironment, config: LeagueConfig, interface: Interface, match: Match, index: int
 ) -> Iterator[Moment]:
-    """Play game `index` of a match again, on copy 0, and yield it step by step.
+    """Play game `index` of a match again, on copy 0, and yield it step by step; one that was forfeited up to there.
 
     Raises EnvironmentMismatch if the environment is not the one of the record, or does not go the way of the record.
     """
@@ -33,7 +34,13 @@ def replay(
     moment = None
     try:
         for moment in exhibit(environment, players, game.seed):
+            is_forfeited = bool(game.forfeits) and not record.left
+            if is_forfeited:
+                _check_forfeits(match, index, moment, interface)
+                moment = replace(moment, is_over=True)
             yield moment
+            if is_forfeited:
+                break
     except IllegalAction as error:
         raise EnvironmentMismatch(f"match {match.id} cannot be replayed: {error}") from error
     assert moment is not None, "a game has a beginning"
@@ -44,6 +51,20 @@ def replay(
         raise EnvironmentMismatch(
             f"match {match.id} cannot be replayed: game {index} returned {replayed}, {game.returns} in the record"
         )
+
+
+def _check_forfeits(match: Match, index: int, moment: Moment, interface: Interface) -> None:
+    """Raise EnvironmentMismatch unless those who forfeited the game had to act at this moment of it."""
+    game = match.games[index]
+    side_of = {agent: side for side, agents in enumerate(interface.sides.values()) for agent in agents}
+    for forfeit in game.forfeits:
+        player = game.sides[side_of[forfeit.agent]] if forfeit.agent in side_of else None
+        if forfeit.agent not in moment.acting or player != forfeit.contestant:
+            who = match.contestants[forfeit.contestant]
+            raise EnvironmentMismatch(
+                f"match {match.id} cannot be replayed: {who} is recorded to have forfeited game {index} as"
+                f" {forfeit.agent}, who had not to act for it there"
+            )
 
 
 class _Record:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from league.results.records import Scoring
@@ -29,7 +29,8 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Standing(Document):
-    """One contestant's results. `score` is in [0, 1], `mean_return` in the environment's own unit.
+    """One contestant's results. `score` is in [0, 1], `mean_return` in the environment's own unit, over the blocks of
+    which no game was forfeited (None without any).
 
     rating: Elo above `script:random`, None if no chain of games leads there.
     interval: the rating's two-sided 95 % interval.
@@ -37,7 +38,7 @@ class Standing(Document):
     """
 
     ref: str
-    mean_return: float
+    mean_return: float | None
     score: float
     games: int
     distinct_games: int | None
@@ -76,6 +77,7 @@ class EvaluationReport(Document):
     """A round robin: who stands where, best first, and who beats whom.
 
     by_side: who stands where on each side; empty where sides are alike, or there is one.
+    forfeits: who forfeited how many games; nobody else is named.
     """
 
     league: str
@@ -87,6 +89,7 @@ class EvaluationReport(Document):
     payoff: Payoff
     scoring: Scoring
     by_side: dict[str, tuple[Standing, ...]]
+    forfeits: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

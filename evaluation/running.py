@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.match import GamePlan
+from league.results.records import Reason
 
 State = dict[str, NDArray]
 """name of a recurrent input → array"""
@@ -21,6 +22,7 @@ class Running:
     """A game on one copy.
 
     returns: of each agent so far. opening: how many of `actions` belong to it, None while it goes on.
+    faults: agent → why it has no action in the step that is under way.
     """
 
     plan: GamePlan
@@ -30,6 +32,7 @@ class Running:
     opening: int | None = None
     actions: list[Any] = field(default_factory=list)
     states: dict[int, State] = field(default_factory=dict)
+    faults: dict[int, Reason] = field(default_factory=dict)
     _moves: list[tuple[int, Any]] = field(default_factory=list)
     _draws: dict[int, np.random.Generator] = field(default_factory=dict)
 

@@ -17,6 +17,7 @@ from league.policies.pinning import pinned
 from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
+from league.results.records import Match
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,7 @@ class Show:
     """A game that can be played before somebody's eyes.
 
     cast: agent → reference of who plays it. play: environment of one copy → the game, step by step.
+    note: what is to be said of its end beside the returns.
     """
 
     title: str
@@ -31,6 +33,7 @@ class Show:
     interface: Interface
     cast: Mapping[str, str]
     play: Callable[[BatchedEnvironment], Iterator[Moment]]
+    note: str | None = None
 
 
 def between(refs: Sequence[str], registry: Registry, side: str | None = None, seed: int = 0) -> Show:
@@ -76,7 +79,17 @@ def recorded(match: str, game: int, registry: Registry) -> Show:
         interface=row.interface,
         cast={agent: record.contestants[record.games[game].sides[side]] for agent, side in seats},
         play=lambda environment: replay(environment, row.config, row.interface, record, game),
+        note=_forfeits(record, game),
     )
+
+
+def _forfeits(match: Match, game: int) -> str | None:
+    """`forfeited by duo@3 as player_1: illegal action`"""
+    told = [
+        f"forfeited by {match.contestants[forfeit.contestant]} as {forfeit.agent}: {forfeit.reason.replace('_', ' ')}"
+        for forfeit in match.games[game].forfeits
+    ]
+    return "; ".join(told) or None
 
 
 def _cast(refs: Sequence[str], interface: Interface, first: str | None) -> dict[str, str]:

@@ -48,12 +48,15 @@ def ranked(results: Iterable[BlockResult], distinct_games: Mapping[str, int] | N
     """Sum up and rate `results`, best rating first, those without one last."""
     results = list(results)
     games: Counter[str] = Counter()
+    whole: Counter[str] = Counter()
     points: defaultdict[str, float] = defaultdict(float)
     returns: defaultdict[str, float] = defaultdict(float)
     for block in results:
-        for ref, score, value in zip(block.contestants, block.scores, block.returns, strict=True):
+        for ref, score in zip(block.contestants, block.scores, strict=True):
             games[ref] += block.games
             points[ref] += score
+        for ref, value in zip(block.contestants, block.returns or (), strict=block.returns is not None):
+            whole[ref] += block.games
             returns[ref] += value
     ratings = rate(results, ANCHOR)
     table = []
@@ -62,7 +65,7 @@ def ranked(results: Iterable[BlockResult], distinct_games: Mapping[str, int] | N
         table.append(
             Standing(
                 ref=ref,
-                mean_return=returns[ref] / played,
+                mean_return=returns[ref] / whole[ref] if whole[ref] else None,
                 score=points[ref] / played,
                 games=played,
                 distinct_games=None if distinct_games is None else distinct_games[ref],

@@ -18,6 +18,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from evaluation.contestants import baselines
+from evaluation.forfeits import forfeits
 from evaluation.gate import distinct_games
 from evaluation.ordering import InOrder
 from evaluation.payoff import tabulate
@@ -26,7 +27,7 @@ from evaluation.report import EvaluationReport, Listener, Progress
 from evaluation.schedule import round_robin
 from evaluation.standings import by_side, ranked
 from league.errors import LeagueError, WorkerLost
-from league.policies.pinning import pinned
+from league.policies.pinning import check_eligible, eligible, pinned
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match, Schedule
@@ -56,7 +57,7 @@ def run(
     workers: Ray tasks at once; 0 plays in this process. Without a Ray in this process a local one is started, and left
         running: `cluster` is its owner.
     enough: ends the schedule before its length; asked after each chunk, and before the first.
-    Raises EnvironmentMismatch, IllegalAction, GameHung, whatever loading a contestant raises, and WorkerLost.
+    Raises what `Player.play` does, and WorkerLost.
     """
     ledger = Ledger(registry)
     schedule = ledger.open(schedule)
@@ -93,12 +94,15 @@ def evaluate(
 ) -> EvaluationReport:
     """A round robin of `refs` and the scripted baselines, every pair meeting in `blocks` matches.
 
-    refs: versions, aliases (pinned to what they name now) and scripts; by default every version of the league.
+    refs: versions, aliases (pinned to what they name now) and scripts; by default every version that was trained in the
+        league's present environment.
     seed: other games for another seed; the same arguments again find their matches in the ledger and play nothing.
     Raises UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and what `run` raises.
     """
     row = registry.league(league)
-    asked = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in registry.versions(league)]
+    asked = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
+    for ref in asked:
+        check_eligible(ref, registry, row.config)
     contestants = list(dict.fromkeys([*asked, *baselines(row.interface)]))
     schedule = round_robin(row.config, row.interface, contestants, blocks, seed)
     with cluster():
@@ -116,6 +120,7 @@ def evaluate(
         payoff=tabulate([standing.ref for standing in table], schedule.sides, matches),
         scoring=schedule.scoring,
         by_side=by_side(schedule.sides, matches) if rated_by_side else {},
+        forfeits={ref: lost for ref in contestants if (lost := forfeits(matches, ref))},
     )
 
 
@@ -184,16 +189,17 @@ def _in_ray(
             yield chunk
             continue
         for ref in ray.wait(list(flying))[0]:
-            done.put(flying.pop(ref), _result(ref))
+            index = flying.pop(ref)
+            done.put(index, _result(ref, schedule, chunks[index]))
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
 def _play_chunk(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
     schedule, storage, config = job
-    return player(storage, config).play(schedule, chunk)
+    return player(storage, config).play(schedule, chunk, expendable=True)
 
 
-def _result(ref: ray.ObjectRef) -> list[Match]:
+def _result(ref: ray.ObjectRef, schedule: Schedule, chunk: range) -> list[Match]:
     try:
         matches: list[Match] = ray.get(ref)
     except RayTaskError as error:
@@ -202,5 +208,9 @@ def _result(ref: ray.ObjectRef) -> list[Match]:
             raise error.cause from None
         raise
     except RayError as error:
-        raise WorkerLost(f"workers died {RETRIES + 1} times over one chunk of matches: {error}") from error
+        players = " and ".join(dict.fromkeys(ref for position in chunk for ref in schedule.contestants_at(position)))
+        raise WorkerLost(
+            f"workers died {RETRIES + 1} times over matches {chunk.start} to {chunk.stop - 1} of {schedule.id}, of"
+            f" {players}; their logs say where they were: {error}"
+        ) from error
     return matches

@@ -17,6 +17,7 @@ from typing import Any
 from evaluation import promotion, tournament
 from evaluation.anchors import anchors_of
 from evaluation.findings import Anchored, Findings, found
+from evaluation.forfeits import forfeits
 from evaluation.gate import Watch, counts_of, floor, judge
 from evaluation.paired import paired_difference
 from evaluation.report import AnchorReport, Confirmation, Difference, Listener, Progress, VerdictReport
@@ -186,16 +187,16 @@ def _matches(registry: Registry, verdict: VerdictRow, schedule: str | None = Non
 def findings(registry: Registry, verdict: VerdictRow) -> Findings:
     """What the ledger says of a verdict's challenger."""
     gate, challenger = gate_of(verdict), _challenger(verdict)
-    anchors = [
-        Anchored(
-            anchor["ref"],
-            anchor["margin"],
-            anchor["schedule"],
-            judge(gate.against_anchor(anchor["margin"]), _matches(registry, verdict, anchor["schedule"]), challenger),
-        )
-        for anchor in verdict.settings.get("anchors", ())
-    ]
-    return found(judge(gate, _matches(registry, verdict), challenger), anchors, len(anchors), None)
+    matches = _matches(registry, verdict)
+    champion = judge(gate, matches, challenger)
+    forfeited = forfeits(matches[: champion.blocks], challenger)
+    anchors = []
+    for anchor in verdict.settings.get("anchors", ()):
+        ref, margin, schedule = anchor["ref"], anchor["margin"], anchor["schedule"]
+        matches = _matches(registry, verdict, schedule)
+        anchors.append(Anchored(ref, margin, schedule, judge(gate.against_anchor(margin), matches, challenger)))
+        forfeited += forfeits(matches[: anchors[-1].decision.blocks], challenger)
+    return found(champion, anchors, len(anchors), None if gate.forfeits else forfeited)
 
 
 def _difference(registry: Registry, verdict: VerdictRow, seen: Findings) -> Difference | None:

@@ -77,6 +77,9 @@ class PlayConfig(_Part):
     max_moves: int = Field(default=10_000, ge=1)
     """Steps of the environment after which a game counts as hung and the match fails; where several agents act at once,
     their actions are one step."""
+    game_seconds: float = Field(default=600.0, gt=0, allow_inf_nan=False)
+    """Seconds of the environment's own work on one game after which it counts as hung, too: of its reset and its steps,
+    and not of the other games that are stepped beside it."""
 
 
 class ConvolutionConfig(_Part):

@@ -36,6 +36,7 @@ LeagueError
 ├── ArtifactCorrupt           a file whose digest is not the manifest's
 ├── GameHung                  a game that does not end
 ├── BoundExceeded             returns that differ by more than a gate was told they can
+├── GameCrashed               a game whose environment raised
 ├── WorkerLost                worker processes that die again and again
 ├── VerdictRefuted            a verdict whose record is not what its games say
 ├── ParityError               an exported graph that acts otherwise than the trained module
@@ -257,7 +258,7 @@ class ArtifactCorrupt(LeagueError):
 
 
 class GameHung(LeagueError):
-    """A game of a match that has not ended after `play.max_moves` actions."""
+    """A game of a match that has not ended after `play.max_moves` steps, or `play.game_seconds` of its environment."""
 
     code = "game_hung"
 
@@ -266,6 +267,12 @@ class BoundExceeded(LeagueError):
     """Returns of a block that differ by more than `gate.return_bound`."""
 
     code = "bound_exceeded"
+
+
+class GameCrashed(LeagueError):
+    """A game of a match whose environment raised, in a reset or at a legal action."""
+
+    code = "game_crashed"
 
 
 class VerdictRefuted(LeagueError):

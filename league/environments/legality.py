@@ -25,7 +25,7 @@ def check_actions(batch: Batch, actions: NDArray, space: Space, agents: Sequence
             f"actions of {agents[batch.agents[0]]} have shape {list(actions.shape[1:])}, not {expected}"
         )
     mask = batch.observations.get(ACTION_MASK)
-    legal = _legal(actions, space, mask)
+    legal = legal_rows(actions, space, mask)
     if not legal.all():
         row = int(np.argmin(legal))
         raise IllegalAction(
@@ -34,8 +34,8 @@ def check_actions(batch: Batch, actions: NDArray, space: Space, agents: Sequence
         )
 
 
-def _legal(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
-    """(k,) bool."""
+def legal_rows(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
+    """Which of the actions (k, …) are in `space` and allowed by their rows of the mask: (k,) bool."""
     match space:
         case Discrete():
             chosen = actions - space.start
@@ -59,6 +59,14 @@ def _legal(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
         case MultiBinary():
             return ((actions == 0) | (actions == 1)).reshape(len(actions), -1).all(axis=1)
     return np.ones(len(actions), dtype=bool)
+
+
+def allows_nothing(mask: NDArray, space: Space) -> NDArray:
+    """Which rows of a mask (k, n) leave no legal action, in one element of it at least: (k,) bool."""
+    if not isinstance(space, MultiDiscrete):
+        return ~(mask != 0).any(axis=1)
+    choices = np.asarray(space.nvec).ravel()
+    return (np.add.reduceat(mask != 0, np.cumsum(choices) - choices, axis=1, dtype=int) == 0).any(axis=1)
 
 
 def _bound(bound: Any, infinite: float) -> NDArray:

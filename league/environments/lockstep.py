@@ -3,9 +3,10 @@
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from operator import itemgetter
-from typing import Any
+from time import perf_counter
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, Obser
 from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, from_gymnasium, inputs, tensors
 
 logger = logging.getLogger(__name__)
+
+Given = TypeVar("Given")
 
 Rows = dict[Group, tuple[list[int], list[int], list[Observation], list[float]]]
 
@@ -54,6 +57,10 @@ class Lockstep:
         self._crashes = [0] * copies
         self._groups: list[Sequence[Group]] = [()] * copies
         self._pending: dict[Group, Batch] = {}
+        self._abandoned: set[int] = set()
+        self._seconds = [0.0] * copies
+        self._busy: int | None = None
+        self._since = 0.0
         self._next_episode: NextEpisode = lambda _: None
 
     @property
@@ -62,6 +69,8 @@ class Lockstep:
 
     def start(self, next_episode: NextEpisode) -> Turn:
         self._next_episode = next_episode
+        self._abandoned.clear()
+        self._busy = None
         turn = Turn()
         rows: Rows = {}
         for copy in range(self.copies):
@@ -76,11 +85,15 @@ class Lockstep:
                 moves.setdefault(copy, []).append((agent, action))
         turn = Turn()
         rows: Rows = {}
-        for copy in sorted(moves):
+        abandoned, self._abandoned = self._abandoned, set()
+        for copy in sorted(moves.keys() | abandoned):
+            if copy in abandoned:
+                self._restart(copy, turn, rows)
+                continue
             # An agent's policy decides which batch it is in, but not when it acts.
             acting = sorted(moves[copy], key=itemgetter(0))
             try:
-                reports = self._copies[copy].step(acting)
+                reports = self._timed(copy, self._copies[copy].step, acting)
             except LeagueError:
                 raise
             except Exception as error:
@@ -91,8 +104,20 @@ class Lockstep:
                 self._take(copy, reports, turn, rows)
         return self._yield(turn, rows)
 
+    def abandon(self, copies: Collection[int]) -> None:
+        self._abandoned.update(copies)
+        kept = {group: batch.rows(batch.without(copies)) for group, batch in self._pending.items()}
+        self._pending = {group: batch for group, batch in kept.items() if batch.copies}
+
     def assign(self, copy: int, groups: Sequence[Group]) -> None:
         self._groups[copy] = groups
+
+    @property
+    def busy(self) -> int | None:
+        return self._busy
+
+    def seconds(self, copy: int) -> float:
+        return self._seconds[copy] + (perf_counter() - self._since if self._busy == copy else 0.0)
 
     def render(self, copy: int) -> NDArray:
         picture = self._copies[copy].render()
@@ -104,16 +129,25 @@ class Lockstep:
         for copy in self._copies:
             copy.close()
 
+    def _timed(self, copy: int, call: Callable[[Given], list[Report]], given: Given) -> list[Report]:
+        self._since = perf_counter()
+        self._busy = copy
+        reports = call(given)
+        self._busy = None
+        self._seconds[copy] += perf_counter() - self._since
+        return reports
+
     def _restart(self, copy: int, turn: Turn, rows: Rows) -> None:
         episode = self._next_episode(copy)
         if episode is None:
             return
         self._groups[copy] = episode.groups
+        self._seconds[copy] = 0.0
         # Some environments hand the seed to a signed integer of 32 bits.
         self._seeds[copy] = episode.seed % 2**31
         while True:
             try:
-                reports = self._copies[copy].reset(self._seeds[copy])
+                reports = self._timed(copy, self._copies[copy].reset, self._seeds[copy])
                 break
             except LeagueError:
                 raise
@@ -164,6 +198,7 @@ class Lockstep:
             type(error).__name__,
             error,
         )
+        self._busy = None
         with contextlib.suppress(Exception):
             self._copies[copy].close()
         self._copies[copy] = copy_of(self._make(), self._splits)

@@ -5,7 +5,7 @@ is the caller's: a policy id in training, a contestant's policy in a match. In a
 own turns: the reward of a row is summed over all moves since the agent's previous row.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -39,6 +39,19 @@ class Batch:
     agents: list[int]
     observations: dict[str, NDArray]
     rewards: list[float]
+
+    def without(self, copies: Collection[int]) -> list[int]:
+        """The rows that are not of these copies."""
+        return [row for row, copy in enumerate(self.copies) if copy not in copies]
+
+    def rows(self, rows: Sequence[int]) -> "Batch":
+        """A batch of these rows."""
+        return Batch(
+            [self.copies[row] for row in rows],
+            [self.agents[row] for row in rows],
+            {name: array[rows] for name, array in self.observations.items()},
+            [self.rewards[row] for row in rows],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +107,24 @@ class BatchedEnvironment(Protocol):
         all copies are idle. Raises IllegalAction, naming agent and action, before any copy has moved."""
         ...
 
+    def abandon(self, copies: Collection[int]) -> None:
+        """Break the episodes of these copies off. Their rows leave the last Turn: the next `step` takes actions of the
+        others only, and restarts these in the same call. As of a crash, no endings of theirs are reported, nor are they
+        in `finished`."""
+        ...
+
     def assign(self, copy: int, groups: Sequence[Group]) -> None:
         """Change the groups of a copy's agents from the next Turn on."""
+        ...
+
+    @property
+    def busy(self) -> int | None:
+        """The copy whose environment is at work at this moment, for who looks from a signal handler; or whose
+        environment raised what came out of the last call."""
+        ...
+
+    def seconds(self, copy: int) -> float:
+        """How long a copy's environment has worked on its episode, reset included and also if it is at it just now."""
         ...
 
     def render(self, copy: int) -> NDArray:

@@ -1,9 +1,10 @@
 """What the ledger admits: a match that its schedule asked for, whole and consistent. Pure."""
 
 import math
+from typing import get_args
 
 from league.errors import LedgerRefusal
-from league.results.records import GAMES_PER_BLOCK, Game, Match, Schedule
+from league.results.records import GAMES_PER_BLOCK, Game, Match, Reason, Schedule
 from league.results.scoring import scores
 
 
@@ -26,10 +27,12 @@ def admit(match: Match, schedule: Schedule) -> None:
         raise _refusal(match, f"it has {len(match.games)} games, expected {GAMES_PER_BLOCK}")
     for index, game in enumerate(match.games):
         _admit_game(match, schedule, index, game)
-    for index, expected_scores in enumerate(scores([game.returns for game in match.games], schedule.scoring)):
+    returns = [game.returns for game in match.games]
+    forfeits = [{forfeit.contestant for forfeit in game.forfeits} for game in match.games]
+    for index, expected_scores in enumerate(scores(returns, schedule.scoring, forfeits)):
         if match.games[index].scores != expected_scores:
-            given = match.games[index].scores
-            raise _refusal(match, f"game {index} has the scores {given}, but its returns say {expected_scores}")
+            given, ground = match.games[index].scores, "forfeits" if any(forfeits) else "returns"
+            raise _refusal(match, f"game {index} has the scores {given}, but its {ground} say {expected_scores}")
 
 
 def _admit_game(match: Match, schedule: Schedule, index: int, game: Game) -> None:
@@ -45,6 +48,13 @@ def _admit_game(match: Match, schedule: Schedule, index: int, game: Game) -> Non
     finite = [value is not None and math.isfinite(value) for value in game.returns]
     if finite != [contestant in seating for contestant in range(len(match.contestants))]:
         raise _refusal(match, f"game {index} needs a finite return of each contestant that played, not {game.returns}")
+    for forfeit in game.forfeits:
+        if forfeit.contestant not in seating:
+            raise _refusal(match, f"game {index} is forfeited by contestant {forfeit.contestant}, who did not play it")
+        if forfeit.reason not in get_args(Reason):
+            raise _refusal(match, f"game {index} is forfeited for a reason that there is not: {forfeit.reason!r}")
+    if len({forfeit.contestant for forfeit in game.forfeits}) < len(game.forfeits):
+        raise _refusal(match, f"game {index} is forfeited twice by one contestant")
 
 
 def _refusal(match: Match, reason: str) -> LedgerRefusal:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
-from league.results.records import Game, Schedule
+from league.results.records import Forfeit, Game, Schedule
 
 
 def dump_schedule(schedule: Schedule) -> str:
@@ -21,18 +21,37 @@ def load_schedule(text: str) -> Schedule:
 
 
 def dump_games(games: Sequence[Game]) -> str:
-    """A block: the seed and opening that its games share, and [sides, actions, returns, scores] of each."""
+    """A block: the seed and opening that its games share, and [sides, actions, returns, scores] of each; behind that,
+    where it was forfeited, [contestant, agent, reason] of each forfeit."""
     first = games[0]
-    return _dump([first.seed, first.opening, [[g.sides, g.actions, g.returns, g.scores] for g in games]])
+    return _dump([first.seed, first.opening, [_game(game) for game in games]])
 
 
 def load_games(text: str) -> tuple[Game, ...]:
     """The block that `dump_games` wrote."""
     seed, opening, games = json.loads(text)
     return tuple(
-        Game(tuple(sides), seed, tuple(opening), tuple(actions), tuple(returns), tuple(scores))
-        for sides, actions, returns, scores in games
+        Game(
+            tuple(sides),
+            seed,
+            tuple(opening),
+            tuple(actions),
+            tuple(returns),
+            tuple(scores),
+            tuple(Forfeit(*forfeit) for forfeit in forfeits),
+        )
+        for sides, actions, returns, scores, *forfeits in games
     )
+
+
+def _game(game: Game) -> list[Any]:
+    return [
+        game.sides,
+        game.actions,
+        game.returns,
+        game.scores,
+        *([forfeit.contestant, forfeit.agent, forfeit.reason] for forfeit in game.forfeits),
+    ]
 
 
 def dump_numbers(numbers: Sequence[float]) -> str:

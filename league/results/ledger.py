@@ -123,7 +123,7 @@ class Ledger:
                     contestants=schedules[of].contestants_at(position),
                     games=games,
                     scores=load_numbers(scores),
-                    returns=load_numbers(returns),
+                    returns=load_numbers(returns) or None,
                 )
                 for of, position, games, scores, returns in found
                 if of in schedules
@@ -158,7 +158,7 @@ def _row(match: Match) -> dict[str, Any]:
         "position": match.position,
         "games": result.games,
         "scores": dump_numbers(result.scores),
-        "returns": dump_numbers(result.returns),
+        "returns": dump_numbers(result.returns or ()),
         "moves": dump_games(match.games),
         "played_at": datetime.now(UTC),
     }

@@ -19,6 +19,10 @@ game of the block. See scoring.py."""
 
 GAMES_PER_BLOCK = 2
 
+Reason = Literal["illegal_action", "not_finite", "malformed", "crashed"]
+"""Why a game was forfeited: by an action outside the space or its mask; by one that holds NaN or an infinity; by an
+answer that is no array of the space's shape and kind; by a policy that raised."""
+
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
@@ -83,6 +87,15 @@ class Schedule:
 
 
 @dataclass(frozen=True, slots=True)
+class Forfeit:
+    """A contestant (an index into the match's) had to act as `agent`, and gave no action that could be played."""
+
+    contestant: int
+    agent: str
+    reason: Reason
+
+
+@dataclass(frozen=True, slots=True)
 class Game:
     """One game of a block.
 
@@ -91,6 +104,10 @@ class Game:
     that stepping a fresh environment from `seed` with them plays the same game again.
     returns[c] is contestant c's return, the mean over the agents of a side and then over its sides; scores[c] is 1, ½
     or 0. Both are None for a contestant that took no part: where there is one side, each plays a game alone.
+
+    A game that is forfeited ends there, and none of the actions of that step is among its own. Its returns are what had
+    been collected until then: they are checked when it is replayed, and compared with nothing. forfeits: by whom, at
+    most one of each contestant, both where they act at once and neither can.
     """
 
     sides: tuple[int, ...]
@@ -99,6 +116,11 @@ class Game:
     actions: tuple[Action, ...]
     returns: tuple[float | None, ...]
     scores: tuple[float | None, ...]
+    forfeits: tuple[Forfeit, ...] = ()
+
+    def forfeited_by(self, contestant: int) -> bool:
+        """Whether a contestant (by index) forfeited it."""
+        return any(forfeit.contestant == contestant for forfeit in self.forfeits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +128,7 @@ class BlockResult:
     """A match without its moves: what ratings and payoffs are made of.
 
     games: how many each contestant took part in. scores and returns are sums over those.
+    A block with a forfeit has no returns: those of a game that was broken off are no measure of anybody.
     """
 
     schedule: str
@@ -113,7 +136,7 @@ class BlockResult:
     contestants: tuple[str, ...]
     games: int
     scores: tuple[float, ...]
-    returns: tuple[float, ...]
+    returns: tuple[float, ...] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,21 +157,22 @@ class Match:
         result = self.result()
         return result.scores[contestant] / result.games
 
-    def mean_return(self, contestant: int) -> float:
-        """Mean return of a contestant (by index) over its games."""
+    def mean_return(self, contestant: int) -> float | None:
+        """Mean return of a contestant (by index) over its games; None if one of the block was forfeited."""
         result = self.result()
-        return result.returns[contestant] / result.games
+        return None if result.returns is None else result.returns[contestant] / result.games
 
     def result(self) -> BlockResult:
         """The match without its moves."""
         contestants = range(len(self.contestants))
         scores = [[game.scores[c] for game in self.games] for c in contestants]
         returns = [[game.returns[c] for game in self.games] for c in contestants]
+        is_whole = not any(game.forfeits for game in self.games)
         return BlockResult(
             schedule=self.schedule,
             position=self.position,
             contestants=self.contestants,
             games=sum(score is not None for score in scores[0]),
             scores=tuple(sum(score for score in own if score is not None) for own in scores),
-            returns=tuple(sum(value for value in own if value is not None) for own in returns),
+            returns=tuple(sum(value for value in own if value is not None) for own in returns) if is_whole else None,
         )

@@ -16,7 +16,7 @@ from starlette.responses import JSONResponse
 
 from league.errors import Forbidden, InvalidInput, NoStudio, UnknownEvaluation
 from league.evaluations import Asked, Night, Tournament
-from league.policies.pinning import pinned
+from league.policies.pinning import check_eligible, eligible, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.rows import EvaluationRow
@@ -101,11 +101,9 @@ def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
     document = asked.root.model_dump(mode="json", exclude={"reason"})
     if isinstance(asked.root, Tournament):
         refs = [pinned(ref, league, registry) for ref in asked.root.contestants]
-        document["contestants"] = refs or [
-            version.ref
-            for version in registry.versions(league)
-            if version.manifest.environment_digest == row.environment_digest
-        ]
+        for ref in refs:
+            check_eligible(ref, registry, row.config)
+        document["contestants"] = refs or [version.ref for version in eligible(registry, league)]
     return document
 
 

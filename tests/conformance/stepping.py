@@ -107,12 +107,18 @@ def _answer(env: Any, seed: int, agent: str, reports: Reports) -> Any:
 
 
 def lockstep(
-    batched: BatchedEnvironment, spaces: Mapping[str, gymnasium.Space], seeds: list[int], steps: int | None = None
+    batched: BatchedEnvironment,
+    spaces: Mapping[str, gymnasium.Space],
+    seeds: list[int],
+    steps: int | None = None,
+    broken: Mapping[int, int] | None = None,
 ) -> dict[int, Reports]:
     """What the batched environment reports to each agent of each episode; episodes queue for the copies.
 
     spaces: agent → how it acts. steps: calls of `step` after which to stop; None until all episodes are over.
+    broken: seeds of episodes that are abandoned, and after how many steps.
     """
+    broken, left = broken or {}, dict(broken or {})
     queue = list(seeds)
     reports: dict[int, Reports] = {seed: defaultdict(list) for seed in seeds}
     playing: dict[int, int] = {}
@@ -131,17 +137,25 @@ def lockstep(
         starting.clear()
         if not turn.batches or taken == steps:
             return reports
+        acting = {copy for batch in turn.batches.values() for copy in batch.copies}
+        abandoned = [copy for copy in acting if left.get(playing[copy]) == 0]
+        left |= {seed: left[seed] - 1 for seed in map(playing.get, acting) if seed in left}
+        if abandoned:
+            batched.abandon(abandoned)
         actions = {}
         for group, batch in turn.batches.items():
             chosen = []
             for row, (copy, index) in enumerate(zip(batch.copies, batch.agents, strict=True)):
+                if copy in abandoned:
+                    continue
                 agent = batched.agents[index]
                 assert group == agent, "a row is in the batch of another group"
                 arrays = {name: array[row] for name, array in batch.observations.items()}
                 own = reports[playing[copy]][agent]
                 chosen.append(draw(spaces[agent], playing[copy], index, len(own), arrays.get(ACTION_MASK)))
                 own.append((agent, arrays, batch.rewards[row], False, False))
-            actions[group] = np.array(chosen)
+            if chosen:
+                actions[group] = np.array(chosen)
         turn = batched.step(actions)
         taken += 1
 
@@ -164,6 +178,26 @@ def assert_stepping_conforms(
     batched = lockstep(make(copies), spaces, seeds)
     for seed in seeds:
         assert_same_episode(batched[seed], plain_loop(stock(), seed))
+
+
+def assert_abandoning_conforms(
+    make: Callable[[int], BatchedEnvironment], stock: Callable[[], Any], seeds: list[int], copies: int
+) -> None:
+    """Every other episode is broken off, after one step more than the one before that: up to there it is reported as
+    ever, and of the others nothing changes.
+    """
+    env = stock()
+    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    broken = {seed: number for number, seed in enumerate(seeds[::2])}
+    reported = lockstep(make(copies), spaces, seeds, broken=broken)
+    for seed in seeds:
+        expected = plain_loop(stock(), seed)
+        if seed in broken:
+            expected = {agent: expected[agent][: len(own)] for agent, own in reported[seed].items()}
+        assert_same_episode(reported[seed], expected)
+    assert any(
+        sum(map(len, reported[seed].values())) < sum(map(len, plain_loop(stock(), seed).values())) for seed in broken
+    ), "no episode was broken off"
 
 
 def assert_same_episode(actual: Reports, expected: Reports) -> None:

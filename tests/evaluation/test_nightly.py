@@ -480,3 +480,18 @@ def test_a_bound_that_returns_exceed_is_named_and_the_verdict_can_be_voided(tmp_
     verdicts.void(registry, registry.verdicts(examples.LEAGUE)[0].id, actor="me", reason="bound")
     mended = examples.config(gate=gate | {"return_bound": 2})
     assert nightly(mended, registry=registry).verdicts[0].outcome == "promote"
+
+
+def test_who_forfeits_a_game_is_not_promoted_unless_its_gate_allows_that(tmp_path: Path) -> None:
+    """It wins every game but those whose opening gives it a certain square, where it answers no legal action."""
+    config = examples.config(gate={"elo1": 60})
+    registry = league_of(tmp_path, WEAK, examples.graph(wins=True, blocks=True, faulty=True), config=config)
+    registry.set_alias(examples.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+    (refused,) = nightly(config, registry=registry).verdicts
+    assert (refused.outcome, refused.promoted) == ("reject", False)
+    assert re.fullmatch(r"it forfeited \d+ games, and its gate allows none", str(refused.note))
+    assert refused.llr >= refused.bounds[1]
+    verify(refused.verdict, registry=registry)
+    lenient = examples.config(gate={"elo1": 60, "forfeits": True})
+    verdicts.void(registry, refused.verdict, actor="me", reason="the gate was too strict")
+    assert nightly(lenient, registry=registry).champion == "tictactoe@2"

@@ -9,9 +9,9 @@ from evaluation.replay import replay
 from evaluation.schedule import round_robin
 from league.environments.building import interface
 from league.environments.lockstep import stepping
-from league.errors import EnvironmentMismatch, GameHung, IllegalAction
+from league.errors import EnvironmentMismatch, GameHung
 from league.policies.onnx import OnnxPolicy
-from league.policies.policy import Actions, Arrays, Policy
+from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.results.records import Match, Schedule
 from tests.evaluation import examples
@@ -124,30 +124,6 @@ def test_a_record_that_does_not_replay_is_refused(change: str) -> None:
     record = replace(match, games=(forged, match.games[1]), environment_digest=digest)
     with pytest.raises(EnvironmentMismatch):
         list(replay(stepping(CONFIG.environment, 1), CONFIG, INTERFACE, record, 0))
-
-
-class Stubborn:
-    """Always takes square 0."""
-
-    def act(
-        self,
-        observations: Arrays,
-        *,
-        state: Arrays | None = None,
-        explore: bool = False,
-        rng: Sequence[np.random.Generator] | None = None,
-    ) -> Actions:
-        return Actions(np.zeros(len(observations["action_mask"]), np.int64))
-
-
-def with_stubborn(policy: Policy) -> Roster:
-    return {**roster(), "tictactoe@9": dict.fromkeys(INTERFACE.agents, ("shared", policy))}
-
-
-def test_an_illegal_action_names_its_contestant() -> None:
-    order = schedule(contestants=["script:one_ply", "tictactoe@9"])
-    with pytest.raises(IllegalAction, match=r"tictactoe@9: .*illegal"):
-        play(order, [0, 1], stepping(CONFIG.environment, 4), INTERFACE, with_stubborn(Stubborn()))
 
 
 def test_a_game_that_does_not_end_is_a_fault() -> None:

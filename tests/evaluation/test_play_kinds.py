@@ -16,10 +16,9 @@ from evaluation.schedule import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stepping
-from league.errors import GameHung, IllegalAction
+from league.errors import GameHung
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
-from league.policies.policy import Actions, Arrays
 from league.policies.scripted import script
 from league.results.admission import admit
 from league.results.documents import dump_games, load_games
@@ -182,20 +181,3 @@ def test_a_step_of_many_agents_is_one_move() -> None:
     assert kind.played(schedule, max_moves=6)
     with pytest.raises(GameHung, match="after 5 moves"):
         kind.played(schedule, max_moves=5)
-
-
-class Wild:
-    """Acts outside its space."""
-
-    def act(
-        self, observations: Arrays, *, state: Arrays | None = None, explore: bool = False, rng: Any = None
-    ) -> Actions:
-        return Actions(np.full((len(observations["observation"]), 5), 7, np.float32))
-
-
-def test_an_illegal_action_of_many_names_its_contestant() -> None:
-    kind = KINDS["continuous team"]
-    roster = {**kind.roster, "kind@9": {agent: ("shared", Wild()) for agent in kind.interface.agents}}
-    schedule = kind.schedule(["kind@1", "kind@9"])
-    with pytest.raises(IllegalAction, match=r"kind@9: action .* of agent_0 is illegal"):
-        play(schedule, [0], stepping(kind.config.environment, 2), kind.interface, roster)

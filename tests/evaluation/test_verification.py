@@ -8,13 +8,16 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
+from evaluation.forfeits import forfeits
 from evaluation.nightly import nightly
 from evaluation.verification import verify
 from league.errors import EnvironmentMismatch, InvalidInput, NotFound, VerdictRefuted
 from league.registry import tables
 from league.registry.registry import Registry
 from league.registry.rows import VerdictRow
+from league.results.ledger import Ledger
 from tests.evaluation import examples
+from tests.evaluation.test_forfeits import reckless
 from tests.evaluation.test_nightly import CONFIG, MIDDLING, STRONG, WEAK, league_of
 
 
@@ -78,9 +81,9 @@ def test_whatever_is_changed_in_the_evidence_is_named(registry: Registry, name: 
         verify(row.id, registry=registry)
 
 
-def change_moves(registry: Registry, verdict: str, change: Callable[[list[Any]], None]) -> None:
+def change_moves(registry: Registry, verdict: str, change: Callable[[list[Any]], None], position: int = 0) -> None:
     with registry.database.write() as session:
-        match = session.scalars(select(tables.Match).filter_by(schedule=verdict, position=0)).one()
+        match = session.scalars(select(tables.Match).filter_by(schedule=verdict, position=position)).one()
         moves = json.loads(match.moves)
         change(moves)
         match.moves = json.dumps(moves)
@@ -130,6 +133,26 @@ def test_a_void_verdict_holds_as_far_as_it_went(tmp_path: Path) -> None:
     (verdict,) = verdicts(registry)
     assert conclude(registry, verdict).outcome == "void"
     assert verify(verdict.id, registry=registry).outcome == "void"
+
+
+def test_a_verdict_on_a_version_that_forfeits_holds(tmp_path: Path) -> None:
+    registry = league_of(tmp_path, STRONG, reckless(crashes=True))
+    nightly(CONFIG, registry=registry)
+    row = verdicts(registry)[-1]
+    lost = forfeits(Ledger(registry).matches(league=row.league, schedule=row.schedule), "tictactoe@2")
+    assert (row.candidate, row.outcome) == (2, "reject")
+    assert lost
+    assert verify(row.id, registry=registry, replays=8).replayed == 8
+
+    def change(moves: list[Any]) -> None:
+        for game in moves[2]:
+            for forfeit in game[4:]:
+                forfeit[1] = "player_1" if forfeit[1] == "player_2" else "player_2"
+
+    for match in range(row.evidence["blocks"]):  # type: ignore[index]
+        change_moves(registry, row.id, change, match)
+    with pytest.raises(EnvironmentMismatch, match="who had not to act for it there"):
+        verify(row.id, registry=registry, replays=8)
 
 
 def test_there_must_be_a_verdict_and_it_must_be_closed(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from league.environments.building import build
 from league.environments.lockstep import stepping
 from league.environments.stepping import BatchedEnvironment, Episode, Turn
 from league.errors import IllegalAction
-from tests.conformance.stepping import assert_stepping_conforms
+from tests.conformance.stepping import assert_abandoning_conforms, assert_stepping_conforms
 
 COUNTING = "tests.league.environments.counting:counting"
 
@@ -32,6 +32,15 @@ ENVIRONMENTS = {
 def test_lockstep_reports_what_the_plain_loop_reports(name: str, copies: int) -> None:
     config = ENVIRONMENTS[name]
     assert_stepping_conforms(
+        lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), copies=copies
+    )
+
+
+@pytest.mark.parametrize("copies", [1, 3, 8])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_an_episode_that_is_broken_off_leaves_no_trace(name: str, copies: int) -> None:
+    config = ENVIRONMENTS[name]
+    assert_abandoning_conforms(
         lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), copies=copies
     )
 

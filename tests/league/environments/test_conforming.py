@@ -1,6 +1,7 @@
 """Lockstep is the plain loop of each API, for stock environments whose own code has had no hand of ours on it."""
 
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from examples.traffic import crossing
 from league.config import EnvironmentConfig
 from league.environments.lockstep import stepping
-from tests.conformance.stepping import assert_stepping_conforms
+from tests.conformance.stepping import assert_abandoning_conforms, assert_stepping_conforms
 from tests.league.environments.simultaneous import meeting, rllib_meeting
 
 PARALLEL: dict[str, dict[str, Any]] = {
@@ -33,16 +34,28 @@ OWN: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("copies", [1, 3])
-@pytest.mark.parametrize("entry_point", [*PARALLEL, *AEC, *OWN])
-def test_lockstep_is_the_plain_loop(entry_point: str, copies: int) -> None:
+Case = tuple[EnvironmentConfig, Callable[[], Any]]
+
+
+@pytest.fixture(params=[*PARALLEL, *AEC, *OWN])
+def case(request: pytest.FixtureRequest) -> Case:
+    """An environment's configuration, and what makes the stock one."""
+    entry_point = request.param
     if entry_point in OWN:
         make, kwargs = OWN[entry_point]
     elif entry_point in PARALLEL:
         make, kwargs = importlib.import_module(entry_point).parallel_env, PARALLEL[entry_point]
     else:
         make, kwargs = importlib.import_module(entry_point).env, AEC[entry_point]
-    config = EnvironmentConfig(entry_point=entry_point, kwargs=kwargs)
-    assert_stepping_conforms(
-        lambda n: stepping(config, n), lambda: make(**kwargs), seeds=[11, 12, 13, 14], copies=copies
-    )
+    return EnvironmentConfig(entry_point=entry_point, kwargs=kwargs), lambda: make(**kwargs)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_lockstep_is_the_plain_loop(case: Case, copies: int) -> None:
+    config, stock = case
+    assert_stepping_conforms(lambda n: stepping(config, n), stock, seeds=[11, 12, 13, 14], copies=copies)
+
+
+def test_an_episode_that_is_broken_off_leaves_no_trace(case: Case) -> None:
+    config, stock = case
+    assert_abandoning_conforms(lambda n: stepping(config, n), stock, seeds=[11, 12, 13, 14], copies=2)

@@ -14,7 +14,7 @@ from league.errors import LedgerRefusal, NotFound, UnknownLeague
 from league.registry.registry import Registry
 from league.results.documents import dump_games, dump_schedule, load_games, load_schedule
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Game, Match, Schedule
+from league.results.records import BlockResult, Forfeit, Game, Match, Schedule
 from league.settings import Storage
 from tests.league.registry.examples import LEAGUE, config, registered
 
@@ -128,6 +128,18 @@ def test_results_are_the_sums_of_the_blocks(ledger: Ledger) -> None:
         ledger.results("chess")
 
 
+def test_a_block_with_a_forfeit_has_scores_and_no_returns(ledger: Ledger) -> None:
+    ledger.open(SCHEDULE)
+    first, second = played(SCHEDULE, 0).games
+    lost = replace(first, scores=(0.0, 1.0), forfeits=(Forfeit(0, "player_1", "illegal_action"),))
+    match = SCHEDULE.match(0, (lost, second))
+    ledger.append(match)
+    assert ledger.matches(league=LEAGUE) == [match]
+    assert ledger.results(LEAGUE) == [match.result()]
+    assert match.result() == BlockResult(SCHEDULE.id, 0, match.contestants, 2, (0.5, 1.5), None)
+    assert match.mean_return(0) is None
+
+
 def alone(schedule: Schedule, position: int, *returns: float) -> Match:
     """A block in which each contestant plays a game by itself."""
     first, second = returns
@@ -164,6 +176,7 @@ def _of_game(change: Callable[[Game], Game]) -> Callable[[Match], Match]:
     return lambda match: replace(match, games=(match.games[0], change(match.games[1])))
 
 
+CRASH = Forfeit(0, "player_2", "crashed")
 REFUSED: dict[str, tuple[Callable[[Match], Match], str]] = {
     "beyond the schedule": (lambda match: replace(match, position=9), "ends before position 9"),
     "before the schedule": (lambda match: replace(match, position=-1), "ends before position 9"),
@@ -205,6 +218,19 @@ REFUSED: dict[str, tuple[Callable[[Match], Match], str]] = {
     "the other one wins": (_of_game(lambda game: replace(game, scores=(1.0, 0.0))), r"returns say \(0\.5, 0\.5\)"),
     "both win": (_of_game(lambda game: replace(game, scores=(1.0, 1.0))), "game 1 has the scores .* its returns say"),
     "a score out of range": (_of_game(lambda game: replace(game, scores=(2.0, -1.0))), "game 1 has the scores"),
+    "a forfeit that wins": (_of_game(lambda game: replace(game, forfeits=(CRASH,))), r"forfeits say \(0\.0, 1\.0\)"),
+    "two forfeits of one": (
+        _of_game(lambda game: replace(game, forfeits=(CRASH, CRASH), scores=(0.0, 1.0))),
+        "game 1 is forfeited twice",
+    ),
+    "a forfeit of nobody": (
+        _of_game(lambda game: replace(game, forfeits=(replace(CRASH, contestant=2),))),
+        "forfeited by contestant 2, who did not play it",
+    ),
+    "a forfeit for no reason": (
+        _of_game(lambda game: replace(game, forfeits=(replace(CRASH, reason="tired"),), scores=(0.0, 1.0))),
+        "reason that there is not: 'tired'",
+    ),
     "no number": (_of_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 has the scores"),
 }
 
