@@ -4,7 +4,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.environments.legality import check_actions
+from league.environments.legality import allows_nothing, check_actions
 from league.environments.stepping import Batch
 from league.errors import IllegalAction
 from league.spaces import ACTION_MASK, from_gymnasium
@@ -59,6 +59,14 @@ def test_masks_forbid_by_element() -> None:
             check(space, np.array([[0, 1], illegal]), mask)
     with pytest.raises(IllegalAction, match="of first"):
         check(spaces.Discrete(3), np.array([1, 0]), np.array([1, 0, 1]))
+
+
+def test_a_mask_that_leaves_nothing_is_told_from_one_that_forbids() -> None:
+    choices = from_gymnasium(spaces.MultiDiscrete([2, 3]))
+    masks = np.array([[1, 1, 0, 0, 0], [0, 1, 0, 0, 1], [0, 0, 1, 1, 1]], np.int8)
+    assert allows_nothing(masks, choices).tolist() == [True, False, True]
+    one = from_gymnasium(spaces.Discrete(5))
+    assert allows_nothing(np.array([[0, 0, 0, 0, 0], [0, 0, 0, 0, 1]], np.int8), one).tolist() == [True, False]
 
 
 def test_as_many_actions_as_rows_and_in_their_shape() -> None:
