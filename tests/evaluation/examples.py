@@ -126,8 +126,13 @@ def _info(name: str, dtype: int, *shape: int) -> ValueInfoProto:
     return helper.make_tensor_value_info(name, dtype, ["batch", *shape])
 
 
-def graph(wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDGES_FIRST) -> bytes:
-    """An ONNX graph with the interface of a checkpoint's: observation, action_mask → action, action_dist_inputs."""
+def graph(
+    wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDGES_FIRST, faulty: bool = False
+) -> bytes:
+    """An ONNX graph with the interface of a checkpoint's: observation, action_mask → action, action_dist_inputs.
+
+    faulty: it takes the last square for free, always, and puts a mark there now and then although it is taken.
+    """
     see = np.zeros((18, 16), np.float32)
     heed = np.zeros((16, 9), np.float32)
     for i, line in enumerate(LINES):
@@ -141,6 +146,7 @@ def graph(wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDG
         "heed": heed,
         "order": -np.argsort(order).astype(np.float32),
         "flat": np.array([-1, 18], np.int64),
+        "taken_for_free": np.arange(9) == (8 if faulty else 9),
         "illegal": np.array(np.finfo(np.float32).min, np.float32),
     }
     nodes = [
@@ -151,7 +157,8 @@ def graph(wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDG
         helper.make_node("Relu", ["excess"], ["pairs"]),
         helper.make_node("MatMul", ["pairs", "heed"], ["urgent"]),
         helper.make_node("Add", ["urgent", "order"], ["wanted"]),
-        helper.make_node("Cast", ["action_mask"], ["legal"], to=TensorProto.BOOL),
+        helper.make_node("Cast", ["action_mask"], ["masked"], to=TensorProto.BOOL),
+        helper.make_node("Or", ["masked", "taken_for_free"], ["legal"]),
         helper.make_node("Where", ["legal", "wanted", "illegal"], ["action_dist_inputs"]),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]

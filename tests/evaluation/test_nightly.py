@@ -1,5 +1,6 @@
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -483,9 +484,9 @@ def test_a_bound_that_returns_exceed_is_named_and_the_verdict_can_be_voided(tmp_
 
 
 def test_who_forfeits_a_game_is_not_promoted_unless_its_gate_allows_that(tmp_path: Path) -> None:
-    """It wins every game but those whose opening gives it a certain square, where it answers no legal action."""
+    """It plays well, and now and then puts its mark where another is."""
     config = examples.config(gate={"elo1": 60})
-    registry = league_of(tmp_path, WEAK, examples.graph(wins=True, blocks=True, faulty=True), config=config)
+    registry = league_of(tmp_path, WEAK, examples.graph(True, True, examples.CENTRE_FIRST, faulty=True), config=config)
     registry.set_alias(examples.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
     (refused,) = nightly(config, registry=registry).verdicts
     assert (refused.outcome, refused.promoted) == ("reject", False)
