@@ -13,6 +13,7 @@ from evaluation.report import Confirmation, NightReport
 from league.config import LeagueConfig
 from league.errors import AlreadyRunning, LeagueError
 from league.refs import check_slug
+from league.registry.faults import disk_faults
 from league.registry.registry import Registry
 from league.settings import Storage
 
@@ -35,7 +36,8 @@ def nightly(
     """Judge each new version against the champion and the anchors, promote the better one, and rate everybody.
 
     May be killed at any point and started again: what was played is in the ledger and is not played twice. Meant for
-    cron, a systemd timer or a CronJob (see deploy/nightly/). Exit code 0: all is well, whoever is champion; 1: a
+    cron, a systemd timer or a CronJob (see deploy/nightly/). The page that `league report` makes is left in
+    LEAGUE_HOME/reports. Exit code 0: all is well, whoever is champion; 1: a
     version could not be judged, a league failed, or nobody took the webhook; 2: a mistake in what was asked; 75:
     another night is at work on one of the leagues.
     """
@@ -65,12 +67,19 @@ def nightly(
 
 
 def hold_night(config: LeagueConfig, workers: int = CORES, quiet: bool = False) -> NightReport:
-    """Hold one league's night and tell of it."""
+    """Hold one league's night, tell of it, and leave the league's page in the home."""
     from evaluation.nightly import nightly as run
+    from evaluation.pages.league_report import league_report
+    from evaluation.pages.page import write
 
     Storage.from_environment().export()
+    registry = Registry.open()
     with watched(quiet) as listener:
-        report = run(config, registry=Registry.open(), workers=workers, listener=listener)
+        report = run(config, registry=registry, workers=workers, listener=listener)
+    page = registry.storage.home / "reports" / f"{config.league}.html"
+    with disk_faults(page):
+        page.parent.mkdir(exist_ok=True)
+    write(league_report(registry, config.league), page)
     for fault in report.faults:
         errors.print(f"{config.league}: {fault}", markup=False, soft_wrap=True)
     if not quiet:
@@ -81,6 +90,7 @@ def hold_night(config: LeagueConfig, workers: int = CORES, quiet: bool = False) 
             say(sentence)
         say()
         show_standings(report.standings)
+        say(f"\nMore on {page}")
     return report
 
 

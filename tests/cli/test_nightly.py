@@ -44,12 +44,15 @@ def inbox(request: pytest.FixtureRequest) -> Iterator[Inbox]:
     thread.join()
 
 
-def test_without_an_argument_all_registered_leagues_have_their_night(league: League, registry: Registry) -> None:
+def test_without_an_argument_all_registered_leagues_have_their_night(
+    league: League, registry: Registry, home: Path
+) -> None:
     told = league("nightly", "--workers", "0")
     assert told.code == 0, told.err
     champion = registry.aliases("tictactoe")["champion"]
     assert f"tictactoe: 3 judged, the champion is now tictactoe@{champion} (before: none)." in told.out
     assert "fresh games" in told.out
+    assert f"tictactoe@{champion}" in (home / "reports" / "tictactoe.html").read_text()
     by_name = league("nightly", "tictactoe", "--workers", "0")
     assert (by_name.code, "no new version to judge" in by_name.out) == (0, True)
 
