@@ -175,10 +175,12 @@ class _Played:
         self._sides = tuple(league.interface.sides)
         self._is_rated_by_side = scoring(league.interface) == "side" and len(self._sides) > 1
         ledger = Ledger(registry)
+        purged = ledger.purged(league.slug)
         schedules = {
             schedule.id: schedule
             for schedule in ledger.schedules(league.slug)
-            if (schedule.environment_digest, schedule.sides) == (league.environment_digest, self._sides)
+            if schedule.id not in purged
+            and (schedule.environment_digest, schedule.sides) == (league.environment_digest, self._sides)
         }
         results = [result for result in ledger.results(league.slug) if result.schedule in schedules]
         self.games = 0

@@ -44,6 +44,12 @@ class Ledger:
         with self._database.read() as session:
             return _schedules(session, league)
 
+    def purged(self, league: str) -> set[str]:
+        """The schedules of a league whose matches count for nothing."""
+        table = tables.Schedule
+        with self._database.read() as session:
+            return set(session.scalars(select(table.id).where(table.league == league, table.purged_at.is_not(None))))
+
     def schedule(self, schedule: str) -> Schedule:
         """One schedule by its id. Raises NotFound."""
         with self._database.read() as session:

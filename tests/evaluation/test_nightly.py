@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from evaluation import tournament, verdicts
 from evaluation.nightly import nightly
+from evaluation.pages.league_report import league_report
 from evaluation.report import NightReport, Progress, VerdictReport
 from evaluation.verification import verify
 from league.config import LeagueConfig
@@ -429,6 +430,8 @@ def test_purged_games_count_for_nothing_and_stay(registry: Registry) -> None:
     assert len(Ledger(registry).results(examples.LEAGUE)) == before - played
     assert len(Ledger(registry).matches(league=examples.LEAGUE, schedule=row.schedule)) >= first.blocks
     assert verify(first.verdict, registry=registry).outcome == "void"
+    page = league_report(registry, examples.LEAGUE)
+    assert page.games == sum(result.games for result in Ledger(registry).results(examples.LEAGUE))
 
 
 def test_a_promotion_is_confirmed_by_fresh_games_of_fixed_length(registry: Registry) -> None:
