@@ -43,7 +43,8 @@ class Player:
         positions = list(positions)
         refs = dict.fromkeys(ref for position in positions for ref in schedule.contestants_at(position))
         roster: Roster = {ref: self.contestant(ref) for ref in refs}
-        return play(schedule, positions, self._environment, self.interface, roster, self.config.play.max_moves)
+        seated = self.interface.apart() if schedule.scoring == "team" else self.interface
+        return play(schedule, positions, self._environment, seated, roster, self.config.play.max_moves)
 
     def contestant(self, ref: str) -> dict[str, tuple[str, Policy]]:
         """agent → (policy id, policy) of a pinned reference, loaded and verified once."""

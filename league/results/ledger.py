@@ -93,14 +93,17 @@ class Ledger:
             return set(session.scalars(select(tables.Match.position).filter_by(schedule=schedule)))
 
     def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
-        """The matches of a league without their moves, in schedule order; of one environment if given."""
+        """The matches of a league without their moves, in schedule order; of one environment if given.
+
+        Without those in which the contestants were one team: they say nothing of who is stronger.
+        """
         match = tables.Match
         columns = match.schedule, match.position, match.games, match.scores, match.returns
         with self._database.read() as session:
             schedules = {
                 known.id: known
                 for known in _schedules(session, league)
-                if environment_digest in (None, known.environment_digest)
+                if environment_digest in (None, known.environment_digest) and known.scoring != "team"
             }
             found = session.execute(_in_order(select(*columns), league))
             return [

@@ -5,7 +5,9 @@ adversary's return says nothing beside that of the agents it works against, and 
 in the same game. There a contestant is compared with the other one on the same side in the other game, which has the
 same seed and opening: both have had the same task.
 
-Either way the scores of a block sum to half their number, and change places when the contestants do; so policies that
+Where both play in one team (cross-play) there is nothing to compare, and no score.
+
+Otherwise the scores of a block sum to half their number, and change places when the contestants do; so policies that
 play alike score ½ on average, whatever a seat is worth.
 """
 
@@ -24,6 +26,6 @@ def scores(returns: Sequence[Values], scoring: Scoring) -> list[Values]:
 def _score(returns: Sequence[Values], game: int, contestant: int, scoring: Scoring) -> float | None:
     mine = returns[game][contestant]
     other = returns[game if scoring == "game" else 1 - game][1 - contestant]
-    if mine is None or other is None:
+    if scoring == "team" or mine is None or other is None:
         return None
     return 1.0 if mine > other else 0.5 if mine == other else 0.0
