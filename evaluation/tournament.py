@@ -2,8 +2,8 @@
 
 Chunks are aligned, consecutive positions. A chunk that is done early waits until all before it are in the
 ledger, and a chunk is appended whole or not at all. So the ledger always holds a prefix of the schedule, the same
-whatever the number of workers, and a run that was killed goes on behind it: at most the chunks in flight are
-played again.
+whatever the number of workers, and a run that was killed goes on behind it. Of those that are under way or wait there
+are never more than workers: one chunk per worker is the most that a kill can cost.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ def run(
         running: `cluster` is its owner.
     enough: ends the schedule before its length; asked after each chunk, and before the first.
     until: matches at most; others may be in the ledger already, and are returned too.
-    Raises EnvironmentMismatch, IllegalAction, GameHung, whatever loading a contestant raises, and WorkerLost.
+    Raises EnvironmentMismatch, IllegalAction, GameHung, whatever loading a contestant raises, WorkerLost, and
+    ConfigError for a cluster of machines that do not share the registry.
     """
     ledger = Ledger(registry)
     schedule = ledger.open(schedule)
@@ -239,20 +240,21 @@ def _here(schedule: Schedule, chunks: Sequence[range], storage: Storage, config:
 def _in_ray(
     schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str, workers: int
 ) -> Generator[list[Match]]:
-    """The chunks in order.
+    """The chunks in order. A chunk begins when one of `workers` before it has been taken.
 
-    At most `workers + 1` are under way, and no more than a few done ones wait for their turn.
+    Raises ConfigError if the nodes of the cluster do not share `storage`.
     """
     if not ray.is_initialized():
         _start_ray(workers)
+    storage.check_reach({node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]})
     job = ray.put((schedule, storage, config))
     waiting = enumerate(chunks)
     flying: dict[ray.ObjectRef, int] = {}
     done: dict[int, list[Match]] = {}
     due = 0
     while due < len(chunks):
-        room = min(workers + 1 - len(flying), 4 * workers - len(flying) - len(done))
-        flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, max(0, room))}
+        room = workers - len(flying) - len(done)
+        flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
         if due in done:
             yield done.pop(due)
             due += 1
