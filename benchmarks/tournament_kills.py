@@ -112,6 +112,8 @@ class _Stage:
     driver: subprocess.Popen = field(init=False)
 
     def __post_init__(self) -> None:
+        # A node that starts beside others on two busy cores may take longer than Ray's 30 s.
+        os.environ["RAY_raylet_start_wait_time_s"] = str(int(PATIENCE))  # noqa: SIM112
         self.cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
         self.nodes = [self.cluster.add_node(num_cpus=1) for _ in range(NODES)]
         self.driver = self._start()
