@@ -51,7 +51,11 @@ LONG = 0.5
 PRECISE = 0.02
 """What is left of a Newton step that is solved. Steps are taken until they are short, so this costs no precision."""
 
+MOST_DIRECTIONS = 100
+"""Of conjugate gradients in a step. What is solved worse still leads uphill, and another step follows."""
+
 TINY = 1e-300
+"""Less than any curvature that matters."""
 
 CELLS_AT_ONCE = 1_000_000
 """Resamples are worked off in chunks of at most this many random numbers, which bounds memory, and fits caches."""
@@ -231,7 +235,9 @@ class _Model:
         towards = solved = cho_solve(factor, residual.T, check_finite=False).T
         left = (residual * solved).sum(axis=1)
         enough = PRECISE**2 * left
-        while (left > enough).any():
+        for _ in range(MOST_DIRECTIONS):
+            if not (left > enough).any():
+                break
             curved = (information * (towards @ self._design.T)) @ self._design
             # A row that is at its maximum has nothing left to divide.
             length = (left / np.maximum((towards * curved).sum(axis=1), TINY))[:, None]
