@@ -8,7 +8,7 @@ rating is 0 by definition. Who is connected to the anchor by no chain of games h
 Intervals come from the Bayesian bootstrap over blocks (weights of independent Exp(1) law on each block, and
 on the virtual draw as one more observation), refitting at each resample: the block, not the game, is the
 independent unit, and a series without a single defeat still gets an honest, wide interval where resampling
-with replacement would give none. Of very large tables (a hundred thousand pairs) the refits would take minutes, and
+with replacement would give none. Of very large tables (75,000 pairs and more) the refits would take minutes, and
 tell what the normal law tells to which they tend: there the interval is that of the sandwich estimator.
 
 Sources: R. A. Bradley and M. E. Terry, "Rank analysis of incomplete block designs" (1952); D. R. Hunter, "MM
@@ -42,7 +42,7 @@ ELO = 400 / math.log(10)
 TOLERANCE = 1e-3 / ELO
 """A fit has settled when no rating moves by more than a thousandth of an Elo."""
 
-MOST_CELLS = 100_000_000
+MOST_CELLS = 75_000_000
 """Random numbers beyond which intervals come from the law that the bootstrap tends to."""
 
 LONG = 0.5
