@@ -27,6 +27,7 @@ import torch
 from pettingzoo.classic import connect_four_v3
 from ray.rllib.core.columns import Columns
 
+from benchmarks import adaptive_ranking, rating_speed, tournament_kills
 from benchmarks.evaluated_league import CONFIG, publish
 from evaluation.player import Player
 from evaluation.schedule import round_robin
@@ -165,7 +166,13 @@ def _told(what: str, ratio: float, target: float) -> bool:
     return ratio >= target
 
 
-PARTS: dict[str, Callable[[bool], bool]] = {"throughput": throughput, "workers": workers}
+PARTS: dict[str, Callable[[bool], bool]] = {
+    "throughput": throughput,
+    "workers": workers,
+    "ratings": lambda quick: not rating_speed.run(quick),
+    "adaptive": lambda quick: not adaptive_ranking.run(quick),
+    "kills": lambda quick: not tournament_kills.run(quick),
+}
 """name → what measures it, quickly or not, and says whether its targets are met."""
 
 

@@ -1,18 +1,30 @@
 """`league evaluate`."""
 
 import os
+from collections.abc import Sequence
+from enum import Enum
 from typing import Annotated
 
 import typer
 
 from cli.output import elo, emit, errors, say, table
 from cli.watching import difference, watched
-from evaluation.report import EvaluationReport, Standing
+from evaluation.report import CrossPlay, Estimate, EvaluationReport, Population, Standing
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.settings import Storage
 
 CORES = os.cpu_count() or 1
+
+
+class Schedule(Enum):
+    """What `league evaluate` can play."""
+
+    round_robin = "round_robin"
+    gauntlet = "gauntlet"
+    adaptive = "adaptive"
+    cross_play = "cross_play"
+
 
 Workers = Annotated[int, typer.Option(min=0, help="Ray tasks that play at once; 0 plays in this process.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
@@ -24,17 +36,42 @@ def evaluate(
         list[str] | None,
         typer.Argument(metavar="[REF]…", help="Who plays, e.g. connect_four@3. Default: all versions."),
     ] = None,
+    schedule: Annotated[
+        Schedule,
+        typer.Option(
+            help="round_robin: everybody meets everybody. gauntlet: each REF meets those of --against. adaptive: those "
+            "meet whose order is least plain, in a quarter of the games. cross_play: REFs play together in one team."
+        ),
+    ] = Schedule.round_robin,
+    against: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="REF", help="Whom each REF meets in a gauntlet; repeat it. Default: the champion and the scripts."
+        ),
+    ] = None,
     blocks: Annotated[
-        int, typer.Option(min=1, help="Matches of each pair; a match is two games from one seed, places changed.")
-    ] = 32,
+        int | None,
+        typer.Option(
+            min=1,
+            help="Matches of each pair; a match is two games from one seed, places changed. Adaptive: a quarter of "
+            "that on average. Default: 32, or as many as --games, --minutes and --precision allow.",
+        ),
+    ] = None,
+    games: Annotated[int | None, typer.Option(min=2, help="End after this many games.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="End after this long.")] = None,
+    precision: Annotated[
+        float | None, typer.Option(metavar="ELO", help="End when each rating's 95 % interval is within ± this many.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Another one plays fresh games.")] = 0,
     workers: Workers = CORES,
     as_json: AsJson = False,
 ) -> None:
-    """Play a round robin and show who stands where. The scripts `random` and `one_ply` take part where they can.
+    """Play a tournament and show who stands where. The scripts `random` and `one_ply` take part where they can.
 
-    Nothing is promoted: that is what `league nightly` and `league promote` do. All matches count for the ratings.
+    Nothing is promoted: that is what `league nightly` and `league promote` do. All matches count for the ratings, but
+    for those of cross-play. Started again, it goes on where it was.
     """
+    from evaluation.budget import Budget
     from evaluation.tournament import evaluate as run
 
     Storage.from_environment().export()
@@ -43,7 +80,10 @@ def evaluate(
             check_slug("league", league),
             refs or (),
             registry=Registry.open(),
+            schedule=schedule.value,
+            against=against or (),
             blocks=blocks,
+            budget=Budget(games, minutes, precision),
             workers=workers,
             seed=seed,
             listener=listener,
@@ -51,7 +91,10 @@ def evaluate(
     if as_json:
         emit(report.to_json())
         return
-    say(f"{league}: {report.games} games, {report.distinct_games} of them different\n")
+    say(f"{league}: {report.games} games, {report.distinct_games} of them different{_ENDS[report.stopped_by]}\n")
+    if report.cross_play is not None:
+        _show_cross_play(report.cross_play)
+        return
     show_standings(report.standings)
     for side, standings in report.by_side.items():
         say(f"\nAs {side}:")
@@ -59,6 +102,16 @@ def evaluate(
     _show_payoff(report)
     for ref, lost in report.forfeits.items():
         errors.print(f"{ref} forfeited {lost} games: it had no legal action to give", markup=False, soft_wrap=True)
+    if report.population is not None:
+        _show_population(report.payoff.contestants, report.population)
+
+
+_ENDS = {
+    "schedule": "",
+    "games": "; the games are used up",
+    "minutes": "; cut short, as the time was up",
+    "precision": "; the ratings are precise enough",
+}
 
 
 def show_standings(standings: tuple[Standing, ...]) -> None:
@@ -88,6 +141,34 @@ def _show_payoff(report: EvaluationReport) -> None:
         say("\nMean return of the row minus that of the column in the same blocks [95 %]:")
         cells = [[None if gap is None else difference(gap) for gap in row] for row in payoff.difference]
         table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
+
+
+def _show_population(contestants: Sequence[str], shares: Population) -> None:
+    say("\nShares of a population of imitators (α-Rank), and of the equilibrium of picking whom to play (Nash) [95 %]:")
+    rows = zip(contestants, map(_share, shares.alpha_rank), map(_share, shares.nash), strict=True)
+    table(("contestant", "α-Rank", "Nash"), rows)
+
+
+def _share(estimate: Estimate) -> str:
+    """`0.250 [0.100, 0.400]`"""
+    bounds = "" if estimate.low is None or estimate.high is None else f" [{estimate.low:.3f}, {estimate.high:.3f}]"
+    return f"{estimate.value:.3f}{bounds}"
+
+
+def _show_cross_play(cross: CrossPlay) -> None:
+    say("Mean return of the team [95 %]: the row plays one agent, which goes round, and the column all others:")
+    names = [_short(ref) for ref in cross.contestants]
+    cells = [[_span(cell) for cell in row] for row in cross.returns]
+    table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
+    say(f"\nWith itself {_span(cross.own) or '–'}, with others {_span(cross.mixed) or '–'}.")
+
+
+def _span(estimate: Estimate | None) -> str | None:
+    """`-21.5 [-22.1, -20.9]`"""
+    if estimate is None:
+        return None
+    bounds = "" if estimate.low is None or estimate.high is None else f" [{estimate.low:.4g}, {estimate.high:.4g}]"
+    return f"{estimate.value:.4g}{bounds}"
 
 
 def _short(ref: str) -> str:

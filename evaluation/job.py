@@ -21,6 +21,7 @@ from typing import Any, Self
 import ray
 from ray.exceptions import RayError
 
+from evaluation.budget import Budget
 from evaluation.nightly import nightly
 from evaluation.report import EvaluationReport, Listener, NightReport, Progress, VerdictReport
 from evaluation.runners import Order
@@ -79,7 +80,10 @@ def _report(
                 evaluation.league,
                 asked.contestants,
                 registry=registry,
+                schedule=asked.schedule,
+                against=asked.against,
                 blocks=asked.blocks,
+                budget=Budget(asked.games, asked.minutes, asked.precision),
                 seed=asked.seed,
                 workers=tasks,
                 listener=listener,

@@ -111,14 +111,22 @@ def nash_averaging(payoff: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def _support(table: Floats) -> NDArray[np.intp]:
-    """Who is played in some equilibrium: the greatest share that an equilibrium `table @ p <= 0` can give each."""
+    """Who is played in some equilibrium: an equilibrium p in which everybody either is, or loses against it.
+
+    There is one (A. Goldman and A. Tucker, "Theory of linear programming", 1956), and who loses against it is in no
+    other. It has the greatest t with `p - table @ p >= t`.
+    """
     size = len(table)
-    found = np.zeros(size, dtype=bool)
-    for one in range(size):
-        if not found[one]:
-            solved = linprog(-np.eye(size)[one], A_ub=table, b_ub=np.zeros(size), A_eq=np.ones((1, size)), b_eq=[1.0])
-            found |= np.asarray(solved.x) > EXPLOITABLE
-    return np.flatnonzero(found)
+    ones, no_gain = np.ones((size, 1)), np.concatenate([table, np.zeros((size, 1))], axis=1)
+    solved = linprog(
+        -np.eye(size + 1)[size],
+        A_ub=np.concatenate([no_gain, np.concatenate([table - np.eye(size), ones], axis=1)]),
+        b_ub=np.zeros(2 * size),
+        A_eq=np.append(np.ones(size), 0.0)[None],
+        b_eq=[1.0],
+    )
+    share = np.asarray(solved.x)[:size]
+    return np.flatnonzero(share > -table @ share)
 
 
 def _most_even(inside: Floats, outside: Floats) -> Floats:
@@ -197,8 +205,6 @@ def _checked(scores: ArrayLike) -> Floats:
 
 SMALLEST = 1e-250
 """Rate at which a population goes over to who always loses; any that is positive."""
-EXPLOITABLE = 1e-9
-"""Share below which a contestant counts as not played."""
 RANK = 1e-9
 """Singular values below this, relative to the largest, are zero."""
 

@@ -47,12 +47,13 @@ class Player:
         positions = list(positions)
         refs = dict.fromkeys(ref for position in positions for ref in schedule.contestants_at(position))
         roster: Roster = {ref: self.contestant(ref) for ref in refs}
+        seated = self.interface.apart() if schedule.scoring == "team" else self.interface
         settings = self.config.play
         deadline = Deadline(settings.game_seconds, expendable)
         environment = self._environment or stepping(self.config.environment, settings.copies)
         # What was interrupted anywhere is not used again, nor closed: that may hang, too.
         self._environment = None
-        matches = play(schedule, positions, environment, self.interface, roster, settings.max_moves, deadline)
+        matches = play(schedule, positions, environment, seated, roster, settings.max_moves, deadline)
         self._environment = environment
         return matches
 

@@ -8,12 +8,13 @@ rating is 0 by definition. Who is connected to the anchor by no chain of games h
 Intervals come from the Bayesian bootstrap over blocks (weights of independent Exp(1) law on each block, and
 on the virtual draw as one more observation), refitting at each resample: the block, not the game, is the
 independent unit, and a series without a single defeat still gets an honest, wide interval where resampling
-with replacement would give none.
+with replacement would give none. Of very large tables (75,000 pairs and more) the refits would take minutes, and
+tell what the normal law tells to which they tend: there the interval is that of the sandwich estimator.
 
 Sources: R. A. Bradley and M. E. Terry, "Rank analysis of incomplete block designs" (1952); D. R. Hunter, "MM
 algorithms for generalized Bradley–Terry models" (2004) for existence and connectedness; D. B. Rubin, "The
 Bayesian bootstrap" (1981); M. A. Newton and A. E. Raftery, "Approximate Bayesian inference with the weighted
-likelihood bootstrap" (1994).
+likelihood bootstrap" (1994); H. White, "Maximum likelihood estimation of misspecified models" (1982).
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import expit
+from scipy.special import expit, ndtri
 
 from league.results.records import BlockResult
 
@@ -41,8 +42,23 @@ ELO = 400 / math.log(10)
 TOLERANCE = 1e-3 / ELO
 """A fit has settled when no rating moves by more than a thousandth of an Elo."""
 
-CELLS_AT_ONCE = 4_000_000
-"""Resamples are worked off in chunks of at most this many random numbers, which bounds memory."""
+MOST_CELLS = 75_000_000
+"""Random numbers beyond which intervals come from the law that the bootstrap tends to."""
+
+LONG = 0.5
+"""Log odds. Newton's method may overshoot with longer steps, not with shorter ones."""
+
+PRECISE = 0.02
+"""What is left of a Newton step that is solved. Steps are taken until they are short, so this costs no precision."""
+
+MOST_DIRECTIONS = 100
+"""Of conjugate gradients in a step. What is solved worse still leads uphill, and another step follows."""
+
+TINY = 1e-300
+"""Less than any curvature that matters."""
+
+CELLS_AT_ONCE = 1_000_000
+"""Resamples are worked off in chunks of at most this many random numbers, which bounds memory, and fits caches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +92,14 @@ def rate(
     ratings = dict.fromkeys(names, Rating(None, None, None)) | {anchor: Rating(0.0, 0.0, 0.0)}
     size, base = int(rated.sum()), int(index[number[anchor]])
     if size > 1:
-        elo = ELO * bradley_terry(*table.sums(), table.pairs, size, base)[0]
-        tail = (1 - confidence) / 2 * 100
-        spread = ELO * table.resampled(size, base, resamples, seed)
-        low, high = np.percentile(spread, (tail, 100 - tail), axis=0)
+        fitted, tail = bradley_terry(*table.sums(), table.pairs, size, base)[0], (1 - confidence) / 2
+        if resamples * len(table.number) > MOST_CELLS:
+            half = float(ndtri(1 - tail)) * table.deviation(fitted, base)
+            low, high = fitted - half, fitted + half
+        else:
+            low, high = np.quantile(table.resampled(fitted, base, resamples, seed), (tail, 1 - tail), axis=0)
         for name in itertools.compress(names, rated):
-            ratings[name] = Rating(*(float(x[index[number[name]]]) for x in (elo, low, high)))
+            ratings[name] = Rating(*(float(ELO * x[index[number[name]]]) for x in (fitted, low, high)))
     return ratings
 
 
@@ -123,19 +141,35 @@ class _Table:
         points = np.add.reduceat(weight * (self.games * self.score), starts, axis=1) + prior / 2
         return points, games
 
-    def resampled(self, size: int, anchor: int, resamples: int, seed: int) -> Floats:
-        """Log odds (resamples, size) refitted under random weights; `k` blocks of one kind weigh Gamma(k, 1)
-        together.
+    def resampled(self, fitted: Floats, anchor: int, resamples: int, seed: int) -> Floats:
+        """Log odds (resamples, size) refitted under random weights, from those of all blocks alike (size,) on; `k`
+        blocks of one kind weigh Gamma(k, 1) together.
         """
         rng = np.random.default_rng(seed)
         chunk = max(1, min(resamples, CELLS_AT_ONCE // len(self.number)))
-        fitted = []
+        model = _Model(self.pairs, len(fitted), anchor, near=fitted, games=self.sums()[1])
+        refitted = []
         for start in range(0, resamples, chunk):
             rows = min(chunk, resamples - start)
             weight = rng.standard_gamma(self.number, size=(rows, len(self.number)))
             prior = rng.standard_exponential(size=(rows, len(self.pairs)))
-            fitted.append(bradley_terry(*self.sums(weight, prior), self.pairs, size, anchor))
-        return np.concatenate(fitted)
+            refitted.append(model.fit(*self.sums(weight, prior)))
+        return np.concatenate(refitted)
+
+    def deviation(self, fitted: Floats, anchor: int) -> Floats:
+        """Standard deviation (size,) of the log odds under random weights, as there come to be many blocks.
+
+        The sandwich `H^-1 J H^-1` of the Hessian H and the sum J of squared gradients, of blocks and of virtual draws.
+        """
+        p = expit(fitted[self.pairs[:, 0]] - fitted[self.pairs[:, 1]])
+        starts = np.flatnonzero(np.diff(self.pair, prepend=-1))
+        games = np.add.reduceat(self.number * self.games, starts) + 1
+        surprise = self.number * (self.games * (self.score - p[self.pair])) ** 2
+        squares = np.add.reduceat(surprise, starts) + (0.5 - p) ** 2
+        design = _design(self.pairs, len(fitted))[:, np.arange(len(fitted)) != anchor]
+        inverse = cho_solve(_factor(design, games * p * (1 - p)), np.eye(design.shape[1]))
+        variance = np.einsum("ij,ij->i", inverse @ _weighted(design, squares), inverse)
+        return np.insert(np.sqrt(variance), anchor, 0.0)
 
 
 def _connected(table: _Table, contestants: int, anchor: int) -> NDArray[np.bool_]:
@@ -146,55 +180,89 @@ def _connected(table: _Table, contestants: int, anchor: int) -> NDArray[np.bool_
 
 
 def bradley_terry(points: Floats, games: Floats, pairs: Ints, size: int, anchor: int) -> Floats:
-    """Log odds (resamples, size) that maximise the likelihood of each row of `points` and `games` (resamples, p).
+    """Log odds (resamples, size) that maximise the likelihood of each row of `points` and `games` (resamples, p)."""
+    return _Model(pairs, size, anchor).fit(points, games)
 
-    Newton steps in which rows share one matrix, the Hessian at their mean: one factorisation per step, however many
-    resamples there are. A group of rows too different for that is split in two; a row alone is Newton's method proper.
+
+class _Model:
+    """Newton's method for many rows at once, each with its own points and games of the same pairs.
+
+    Each step is solved by conjugate gradients, whose preconditioner all rows share: one factorisation, however many
+    rows there are. Without more it is the mean of the rows' Hessians at each step: of one row, the Hessian itself.
+    near: log odds (size,) near all answers, at which `games` (1, p) give the preconditioner of all steps.
     """
-    design = _design(pairs, size)
-    theta, groups = np.zeros((len(points), size)), [np.arange(len(points))]
-    while groups:
-        rows = groups.pop()
-        theta[rows], unsettled = _newton(theta[rows], points[rows], games[rows], design, anchor)
-        rest = rows[unsettled]
-        if len(rest) > 1:
-            spread = theta[rest].var(axis=0).argmax()
-            rest = rest[np.argsort(theta[rest, spread])]
-        groups.extend(half for half in np.array_split(rest, min(2, len(rest)) or 1) if len(half))
-    return theta
+
+    def __init__(
+        self, pairs: Ints, size: int, anchor: int, near: Floats | None = None, games: Floats | None = None
+    ) -> None:
+        self._design, self._anchor = _design(pairs, size)[:, np.arange(size) != anchor], anchor
+        self._start = np.delete(np.zeros(size) if near is None else near - near[anchor], anchor)
+        self._factor = None
+        if games is not None:
+            p = expit(self._start @ self._design.T)
+            self._factor = _factor(self._design, games[0] * p * (1 - p))
+
+    def fit(self, points: Floats, games: Floats) -> Floats:
+        """Log odds (resamples, size) that maximise the likelihood of each row, as `bradley_terry` does."""
+        theta, rows = np.repeat(self._start[None], len(points), axis=0), np.arange(len(points))
+        while len(rows):
+            step = self._step(theta[rows], points[rows], games[rows])
+            theta[rows] += step
+            rows = rows[np.abs(step).max(axis=1) > TOLERANCE]
+        return np.insert(theta, self._anchor, 0.0, axis=1)
+
+    def _step(self, theta: Floats, points: Floats, games: Floats) -> Floats:
+        """A step of each row uphill. Where it is long it is halved until the concave likelihood does not fall."""
+        gap = theta @ self._design.T
+        p = expit(gap)
+        step = self._solve(games * p * (1 - p), (points - games * p) @ self._design)
+        long = np.flatnonzero(np.abs(step).max(axis=1) > LONG)
+        if len(long):
+            points, games, gap, step_gap = points[long], games[long], gap[long], step[long] @ self._design.T
+            scale, floor = np.ones((len(long), 1)), _likelihood(points, games, gap) - 1e-9
+            while (worse := _likelihood(points, games, gap + scale * step_gap) < floor).any():
+                scale[worse] /= 2
+            step[long] *= scale
+        return step
+
+    def _solve(self, information: Floats, gradient: Floats) -> Floats:
+        """Row by row x (resamples, n) with `design.T diag(information) design x = gradient`, but for a part `PRECISE`.
+
+        Preconditioned conjugate gradients; J. Nocedal and S. Wright, "Numerical optimization" (2006), algorithm 5.3.
+        """
+        factor = self._factor or _factor(self._design, information.mean(axis=0))
+        x, residual = np.zeros_like(gradient), gradient
+        towards = solved = cho_solve(factor, residual.T, check_finite=False).T
+        left = (residual * solved).sum(axis=1)
+        enough = PRECISE**2 * left
+        for _ in range(MOST_DIRECTIONS):
+            if not (left > enough).any():
+                break
+            curved = (information * (towards @ self._design.T)) @ self._design
+            # A row that is at its maximum has nothing left to divide.
+            length = (left / np.maximum((towards * curved).sum(axis=1), TINY))[:, None]
+            x, residual = x + length * towards, residual - length * curved
+            solved = cho_solve(factor, residual.T, check_finite=False).T
+            before, left = left, (residual * solved).sum(axis=1)
+            towards = solved + (left / np.maximum(before, TINY))[:, None] * towards
+        return x
 
 
-def _design(pairs: Ints, size: int) -> csr_array:
+def _design(pairs: Ints, size: int) -> csc_array:
     """The matrix (p, size) that takes log odds to the gap of each pair."""
     rows = np.tile(np.arange(len(pairs)), 2)
-    return csr_array((np.repeat([1.0, -1.0], len(pairs)), (rows, pairs.T.reshape(-1))), shape=(len(pairs), size))
+    return csc_array((np.repeat([1.0, -1.0], len(pairs)), (rows, pairs.T.reshape(-1))), shape=(len(pairs), size))
 
 
-def _newton(
-    theta: Floats, points: Floats, games: Floats, design: csr_array, anchor: int, steps: int = 20
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """At most `steps` damped Newton steps from `theta`; returns where they led, and which rows have not settled.
+def _factor(design: csc_array, information: Floats) -> tuple[Floats, bool]:
+    """The Hessian of pairs with this `information` (p,), factorised."""
+    factor: tuple[Floats, bool] = cho_factor(_weighted(design, information), check_finite=False)
+    return factor
 
-    A row's step is halved until its concave likelihood does not fall.
-    """
-    free = np.arange(theta.shape[1]) != anchor
-    mean_games = games.mean(axis=0)
-    for _ in range(steps):
-        gap = theta @ design.T
-        gradient = (points - games * expit(gap)) @ design
-        p = expit(gap.mean(axis=0))
-        hessian = (design.T @ design.multiply((mean_games * p * (1 - p))[:, None])).toarray()[np.ix_(free, free)]
-        step = np.zeros_like(theta)
-        step[:, free] = cho_solve(cho_factor(hessian), gradient[:, free].T).T
-        step_gap = step @ design.T
-        scale, floor = np.ones((len(theta), 1)), _likelihood(points, games, gap) - 1e-9
-        while (worse := _likelihood(points, games, gap + scale * step_gap) < floor).any():
-            scale[worse] /= 2
-        theta = theta + scale * step
-        unsettled = np.abs(step).max(axis=1) > TOLERANCE
-        if not unsettled.any():
-            break
-    return theta, unsettled
+
+def _weighted(design: csc_array, weight: Floats) -> Floats:
+    """`design.T diag(weight) design`"""
+    return np.asarray((design.T @ design.multiply(weight[:, None])).toarray())
 
 
 def _likelihood(points: Floats, games: Floats, gap: Floats) -> Floats:

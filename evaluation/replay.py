@@ -15,7 +15,7 @@ from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, IllegalAction
 from league.interface import Interface
 from league.policies.policy import Actions, Arrays
-from league.results.records import Action, Match
+from league.results.records import Action, Game, Match
 from league.spaces import DictSpace, Space
 
 
@@ -46,11 +46,16 @@ def replay(
     assert moment is not None, "a game has a beginning"
     agents = environment.agents
     returns = [moment.returns[agent] for agent in agents]
-    replayed = contestant_returns(returns, sides_of(agents, interface), game.sides)
+    replayed = contestant_returns(returns, sides_of(agents, seated(interface, game)), game.sides)
     if record.left or replayed != game.returns:
         raise EnvironmentMismatch(
             f"match {match.id} cannot be replayed: game {index} returned {replayed}, {game.returns} in the record"
         )
+
+
+def seated(interface: Interface, game: Game) -> Interface:
+    """The interface with the sides that a game was played with: in cross-play each agent of the team is one."""
+    return interface if len(game.sides) == len(interface.sides) else interface.apart()
 
 
 def _check_forfeits(match: Match, index: int, moment: Moment, interface: Interface) -> None:

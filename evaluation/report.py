@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from league.results.records import Scoring
 
@@ -73,10 +73,53 @@ class Payoff(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class EvaluationReport(Document):
-    """A round robin: who stands where, best first, and who beats whom.
+class Estimate(Document):
+    """A value with the bounds of its 95 % interval, None where that takes more games."""
 
+    value: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Population(Document):
+    """What follows from the whole payoff table, for each contestant in its order: shares that sum to 1.
+
+    alpha_rank: of the time that a population of imitators spends at it. nash: in the most even equilibrium of picking
+    a contestant to play.
+    """
+
+    alpha_rank: tuple[Estimate, ...]
+    nash: tuple[Estimate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CrossPlay(Document):
+    """Mean returns of a team (per agent, in the environment's own unit) in which two contestants play together.
+
+    returns[i][j]: contestant i plays one agent, which goes round the team, and j all others; on the diagonal i plays
+    all of them; None if they have not. own: the mean of the diagonal. mixed: that of all the rest.
+    """
+
+    contestants: tuple[str, ...]
+    returns: tuple[tuple[Estimate | None, ...], ...]
+    own: Estimate | None
+    mixed: Estimate | None
+
+
+StoppedBy = Literal["schedule", "games", "minutes", "precision"]
+"""What ended an evaluation: its schedule's end, a budget, or ratings that were precise enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationReport(Document):
+    """A tournament: who stands where, best first, and who beats whom; or how well contestants play together.
+
+    schedule: the id of its schedule; of an adaptive tournament, what the ids of its rounds begin with.
+    kind: `round_robin`, `gauntlet`, `adaptive` or `cross_play`.
     by_side: who stands where on each side; empty where sides are alike, or there is one.
+    population: None unless everybody has met everybody, as in a round robin.
+    cross_play: None in a tournament; where it is given, there are neither standings nor payoffs.
     forfeits: who forfeited how many games; nobody else is named.
     """
 
@@ -90,6 +133,10 @@ class EvaluationReport(Document):
     scoring: Scoring
     by_side: dict[str, tuple[Standing, ...]]
     forfeits: dict[str, int] = field(default_factory=dict)
+    kind: str = "round_robin"
+    stopped_by: StoppedBy = "schedule"
+    population: Population | None = None
+    cross_play: CrossPlay | None = None
 
 
 @dataclass(frozen=True, slots=True)

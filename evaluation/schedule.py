@@ -1,20 +1,22 @@
 """Schedules: who meets whom, how often, in which order. Pure: the same arguments give the same schedule and id.
 
 Two contestants meet at a time, in leagues of any number of sides (see match.py). The order goes round by round, every
-pairing once in each, so that any prefix of a schedule is balanced.
+pairing once in each, so that any prefix of a schedule is balanced. An adaptive tournament is a sequence of schedules,
+each of which follows from the results of those before it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from typing import Any
 
+from evaluation import adaptive
 from league.config import GateConfig, LeagueConfig
 from league.errors import EnvironmentMismatch
 from league.interface import Interface, digest
-from league.results.records import Schedule, Scoring
+from league.results.records import GAMES_PER_BLOCK, BlockResult, Schedule, Scoring
 from league.seeds import derive
 
 Pairing = tuple[int, ...]
@@ -35,13 +37,17 @@ def gauntlet(
     opponents: Sequence[str],
     blocks: int,
     seed: int = 0,
+    kind: str = "gauntlet",
 ) -> Schedule:
-    """Every challenger meets every opponent, but never itself, in `blocks` matches."""
+    """Every challenger meets every opponent, but never itself, in `blocks` matches.
+
+    kind: `gauntlet` is what a night plays for the rating of a new version, `challenge` what somebody asked for.
+    """
     contestants = list(dict.fromkeys([*challengers, *opponents]))
     number = {ref: i for i, ref in enumerate(contestants)}
     meetings = [(number[a], number[b]) for a in challengers for b in opponents if a != b]
     pairings = list({frozenset(pair): pair for pair in meetings}.values())
-    return _schedule(config, interface, "gauntlet", contestants, pairings, blocks * len(pairings), seed)
+    return _schedule(config, interface, kind, contestants, pairings, blocks * len(pairings), seed)
 
 
 def verdict(
@@ -74,6 +80,77 @@ def beside(
     return _schedule(config, interface, kind, contestants, [(0, 1)], blocks, verdict.seed, of=verdict.id)
 
 
+def cross_play(
+    config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int = 0
+) -> Schedule:
+    """Every pair of contestants, and each with itself, plays `blocks` matches in one team.
+
+    The sides are the team's agents: one of them is played by one contestant, the others by the other.
+    Raises EnvironmentMismatch unless the league has one side of several agents.
+    """
+    if len(interface.sides) != 1 or len(interface.agents) < 2:
+        raise EnvironmentMismatch(
+            f"cross-play mixes the agents of one team, but league {config.league} has {len(interface.sides)} side(s)"
+            f" and {len(interface.agents)} agent(s)"
+        )
+    if len(contestants) < 2:
+        raise EnvironmentMismatch(f"cross-play in league {config.league} needs two contestants")
+    pairings = list(combinations_with_replacement(range(len(contestants)), 2))
+    length = blocks * len(pairings)
+    return _schedule(config, interface.apart(), "cross_play", contestants, pairings, length, seed, "team")
+
+
+def adaptive_round(
+    config: LeagueConfig,
+    interface: Interface,
+    contestants: Sequence[str],
+    results: Sequence[BlockResult],
+    seed: int = 0,
+) -> Schedule:
+    """The round of an adaptive tournament that follows `results`, which are those of all rounds before it.
+
+    Its id says which round of which tournament it is, not who meets in it: that is in the ledger once it has begun, and
+    holds there even if another machine rounds a number differently.
+    """
+    first = _first_round(config, interface, contestants, seed)
+    turns, games = _turns(interface), GAMES_PER_BLOCK if len(interface.sides) > 1 else 1
+    pairings: Sequence[Pairing] = first.pairings
+    if results:
+        tally = adaptive.tally({ref: i for i, ref in enumerate(contestants)}, results)
+        size = adaptive.round_size(len(contestants), len(results) // turns)
+        pairings = adaptive.choose(*tally, size, comparisons=games * turns)
+    return replace(
+        first,
+        id=f"{first.id}-{len(results)}",
+        seed=derive(first.seed, len(results)),
+        pairings=tuple(pairings),
+        length=turns * len(pairings),
+    )
+
+
+def adaptive_name(config: LeagueConfig, interface: Interface, contestants: Sequence[str], seed: int = 0) -> str:
+    """What the ids of all rounds of an adaptive tournament begin with."""
+    return _first_round(config, interface, contestants, seed).id
+
+
+def adaptive_rounds(interface: Interface, contestants: int) -> Iterator[int]:
+    """How many matches have been played at the end of each round of an adaptive tournament."""
+    turns, played = _turns(interface), 0
+    while True:
+        played += adaptive.round_size(contestants, played) if played else len(adaptive.ring(contestants, 0))
+        yield turns * played
+
+
+def _first_round(config: LeagueConfig, interface: Interface, contestants: Sequence[str], seed: int) -> Schedule:
+    pairings = adaptive.ring(len(contestants), seed)
+    return _schedule(config, interface, "adaptive", contestants, pairings, _turns(interface) * len(pairings), seed)
+
+
+def _turns(interface: Interface) -> int:
+    """How often a pairing of an adaptive round is played: the seat goes round where there are more than two sides."""
+    return len(interface.sides) if len(interface.sides) > 2 else 1
+
+
 def scoring(interface: Interface) -> Scoring:
     """`game` where there are several sides and all are alike, by the spaces of their agents; else `side`.
 
@@ -94,14 +171,16 @@ def _schedule(
     pairings: Sequence[Pairing],
     length: int,
     seed: int,
+    compared: Scoring | None = None,
     of: str | None = None,
 ) -> Schedule:
+    compared = compared or scoring(interface)
     if not pairings:
         raise EnvironmentMismatch(f"a schedule of league {config.league} needs two contestants that can meet")
     content: dict[str, Any] = {
         "environment": config.environment.digest(),
         "sides": {side: list(agents) for side, agents in interface.sides.items()},
-        "scoring": scoring(interface),
+        "scoring": compared,
         "opening_plies": config.play.opening_plies,
         "contestants": list(contestants),
         "pairings": [list(pairing) for pairing in pairings],
@@ -122,5 +201,5 @@ def _schedule(
         pairings=tuple(pairings),
         length=length,
         opening_plies=config.play.opening_plies,
-        scoring=scoring(interface),
+        scoring=compared,
     )

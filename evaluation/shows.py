@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from evaluation.exhibition import Moment, exhibit
 from evaluation.play import sides_of
-from evaluation.replay import replay
+from evaluation.replay import replay, seated
 from league.config import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
 from league.errors import InvalidReference
@@ -72,7 +72,7 @@ def recorded(match: str, game: int, registry: Registry) -> Show:
         raise InvalidReference(f"match {match} has games 0 to {len(record.games) - 1}, not {game}")
     row = registry.league(record.league)
     agents = list(row.interface.agents)
-    seats = zip(agents, sides_of(agents, row.interface), strict=True)
+    seats = zip(agents, sides_of(agents, seated(row.interface, record.games[game])), strict=True)
     return Show(
         title=f"{match} · game {game}",
         config=row.config,

@@ -45,7 +45,7 @@ def _on_side(game: Game, side: int) -> Game | None:
 
 
 def ranked(results: Iterable[BlockResult], distinct_games: Mapping[str, int] | None = None) -> tuple[Standing, ...]:
-    """Sum up and rate `results`, best rating first, those without one last."""
+    """Sum up and rate `results`, best rating first; behind them those without one, by their scores."""
     results = list(results)
     games: Counter[str] = Counter()
     whole: Counter[str] = Counter()
@@ -77,4 +77,4 @@ def ranked(results: Iterable[BlockResult], distinct_games: Mapping[str, int] | N
 
 
 def _rank(standing: Standing) -> tuple[bool, float, str]:
-    return standing.rating is None, -(standing.rating or 0.0), standing.ref
+    return standing.rating is None, -(standing.score if standing.rating is None else standing.rating), standing.ref

@@ -2,8 +2,8 @@
 
 Chunks are aligned, consecutive positions. A chunk that is done early waits until all before it are in the
 ledger, and a chunk is appended whole or not at all. So the ledger always holds a prefix of the schedule, the same
-whatever the number of workers, and a run that was killed goes on behind it: at most the chunks in flight are
-played again.
+whatever the number of workers, and a run that was killed goes on behind it. Of those that are under way or wait there
+are never more than workers: one chunk per worker is the most that a kill can cost.
 """
 
 from __future__ import annotations
@@ -12,23 +12,31 @@ import logging
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from itertools import islice, pairwise
+from typing import get_args
 
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from evaluation.contestants import baselines
+from evaluation.budget import UNLIMITED, Budget, Limit
+from evaluation.contestants import ANCHOR, baselines
+from evaluation.course import DEFAULT_BLOCKS, MOST_BLOCKS, Course, Kind, draw_up
+from evaluation.cross_play import cross_play_table
 from evaluation.forfeits import forfeits
 from evaluation.gate import distinct_games
 from evaluation.ordering import InOrder
 from evaluation.payoff import tabulate
 from evaluation.player import player
-from evaluation.report import EvaluationReport, Listener, Progress
-from evaluation.schedule import round_robin
+from evaluation.population import population
+from evaluation.report import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
+from evaluation.schedule import scoring
 from evaluation.standings import by_side, ranked
-from league.errors import LeagueError, WorkerLost
+from league.errors import InvalidInput, LeagueError, WorkerLost
 from league.policies.pinning import check_eligible, eligible, pinned
+from league.refs import CHAMPION
 from league.registry.registry import Registry
+from league.registry.rows import LeagueRow
 from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match, Schedule
 from league.settings import Storage
@@ -50,6 +58,7 @@ def run(
     registry: Registry,
     workers: int = 0,
     enough: Enough | None = None,
+    until: int | None = None,
     listener: Listener | None = None,
 ) -> list[Match]:
     """Play what is missing of `schedule` and return all its matches in order.
@@ -57,13 +66,15 @@ def run(
     workers: Ray tasks at once; 0 plays in this process. Without a Ray in this process a local one is started, and left
         running: `cluster` is its owner.
     enough: ends the schedule before its length; asked after each chunk, and before the first.
-    Raises what `Player.play` does, and WorkerLost.
+    until: matches at most; others may be in the ledger already, and are returned too.
+    Raises what `Player.play` does, WorkerLost, and ConfigError for machines that do not share the registry.
     """
     ledger = Ledger(registry)
     schedule = ledger.open(schedule)
     config = registry.league(schedule.league).config
     matches = ledger.matches(league=schedule.league, schedule=schedule.id)
-    chunks = chunks_of(schedule.length, len(matches), config.play.copies)
+    end = schedule.length if until is None else min(until, schedule.length)
+    chunks = chunks_of(end, len(matches), config.play.copies)
     document = config.model_dump_json(by_alias=True)
     played = (
         _in_ray(schedule, chunks, registry.storage, document, workers)
@@ -87,40 +98,103 @@ def evaluate(
     refs: Sequence[str] = (),
     *,
     registry: Registry,
-    blocks: int = 32,
+    schedule: Kind = "round_robin",
+    against: Sequence[str] = (),
+    blocks: int | None = None,
+    budget: Budget = UNLIMITED,
     workers: int = 0,
     seed: int = 0,
     listener: Listener | None = None,
 ) -> EvaluationReport:
-    """A round robin of `refs` and the scripted baselines, every pair meeting in `blocks` matches.
+    """A tournament of `refs` and the scripted baselines; or cross-play of `refs` in one team.
 
     refs: versions, aliases (pinned to what they name now) and scripts; by default every version that was trained in the
         league's present environment.
+    schedule: in a `round_robin` every pair meets in `blocks` matches; in a `gauntlet` each of `refs` meets each of
+        `against` so often, by default the champion and the baselines; `adaptive` plays a quarter of a round robin's
+        matches, where they tell most about the ranking; `cross_play` mixes pairs of `refs` in one team.
+    blocks: by default 32, or as many as the budget allows.
     seed: other games for another seed; the same arguments again find their matches in the ledger and play nothing.
-    Raises UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and what `run` raises.
+    Raises InvalidInput for options that do not go together, UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy,
+    EnvironmentMismatch, and what `run` raises.
     """
     row = registry.league(league)
+    _check_options(schedule, against, budget)
     asked = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
-    for ref in asked:
+    opponents: list[str] = []
+    if schedule == "gauntlet":
+        opponents = [pinned(ref, league, registry) for ref in against] or _opponents(registry, row)
+    elif schedule != "cross_play":
+        asked += baselines(row.interface)
+    for ref in [*asked, *opponents]:
         check_eligible(ref, registry, row.config)
-    contestants = list(dict.fromkeys([*asked, *baselines(row.interface)]))
-    schedule = round_robin(row.config, row.interface, contestants, blocks, seed)
+    contestants = list(dict.fromkeys(asked))
+    blocks = blocks or (DEFAULT_BLOCKS if budget.is_open else MOST_BLOCKS)
+    if budget.precision is not None and ANCHOR not in [*contestants, *opponents]:
+        raise InvalidInput(f"precision: ratings are measured from {ANCHOR}, which nobody meets here")
+    course = draw_up(row.config, row.interface, schedule, contestants, opponents, blocks, seed)
     with cluster():
-        matches = run(schedule, registry=registry, workers=workers, listener=listener)
-    distinct = {ref: distinct_games(matches, ref) for ref in contestants}
-    table = ranked((match.result() for match in matches), distinct)
-    rated_by_side = schedule.scoring == "side" and len(schedule.sides) > 1
+        matches, stopped_by = _follow(course, budget, registry, workers, listener)
+    return _report(row, schedule, course, matches, stopped_by)
+
+
+def _check_options(schedule: Kind, against: Sequence[str], budget: Budget) -> None:
+    if schedule not in get_args(Kind):
+        raise InvalidInput(f"schedule: expected one of {', '.join(get_args(Kind))}, got {schedule!r}")
+    if against and schedule != "gauntlet":
+        raise InvalidInput(f"against: only a gauntlet has opponents of its own, not {schedule}")
+    if budget.precision is not None and schedule == "cross_play":
+        raise InvalidInput("precision: cross_play has no ratings that could be precise enough")
+
+
+def _opponents(registry: Registry, row: LeagueRow) -> list[str]:
+    champion = registry.aliases(row.slug).get(CHAMPION)
+    return [*([] if champion is None else [f"{row.slug}@{champion}"]), *baselines(row.interface)]
+
+
+def _follow(
+    course: Course, budget: Budget, registry: Registry, workers: int, listener: Listener | None
+) -> tuple[list[Match], StoppedBy]:
+    """Play a course, one schedule after another, as far as the budget goes."""
+    limit, matches = Limit(budget, course), list[Match]()
+
+    def enough(own: Sequence[Match]) -> bool:
+        return limit.is_reached([*matches, *own])
+
+    def tell(progress: Progress | VerdictReport) -> None:
+        if listener and isinstance(progress, Progress):
+            listener(replace(progress, played=len(matches) + progress.played, of=limit.most))
+
+    while not limit.is_reached(matches) and (schedule := course.following(matches)) is not None:
+        until = limit.most - len(matches)
+        matches += run(schedule, registry=registry, workers=workers, enough=enough, until=until, listener=tell)
+    return limit.counted(matches)
+
+
+def _report(
+    row: LeagueRow, kind: Kind, course: Course, matches: Sequence[Match], stopped_by: StoppedBy
+) -> EvaluationReport:
+    tournament = () if kind == "cross_play" else course.contestants
+    compared = "team" if kind == "cross_play" else scoring(row.interface)
+    distinct = {ref: distinct_games(matches, ref) for ref in tournament}
+    table = ranked((match.result() for match in matches), distinct) if tournament else ()
+    order, sides = [standing.ref for standing in table], tuple(row.interface.sides)
+    rated_by_side = compared == "side" and len(sides) > 1
     return EvaluationReport(
-        league=league,
-        schedule=schedule.id,
-        environment_digest=schedule.environment_digest,
+        league=row.slug,
+        schedule=course.name,
+        environment_digest=row.environment_digest,
         games=sum(len(match.games) for match in matches),
         distinct_games=distinct_games(matches),
         standings=table,
-        payoff=tabulate([standing.ref for standing in table], schedule.sides, matches),
-        scoring=schedule.scoring,
-        by_side=by_side(schedule.sides, matches) if rated_by_side else {},
-        forfeits={ref: lost for ref in contestants if (lost := forfeits(matches, ref))},
+        payoff=tabulate(order, sides, matches if tournament else ()),
+        scoring=compared,
+        by_side=by_side(sides, matches) if rated_by_side else {},
+        kind=kind,
+        stopped_by=stopped_by,
+        population=population(order, matches) if tournament else None,
+        cross_play=None if tournament else cross_play_table(course.contestants, matches),
+        forfeits={ref: lost for ref in course.contestants if (lost := forfeits(matches, ref))},
     )
 
 
@@ -172,19 +246,20 @@ def _here(schedule: Schedule, chunks: Sequence[range], storage: Storage, config:
 def _in_ray(
     schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str, workers: int
 ) -> Generator[list[Match]]:
-    """The chunks in order.
+    """The chunks in order. A chunk begins when one of `workers` before it has been taken.
 
-    At most `workers + 1` are under way, and no more than a few done ones wait for their turn.
+    Raises ConfigError if the nodes of the cluster do not share `storage`.
     """
     if not ray.is_initialized():
         _start_ray(workers)
+    storage.check_reach({node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]})
     job = ray.put((schedule, storage, config))
     waiting = enumerate(chunks)
     flying: dict[ray.ObjectRef, int] = {}
     done: InOrder[list[Match]] = InOrder()
     while done.due < len(chunks):
-        room = min(workers + 1 - len(flying), 4 * workers - len(flying) - len(done))
-        flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, max(0, room))}
+        room = workers - len(flying) - len(done)
+        flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
         if (chunk := done.take()) is not None:
             yield chunk
             continue

@@ -34,6 +34,10 @@ class Interface(BaseModel):
         """Each policy id once, in the order of its first agent."""
         return tuple(dict.fromkeys(self.policies[agent] for agent in self.agents))
 
+    def apart(self) -> "Interface":
+        """The same agents, each a side of its own: how a team is seated in which contestants play together."""
+        return self.model_copy(update={"sides": {agent: (agent,) for agent in self.agents}})
+
     def of_policy(self, policy: str) -> AgentInterface:
         """The spaces that `policy` serves: those of its first agent, which equal those of its others."""
         return next(spaces for agent, spaces in self.agents.items() if self.policies[agent] == policy)

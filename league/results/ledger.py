@@ -111,7 +111,8 @@ class Ledger:
     def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
         """The matches of a league without their moves, in schedule order; of one environment if given.
 
-        Those of purged schedules are not among them.
+        Without those of purged schedules, and those in which the contestants were one team: they say nothing of who is
+        stronger.
         """
         match = tables.Match
         columns = match.schedule, match.position, match.games, match.scores, match.returns
@@ -119,7 +120,7 @@ class Ledger:
             schedules = {
                 known.id: known
                 for known in _schedules(session, league)
-                if environment_digest in (None, known.environment_digest)
+                if environment_digest in (None, known.environment_digest) and known.scoring != "team"
             }
             found = session.execute(_in_order(select(*columns), league).where(tables.Schedule.purged_at.is_(None)))
             return [

@@ -13,9 +13,9 @@ from league.seeds import derive
 Action = Any
 """An action as JSON: an integer, or a list (of lists) of numbers, in which a float32 is the double of its value."""
 
-Scoring = Literal["game", "side"]
-"""Whom a contestant is compared with: its opponent in the same `game`, or its opponent on the same `side` in the other
-game of the block. See scoring.py."""
+Scoring = Literal["game", "side", "team"]
+"""Whom a contestant is compared with: its opponent in the same `game`, its opponent on the same `side` in the other
+game of the block, or nobody, where they are one `team`. See scoring.py."""
 
 GAMES_PER_BLOCK = 2
 
@@ -35,7 +35,7 @@ class Schedule:
     id: str
     league: str
     kind: str
-    """`verdict`, `anchor`, `confirmation`, `round_robin` or `gauntlet`"""
+    """`verdict`, `anchor`, `confirmation`, `gauntlet` (a night's); `round_robin`, `challenge`, `adaptive`, `cross_play`"""
     seed: int
     environment_digest: str
     sides: tuple[str, ...]
@@ -103,7 +103,8 @@ class Game:
     opening and actions hold every action, step by step and within a step by the agents' order in the environment, so
     that stepping a fresh environment from `seed` with them plays the same game again.
     returns[c] is contestant c's return, the mean over the agents of a side and then over its sides; scores[c] is 1, ½
-    or 0. Both are None for a contestant that took no part: where there is one side, each plays a game alone.
+    or 0. Both are None for a contestant that took no part: where there is one side, each plays a game alone. Scores are
+    None where the contestants are one team.
 
     A game that is forfeited ends there, and none of the actions of that step is among its own. Its returns are what had
     been collected until then: they are checked when it is replayed, and compared with nothing. forfeits: by whom, at
@@ -172,7 +173,7 @@ class Match:
             schedule=self.schedule,
             position=self.position,
             contestants=self.contestants,
-            games=sum(score is not None for score in scores[0]),
+            games=sum(value is not None for value in returns[0]),
             scores=tuple(sum(score for score in own if score is not None) for own in scores),
             returns=tuple(sum(value for value in own if value is not None) for own in returns) if is_whole else None,
         )

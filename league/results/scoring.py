@@ -9,7 +9,9 @@ A game that is forfeited is lost by who forfeited it, whatever it had collected,
 side, each comparison takes both games of the block: whoever forfeited one of them loses all comparisons, unless the
 other one forfeited one, too.
 
-Either way the scores of a block sum to half their number, and change places when the contestants do; so policies that
+Where both play in one team (cross-play) there is nothing to compare, and no score.
+
+Otherwise the scores of a block sum to half their number, and change places when the contestants do; so policies that
 play alike score ½ on average, whatever a seat is worth.
 """
 
@@ -39,7 +41,7 @@ def _score(
 ) -> float | None:
     mine = returns[game][contestant]
     other = returns[game if scoring == "game" else 1 - game][1 - contestant]
-    if mine is None or other is None:
+    if scoring == "team" or mine is None or other is None:
         return None
     if broken:
         mine, other = float(contestant not in broken), float(1 - contestant not in broken)

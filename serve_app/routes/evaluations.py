@@ -100,10 +100,11 @@ def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
     row = registry.league(league)
     document = asked.root.model_dump(mode="json", exclude={"reason"})
     if isinstance(asked.root, Tournament):
-        refs = [pinned(ref, league, registry) for ref in asked.root.contestants]
-        for ref in refs:
-            check_eligible(ref, registry, row.config)
-        document["contestants"] = refs or [version.ref for version in eligible(registry, league)]
+        for name in ("contestants", "against"):
+            document[name] = [pinned(ref, league, registry) for ref in getattr(asked.root, name)]
+            for ref in document[name]:
+                check_eligible(ref, registry, row.config)
+        document["contestants"] = document["contestants"] or [version.ref for version in eligible(registry, league)]
     return document
 
 

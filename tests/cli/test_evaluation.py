@@ -34,6 +34,24 @@ def test_evaluate_as_tables(league: League, registry: Registry) -> None:
     assert "script:one_ply" in out
 
 
+def test_evaluate_within_a_budget(league: League, registry: Registry) -> None:
+    options = ("--schedule", "adaptive", "--games", "41", "--workers", "0")
+    assert "40 games" in (out := league("evaluate", "tictactoe", *options).out)
+    assert "the games are used up" in out
+    document = league("evaluate", "tictactoe", *options, "--json").json
+    assert (document["kind"], document["stopped_by"], document["games"]) == ("adaptive", "games", 40)
+    assert document["population"] is None
+
+
+def test_evaluate_tells_shares_of_a_whole_table(league: League, registry: Registry) -> None:
+    told = league("evaluate", "tictactoe", "--blocks", "4", "--workers", "0")
+    assert "α-Rank" in told.out
+    population = league("evaluate", "tictactoe", "--blocks", "4", "--workers", "0", "--json").json["population"]
+    for shares in population.values():
+        assert sum(share["value"] for share in shares) == pytest.approx(1)
+        assert all(share["low"] <= share["high"] for share in shares)
+
+
 def test_a_night_judges_promotes_and_rates_and_the_next_has_nothing_to_do(
     league: League, registry: Registry, config: str
 ) -> None:

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evaluation import ratings
 from evaluation.ratings import ELO, bradley_terry, rate
 from evaluation.sequential import score_of
 from league.results.records import BlockResult
@@ -131,6 +132,36 @@ def test_resamples_fitted_together_are_resamples_fitted_alone() -> None:
     together = bradley_terry(points, games, pairs, 8, anchor=2)
     alone = [bradley_terry(points[i : i + 1], games[i : i + 1], pairs, 8, anchor=2)[0] for i in range(60)]
     assert np.abs(together - alone).max() * ELO < 0.01
+
+
+def test_resamples_of_few_and_lopsided_blocks_are_fitted_to_the_end() -> None:
+    """At the answer the gradient is nil, also far from where the fits start."""
+    rng = np.random.default_rng(8)
+    pairs = np.array([(i, j) for i in range(30) for j in range(i + 1, min(30, i + 3))])
+    games = rng.gamma(0.3, size=(200, len(pairs))) + 0.05
+    points = games * rng.beta(0.1, 0.1, size=games.shape).clip(0.01, 0.99)
+    theta = bradley_terry(points, games, pairs, 30, anchor=3)
+    gap = theta[:, pairs[:, 0]] - theta[:, pairs[:, 1]]
+    left = points - games / (1 + np.exp(-gap))
+    gradient = np.zeros_like(theta)
+    np.add.at(gradient.T, pairs[:, 0], left.T)
+    np.subtract.at(gradient.T, pairs[:, 1], left.T)
+    assert np.abs(np.delete(gradient, 3, axis=1)).max() < 1e-4
+    assert (theta[:, 3] == 0).all()
+
+
+def test_intervals_of_large_tables_are_those_that_the_bootstrap_tends_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = simulated([10.0 * i for i in range(60)], 4, np.random.default_rng(9))
+    refitted = rate(blocks, RANDOM)
+    monkeypatch.setattr(ratings, "MOST_CELLS", 0)
+    at_once = rate(blocks, RANDOM)
+    bounds = np.array([[(r.low, r.high) for r in each.values() if r.elo] for each in (refitted, at_once)], dtype=float)
+    assert bounds.shape == (2, 59, 2)
+    off = np.abs(bounds[0] - bounds[1]) / np.diff(bounds[0], axis=1)
+    assert off.mean() < 0.03
+    assert off.max() < 0.1
+    assert [r.elo for r in at_once.values()] == [r.elo for r in refitted.values()]
+    assert (at_once[RANDOM].low, at_once[RANDOM].high) == (0.0, 0.0)
 
 
 def test_intervals_cover_the_truth() -> None:

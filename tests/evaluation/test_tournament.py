@@ -3,7 +3,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from evaluation.schedule import round_robin
 from evaluation.tournament import chunks_of, evaluate, run
 from league.errors import (
     ArtifactCorrupt,
+    ConfigError,
     EnvironmentMismatch,
     UnknownAlias,
     UnknownLeague,
@@ -121,14 +122,14 @@ def test_chunks_that_finish_out_of_order_wait_for_their_turn(
 
     @ray.remote(num_cpus=1)
     def last_comes_first(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
-        """The first chunk does not end before the third has."""
+        """The first chunk does not end before the second has."""
         from tests.evaluation.waiting import until
 
         schedule, storage, config = job
         matches = player(storage, config).play(schedule, chunk)
         if chunk.start == 0:
             until(reached.exists)
-        elif chunk.start >= 2 * len(chunk):
+        else:
             reached.touch()
         return matches
 
@@ -144,20 +145,49 @@ def test_chunks_that_finish_out_of_order_wait_for_their_turn(
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_a_worker_that_dies_is_replaced(registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_is_killed_in_the_middle_of_a_chunk_is_replaced(
+    registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     schedule, died = a_schedule(registry), tmp_path / "died"
 
     @ray.remote(num_cpus=1, max_retries=tournament.RETRIES)
     def mortal(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
-        if chunk.start == 4 and not died.exists():
-            died.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
         schedule, storage, config = job
-        return player(storage, config).play(schedule, chunk)
+        here = player(storage, config)
+        for position in chunk:
+            if chunk.start == 4 and position == 6 and not died.exists():
+                died.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            here.play(schedule, [position])
+        return here.play(schedule, chunk)
 
     monkeypatch.setattr(tournament, "_play_chunk", mortal)
     assert run(schedule, registry=registry, workers=2) == undisturbed(registry, schedule)
     assert died.exists()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_no_more_chunks_are_open_than_workers(
+    registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the first chunk is not done, the other worker may play one chunk, and waits with what it could play."""
+    schedule, begun = a_schedule(registry), tmp_path / "begun"
+    begun.mkdir()
+    most_open: list[int] = []
+
+    @ray.remote(num_cpus=1)
+    def noted(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
+        (begun / str(chunk.start)).touch()
+        schedule, storage, config = job
+        return player(storage, config).play(schedule, chunk)
+
+    def watch(matches: Sequence[Match]) -> bool:
+        most_open.append(sum(int(path.name) >= len(matches) for path in begun.iterdir()))
+        return False
+
+    monkeypatch.setattr(tournament, "_play_chunk", noted)
+    run(schedule, registry=registry, workers=2, enough=watch)
+    assert max(most_open) <= 2
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -194,6 +224,51 @@ def test_a_tournament_that_was_killed_goes_on(registry: Registry, workers: int) 
     assert 9 <= len(left) < schedule.length
     assert left == expected[: len(left)]
     assert run(schedule, registry=registry) == in_ledger(registry) == expected
+
+
+NODES = """
+import sys
+import ray
+from ray.cluster_utils import Cluster
+from league.registry.registry import Registry
+from league.settings import Storage
+from evaluation.tournament import run
+from tests.evaluation.test_tournament import a_schedule
+
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+
+def listener(progress):
+    if nodes and progress.played >= 9:
+        cluster.remove_node(nodes.pop(), allow_graceful=False)
+        nodes.clear()
+        cluster.add_node(num_cpus=1)
+registry = Registry.open(Storage.at(sys.argv[1]))
+run(a_schedule(registry), registry=registry, workers=2, listener=listener)
+assert not nodes
+ray.shutdown()
+cluster.shutdown()
+"""
+
+
+def test_a_node_that_is_killed_takes_no_match_with_it(registry: Registry) -> None:
+    """Three nodes of Ray on this machine, which share its files. Kept out of this process, whose Ray is another one."""
+    command = [sys.executable, "-c", NODES, str(registry.storage.home)]
+    played = subprocess.run(command, cwd=Path(__file__).parents[2], timeout=200, check=False, capture_output=True)
+    assert played.returncode == 0, played.stderr.decode()
+    assert in_ledger(registry) == undisturbed(registry, a_schedule(registry))
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_machines_that_do_not_share_the_registry_are_refused(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    two = [{"Alive": True, "NodeManagerAddress": address} for address in ("192.0.2.1", "192.0.2.2")]
+    monkeypatch.setattr(ray, "nodes", lambda: two)
+    with pytest.raises(ConfigError, match="the cluster has 2 machines: set LEAGUE_DATABASE_URL"):
+        run(a_schedule(registry), registry=registry, workers=2)
+    assert in_ledger(registry) == []
 
 
 def test_evaluation_reports_everybody(registry: Registry) -> None:

@@ -1,0 +1,147 @@
+"""Does the adaptive schedule, with a quarter of the games, rank as well as a full round robin?
+
+Simulated: 64 contestants on a ladder, 25 Elo from one to the next; every game is drawn by the logistic model. The round
+robin plays `--matches` matches of two games between each pair (32 is the default of `league evaluate`), the adaptive
+schedule a quarter of that in all. Both are rated as the league rates, and Kendall's τ of the ratings against the truth
+is compared, seed by seed. A second ladder has uneven steps: 25 Elo on average, each one exponentially distributed.
+Target: at least the round robin's τ at the default number of matches; fewer matches are printed.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+from scipy.stats import kendalltau
+
+from evaluation.adaptive import choose, ring, round_size
+from evaluation.course import ADAPTIVE_SHARE, DEFAULT_BLOCKS
+from evaluation.ratings import bradley_terry
+from league.results.records import GAMES_PER_BLOCK
+
+CONTESTANTS = 64
+STEP = 25 * math.log(10) / 400
+"""25 Elo in log odds."""
+HEADER = (
+    "ladder",
+    "matches a pair",
+    "games: full, adaptive",
+    "τ full",
+    "τ adaptive",
+    "difference",
+    "round s",
+    "target",
+)
+
+Floats = NDArray[np.float64]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print a line for each ladder and length; 1 if the target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="10 seeds of the default length: shows that it works")
+    parser.add_argument("--seeds", type=int, default=200)
+    parser.add_argument("--matches", type=int, action="append", help="of each pair; may be repeated")
+    options = parser.parse_args(argv)
+    if options.quick:
+        return run(quick=True)
+    return compare(options.matches or [4, 10, DEFAULT_BLOCKS], options.seeds)
+
+
+def run(quick: bool = False) -> int:
+    """The benchmark with its usual settings."""
+    return compare([DEFAULT_BLOCKS] if quick else [4, 10, DEFAULT_BLOCKS], seeds=10 if quick else 200)
+
+
+def compare(lengths: Sequence[int], seeds: int) -> int:
+    """Simulate tournaments of all lengths on both ladders."""
+    print(" | ".join(HEADER), flush=True)
+    met = True
+    for name, ladder in LADDERS.items():
+        for matches in lengths:
+            met &= _tell(name, ladder, matches, seeds) or matches != DEFAULT_BLOCKS
+    return int(not met)
+
+
+def _tell(name: str, ladder: Callable[[np.random.Generator], Floats], matches: int, seeds: int) -> bool:
+    pairs = CONTESTANTS * (CONTESTANTS - 1) // 2
+    few = matches * pairs // ADAPTIVE_SHARE
+    taus, slowest = np.zeros((seeds, 2)), 0.0
+    for seed in range(seeds):
+        truth = ladder(np.random.default_rng([seed, 0]))
+        taus[seed, 0] = _tau(_round_robin(truth, matches, np.random.default_rng([seed, 1])), truth)
+        played, seconds = _adaptive(truth, few, np.random.default_rng([seed, 2]))
+        taus[seed, 1] = _tau(played, truth)
+        slowest = max(slowest, seconds)
+    full, adaptive, difference = (_mean(each) for each in (*taus.T, taus[:, 1] - taus[:, 0]))
+    met = bool((taus[:, 1] - taus[:, 0]).mean() >= 0)
+    target = ("met" if met else "MISSED (≥ 0)") if matches == DEFAULT_BLOCKS else "–"
+    games = f"{pairs * matches * GAMES_PER_BLOCK:,}, {few * GAMES_PER_BLOCK:,}"
+    print(
+        f"{name} | {matches} | {games} | {full} | {adaptive} | {difference} | {slowest:.3f} | {target}",
+        flush=True,
+    )
+    return met
+
+
+def _even(rng: np.random.Generator) -> Floats:  # noqa: ARG001
+    return STEP * np.arange(CONTESTANTS)
+
+
+def _uneven(rng: np.random.Generator) -> Floats:
+    return STEP * np.cumsum(rng.standard_exponential(CONTESTANTS))
+
+
+LADDERS = {"even": _even, "uneven": _uneven}
+
+Table = tuple[Floats, Floats]
+"""points[i, j] of i against j, games[i, j]"""
+
+
+def _round_robin(truth: Floats, matches: int, rng: np.random.Generator) -> Table:
+    first, second = np.triu_indices(CONTESTANTS, 1)
+    points, games = np.zeros((2, CONTESTANTS, CONTESTANTS))
+    number = matches * GAMES_PER_BLOCK
+    won = rng.binomial(number, expit(truth[first] - truth[second]))
+    points[first, second], points[second, first] = won, number - won
+    games[first, second] = games[second, first] = number
+    return points, games
+
+
+def _adaptive(truth: Floats, matches: int, rng: np.random.Generator) -> tuple[Table, float]:
+    """What was played, and the seconds that the slowest choice of a round took."""
+    points, games = np.zeros((2, CONTESTANTS, CONTESTANTS))
+    played, slowest = 0, 0.0
+    while played < matches:
+        began = time.perf_counter()
+        size = min(round_size(CONTESTANTS, played), matches - played)
+        pairings = choose(points, games, size) if played else ring(CONTESTANTS, int(rng.integers(2**32)))
+        slowest = max(slowest, time.perf_counter() - began)
+        for i, j in pairings[:size]:
+            won = rng.binomial(GAMES_PER_BLOCK, expit(truth[i] - truth[j]))
+            points[[i, j], [j, i]] += won, GAMES_PER_BLOCK - won
+            games[[i, j], [j, i]] += GAMES_PER_BLOCK
+        played += size
+    return (points, games), slowest
+
+
+def _tau(table: Table, truth: Floats) -> float:
+    """Of the league's ratings: Bradley–Terry with one virtual draw for each pair that has played."""
+    points, games = table
+    first, second = np.nonzero(np.triu(games))
+    pairs = np.column_stack([first, second])
+    rated = bradley_terry(points[first, second][None] + 0.5, games[first, second][None] + 1, pairs, CONTESTANTS, 0)[0]
+    return float(kendalltau(rated, truth).statistic)
+
+
+def _mean(values: Floats) -> str:
+    half = 1.96 * values.std(ddof=1) / math.sqrt(len(values))
+    return f"{values.mean():+.4f} ± {half:.4f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""How long does it take to rate 1,000 versions from a million games?
+
+Three leagues, of blocks of two games that are drawn by the logistic model:
+
+- nights: each version has met `script:random`, the ten before it and now and then an older one, in 500 blocks;
+- adaptive: each has met those near it in strength;
+- round robin: everybody has met everybody once, 499,500 pairs.
+
+Timed is `evaluation.standings.ranked`: sums, ratings, and their 95 % intervals; from the blocks in memory. Besides, the
+round robin is written into a ledger, a SQLite file, and timed once more from there. Target: 10 s each.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from evaluation.schedule import round_robin
+from evaluation.standings import ranked
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.registry import tables
+from league.registry.database import insert
+from league.registry.registry import Registry
+from league.results.documents import dump_games, dump_numbers
+from league.results.ledger import Ledger
+from league.results.records import BlockResult, Game
+from league.settings import Storage
+
+SECONDS = 10.0
+"""The target."""
+LEAGUE = "tictactoe"
+BATCH = 20_000
+
+Pairs = NDArray[np.int64]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print a line for each league; 1 if a target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="200 versions, and no ledger: shows that it works")
+    return run(parser.parse_args(argv).quick)
+
+
+def run(quick: bool = False) -> int:
+    """The benchmark with its usual settings."""
+    versions, rng = 200 if quick else 1000, np.random.default_rng(0)
+    truth = np.cumsum(rng.normal(2, 6, versions)) * np.log(10) / 400
+    print("league | games | pairs | seconds | target", flush=True)
+    met = True
+    for name, draw in LEAGUES.items():
+        pairs = draw(versions, truth, rng)
+        results = _blocks(pairs, truth, rng)
+        met &= _tell(name, pairs, lambda results=results: results)
+    if not quick:
+        with tempfile.TemporaryDirectory() as scratch:
+            registry = _written(Path(scratch), results)
+            met &= _tell("the last one, from its ledger", pairs, lambda: Ledger(registry).results(LEAGUE))
+            registry.close()
+    return int(not met)
+
+
+def _tell(name: str, pairs: Pairs, read: Callable[[], list[BlockResult]]) -> bool:
+    began = time.perf_counter()
+    table = ranked(read())
+    seconds = time.perf_counter() - began
+    assert all(standing.interval is not None for standing in table)
+    met = seconds <= SECONDS
+    met_or_not = "met" if met else f"MISSED (≤ {SECONDS:g})"
+    different = len(np.unique(np.sort(pairs, axis=1), axis=0))
+    print(f"{name} | {2 * len(pairs):,} | {different:,} | {seconds:.1f} | {met_or_not}", flush=True)
+    return met
+
+
+def _nights(versions: int, truth: NDArray[np.float64], rng: np.random.Generator) -> Pairs:  # noqa: ARG001
+    version = np.repeat(np.arange(1, versions), 500)
+    kind = rng.random(len(version))
+    before = rng.integers(1, 11, len(version))
+    older = (rng.integers(0, 20, len(version)) * version) // 20
+    opponent = np.where(kind < 0.1, 0, np.where(kind < 0.9, np.maximum(version - before, 0), older))
+    return np.column_stack([version, opponent])
+
+
+def _adaptive(versions: int, truth: NDArray[np.float64], rng: np.random.Generator) -> Pairs:
+    rank = rng.integers(0, versions, 500 * versions)
+    other = np.clip(rank + rng.integers(1, 20, len(rank)) * rng.choice([-1, 1], len(rank)), 0, versions - 1)
+    return np.argsort(truth)[np.column_stack([rank, other])[rank != other]]
+
+
+def _round_robin(versions: int, truth: NDArray[np.float64], rng: np.random.Generator) -> Pairs:  # noqa: ARG001
+    return np.column_stack(np.triu_indices(versions, 1))
+
+
+LEAGUES = {"nights": _nights, "adaptive": _adaptive, "round robin": _round_robin}
+
+
+def _name(version: int) -> str:
+    return f"{LEAGUE}@{version}" if version else "script:random"
+
+
+def _blocks(pairs: Pairs, truth: NDArray[np.float64], rng: np.random.Generator) -> list[BlockResult]:
+    won = rng.binomial(2, expit(truth[pairs[:, 0]] - truth[pairs[:, 1]])).tolist()
+    return [
+        BlockResult("schedule", at, (_name(i), _name(j)), 2, (float(own), 2.0 - own), (2.0 * own - 2, 2 - 2.0 * own))
+        for at, ((i, j), own) in enumerate(zip(pairs.tolist(), won, strict=True))
+    ]
+
+
+def _written(scratch: Path, results: Sequence[BlockResult]) -> Registry:
+    """A ledger that holds a round robin with these results; of the moves only a few, as those are not read."""
+    config = LeagueConfig.from_mapping(
+        {"league": LEAGUE, "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}}
+    )
+    registry = Registry.open(Storage.at(scratch / "home"))
+    registry.register(config, interface(config))
+    contestants = list(dict.fromkeys(ref for block in results for ref in block.contestants))
+    schedule = Ledger(registry).open(round_robin(config, interface(config), contestants, blocks=1))
+    moves = dump_games([Game((i, 1 - i), 1, (), (4, 0, 8), (1.0, -1.0), (1.0, 0.0)) for i in range(2)])
+    for start in range(0, len(results), BATCH):
+        rows = [
+            {
+                "schedule": schedule.id,
+                "position": block.position,
+                "games": block.games,
+                "scores": dump_numbers(block.scores),
+                "returns": dump_numbers(block.returns),
+                "moves": moves,
+                "played_at": datetime.now(UTC),
+            }
+            for block in results[start : start + BATCH]
+        ]
+        with registry.database.write() as session:
+            insert(session, tables.Match, rows)
+    return registry
+
+
+if __name__ == "__main__":
+    sys.exit(main())

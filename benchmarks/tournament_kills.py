@@ -1,0 +1,247 @@
+"""Is a tournament whose processes are killed again and again the same as one that is left alone?
+
+A cluster of Ray on this machine: two nodes with a worker each, beside a head without one. A driver, a process of its
+own, plays a round robin of tic-tac-toe. Again and again one of the three is killed at random by SIGKILL: the driver,
+which is started once more, the process of a worker in the middle of a chunk, or a whole node, for which another comes.
+After the last kill the tournament is left alone for a little, and ended.
+
+Every start of a chunk is written down by its worker. Counted are: matches of the ledger that an undisturbed process
+plays otherwise, or not (lost, doubled, different); chunks that were started and not in the ledger when a driver was
+killed, against one per worker; and starts of chunks that had been started before, against those and one for each worker
+and node that was killed. A chunk is held for a moment, as tic-tac-toe is quick: else few kills would hit one.
+"""
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.cluster_utils import Cluster
+
+from evaluation import tournament
+from evaluation.contestants import baselines
+from evaluation.player import player
+from evaluation.schedule import round_robin
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.registry.registry import Registry
+from league.results.ledger import Ledger
+from league.results.records import Match, Schedule
+from league.settings import Storage
+
+LEAGUE = "tictactoe"
+NODES = 2
+HOLD = 0.15
+"""Seconds that a worker keeps a chunk, besides playing it."""
+PATIENCE = 90.0
+"""Seconds after which a tournament that does not go on has failed."""
+KINDS = ("driver", "worker", "node")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print what was killed and what became of it; 1 if a target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="10 kills: shows that it works")
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="of what is killed, and when")
+    parser.add_argument("--drive", nargs=2, metavar=("SCRATCH", "ADDRESS"), help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    if options.drive:
+        _drive(Path(options.drive[0]), options.drive[1])
+        return 0
+    return torment(10 if options.quick else options.kills, options.seed)
+
+
+def run(quick: bool = False) -> int:
+    """The benchmark with its usual settings."""
+    return torment(10 if quick else 100, seed=0)
+
+
+def torment(kills: int, seed: int) -> int:
+    """Kill `kills` times; 1 if anything was lost, doubled or different, or too much was played again."""
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as scratch:
+        registry, schedule = _open(Path(scratch))
+        stage = _Stage(Path(scratch), random.Random(seed), lambda: len(Ledger(registry).positions(schedule.id)))
+        try:
+            for _ in range(kills):
+                stage.strike()
+            stage.end()
+        finally:
+            stage.close()
+        return _judge(registry, schedule, stage, time.perf_counter() - began)
+
+
+def _open(scratch: Path) -> tuple[Registry, Schedule]:
+    config = LeagueConfig.from_mapping(
+        {
+            "league": LEAGUE,
+            "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
+            "play": {"opening_plies": 1, "copies": 4},
+        }
+    )
+    registry = Registry.open(Storage.at(scratch / "home"))
+    registry.register(config, interface(config))
+    contestants = [*baselines(interface(config)), "script:first"]
+    schedule = round_robin(config, interface(config), contestants, blocks=20_000)
+    return registry, Ledger(registry).open(schedule)
+
+
+@dataclass
+class _Stage:
+    """The cluster and the driver, and whoever hurts them."""
+
+    scratch: Path
+    chance: random.Random
+    appended: Callable[[], int]
+    open_at_drivers_death: list[int] = field(default_factory=list)
+    struck: Counter[str] = field(default_factory=Counter)
+    cluster: Cluster = field(init=False)
+    nodes: list[Any] = field(init=False)
+    driver: subprocess.Popen = field(init=False)
+
+    def __post_init__(self) -> None:
+        # A node that starts beside others on two busy cores may take longer than Ray's 30 s.
+        os.environ["RAY_raylet_start_wait_time_s"] = str(int(PATIENCE))  # noqa: SIM112
+        self.cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        self.nodes = [self.cluster.add_node(num_cpus=1) for _ in range(NODES)]
+        self.driver = self._start()
+
+    def strike(self) -> None:
+        """Wait until a chunk is under way, a little more, and kill something."""
+        known = len(starts(self.scratch))
+        self._until(lambda: len(starts(self.scratch)) > known)
+        time.sleep(self.chance.uniform(0, 2 * HOLD))
+        kind = self.chance.choice(KINDS)
+        getattr(self, f"_kill_{kind}")()
+        self.struck[kind] += 1
+
+    def end(self) -> None:
+        """Leave it alone for some chunks, and have the driver stop."""
+        known = len(starts(self.scratch))
+        self._until(lambda: len(starts(self.scratch)) > known + 4 * NODES)
+        _stop(self.scratch).touch()
+        if code := self.driver.wait(timeout=PATIENCE):
+            raise RuntimeError(f"the driver has failed with exit code {code}:\n{self._log.read_text()[-2000:]}")
+
+    def close(self) -> None:
+        """End all processes."""
+        self.driver.kill()
+        self.driver.wait()
+        self.cluster.shutdown()
+
+    def _kill_driver(self) -> None:
+        self.driver.kill()
+        self.driver.wait()
+        appended = self.appended()
+        self.open_at_drivers_death.append(len({at for at, _ in starts(self.scratch) if at >= appended}))
+        self.driver = self._start()
+
+    def _kill_worker(self) -> None:
+        """One of those that were the last to start a chunk."""
+        self._until(self._hits_worker)
+
+    def _hits_worker(self) -> bool:
+        pids = [pid for _, pid in starts(self.scratch)][-NODES:]
+        for pid in self.chance.sample(pids, len(pids)):
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+                return True
+        return False
+
+    def _kill_node(self) -> None:
+        node = self.nodes.pop(self.chance.randrange(NODES))
+        self.cluster.remove_node(node, allow_graceful=False)
+        self.nodes.append(self.cluster.add_node(num_cpus=1))
+
+    def _start(self) -> subprocess.Popen:
+        command = [sys.executable, "-m", "benchmarks.tournament_kills", "--drive", str(self.scratch)]
+        with self._log.open("a") as log:
+            return subprocess.Popen([*command, self.cluster.address], stdout=log, stderr=log)
+
+    @property
+    def _log(self) -> Path:
+        return self.scratch / "driver.log"
+
+    def _until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            if self.driver.poll() is not None:
+                raise RuntimeError(f"the driver has ended by itself:\n{self._log.read_text()[-2000:]}")
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the tournament has not gone on within {PATIENCE:g} s")
+            time.sleep(0.02)
+
+
+def starts(scratch: Path) -> list[tuple[int, int]]:
+    """(first position, process) of each chunk that was started, as they were."""
+    try:
+        text = (scratch / "starts").read_text()
+    except FileNotFoundError:
+        return []
+    lines = [line.split() for line in text.splitlines()]
+    return [(int(position), int(pid)) for position, pid in lines]
+
+
+def _drive(scratch: Path, address: str) -> None:
+    """Play until somebody wants it to stop. Runs in a process of its own."""
+    ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    registry = Registry.open(Storage.at(scratch / "home"))
+    (schedule,) = Ledger(registry).schedules(LEAGUE)
+    log = str(scratch / "starts")
+
+    @ray.remote(num_cpus=1, max_retries=tournament.RETRIES)
+    def noted(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
+        # One short line, appended in one write: whole, or not there.
+        descriptor = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        os.write(descriptor, f"{chunk.start} {os.getpid()}\n".encode())
+        os.close(descriptor)
+        time.sleep(HOLD)
+        schedule, storage, config = job
+        return player(storage, config).play(schedule, chunk)
+
+    tournament._play_chunk = noted  # type: ignore[assignment]
+    tournament.run(schedule, registry=registry, workers=NODES, enough=lambda _: _stop(scratch).exists())
+
+
+def _stop(scratch: Path) -> Path:
+    return scratch / "stop"
+
+
+def _judge(registry: Registry, schedule: Schedule, stage: _Stage, seconds: float) -> int:
+    found = Ledger(registry).matches(league=LEAGUE, schedule=schedule.id)
+    document = registry.league(LEAGUE).config.model_dump_json(by_alias=True)
+    expected = player(registry.storage, document).play(schedule, range(len(found)))
+    positions = Counter(match.position for match in found)
+    lost = len(set(range(len(found))) - set(positions))
+    doubled = sum(count - 1 for count in positions.values())
+    different = sum(one != other for one, other in zip(found, expected, strict=True))
+    begun = starts(stage.scratch)
+    again = len(begun) - len({position for position, _ in begun})
+    most = max(stage.open_at_drivers_death, default=0)
+    allowed = sum(stage.open_at_drivers_death) + stage.struck["worker"] + stage.struck["node"]
+    named = ", ".join(f"{stage.struck[kind]} of a {kind}" for kind in KINDS)
+    print(f"{stage.struck.total()} kills: {named}; {len(found):,} matches in {seconds:.0f} s")
+    print("lost | doubled | different | open chunks at a driver's death, at most | chunks started again | target")
+    met = bool(found) and not (lost or doubled or different) and most <= NODES and again <= allowed
+    print(
+        f"{lost} | {doubled} | {different} | {most} of {NODES} | {again} of at most {allowed}"
+        f" | {'met' if met else 'MISSED (0, 0, 0, one per worker)'}"
+    )
+    registry.close()
+    return int(not met)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
