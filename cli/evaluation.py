@@ -27,6 +27,10 @@ class Schedule(Enum):
 
 
 Workers = Annotated[int, typer.Option(min=0, help="Ray tasks that play at once; 0 plays in this process.")]
+Address = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="Play on this Ray cluster; `auto` finds the one of this machine."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 
 
@@ -64,6 +68,7 @@ def evaluate(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Another one plays fresh games.")] = 0,
     workers: Workers = CORES,
+    address: Address = None,
     as_json: AsJson = False,
 ) -> None:
     """Play a tournament and show who stands where. The scripts `random` and `one_ply` take part where they can.
@@ -72,10 +77,11 @@ def evaluate(
     for those of cross-play. Started again, it goes on where it was.
     """
     from evaluation.budget import Budget
+    from evaluation.cluster import cluster
     from evaluation.tournament import evaluate as run
 
     Storage.from_environment().export()
-    with watched(quiet=as_json) as listener:
+    with cluster(address), watched(quiet=as_json) as listener:
         report = run(
             check_slug("league", league),
             refs or (),

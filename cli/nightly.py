@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cli.evaluation import CORES, AsJson, Workers, show_standings
+from cli.evaluation import CORES, Address, AsJson, Workers, show_standings
 from cli.output import emit, errors, say
 from cli.watching import difference, watched
 from evaluation.report import Confirmation, NightReport
@@ -31,6 +31,7 @@ def nightly(
         str | None,
         typer.Option(envvar="LEAGUE_WEBHOOK", help="POST a summary, and the reports as JSON, to this URL at the end."),
     ] = None,
+    address: Address = None,
     as_json: AsJson = False,
 ) -> None:
     """Judge each new version against the champion and the anchors, promote the better one, and rate everybody.
@@ -41,13 +42,15 @@ def nightly(
     version could not be judged, a league failed, or nobody took the webhook; 2: a mistake in what was asked; 75:
     another night is at work on one of the leagues.
     """
+    from evaluation.cluster import cluster
     from evaluation.webhook import deliver
 
     configs = _configs(leagues or ())
     reports, faults, busy = [], [], False
     for config in configs:
         try:
-            report = hold_night(config, workers, quiet=as_json)
+            with cluster(address):
+                report = hold_night(config, workers, quiet=as_json)
         except LeagueError as error:
             # The other leagues shall have their night all the same.
             sentence = f"{config.league}: {' '.join(str(error).split())}"

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 
 from evaluation import tournament, verdicts
+from evaluation.cluster import cluster
 from evaluation.contestants import ANCHOR, baselines
 from evaluation.report import Confirmation, Listener, NightReport, VerdictReport
 from evaluation.schedule import gauntlet
@@ -65,7 +66,7 @@ def nightly(
     not an error.
     """
     began = time.monotonic()
-    with registry.alone(f"nightly-{config.league}"), tournament.cluster():
+    with registry.alone(f"nightly-{config.league}"), cluster():
         registry.register(config, interface(config))
         night = _Night(registry, registry.league(config.league), workers, listener)
         before = night.champion()

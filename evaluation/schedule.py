@@ -14,7 +14,7 @@ from typing import Any
 
 from evaluation import adaptive
 from league.config import GateConfig, LeagueConfig
-from league.errors import EnvironmentMismatch
+from league.errors import ConfigError, EnvironmentMismatch
 from league.interface import Interface, digest
 from league.results.records import GAMES_PER_BLOCK, BlockResult, Schedule, Scoring
 from league.seeds import derive
@@ -151,11 +151,17 @@ def _turns(interface: Interface) -> int:
     return len(interface.sides) if len(interface.sides) > 2 else 1
 
 
-def scoring(interface: Interface) -> Scoring:
-    """`game` where there are several sides and all are alike, by the spaces of their agents; else `side`.
+def scoring(config: LeagueConfig, interface: Interface) -> Scoring:
+    """What `play.scoring` says; else `game` where there are several sides and all are alike, by the spaces of their
+    agents, and otherwise `side`.
 
-    Chess has two alike sides, an adversary and those whom it works against are unlike, a team is one side.
+    Chess has two alike sides, an adversary and those whom it works against are unlike, a team is one side. Raises
+    ConfigError for `game` where nobody else is in the same game.
     """
+    if config.play.scoring is not None:
+        if config.play.scoring == "game" and len(interface.sides) == 1:
+            raise ConfigError("play.scoring: game compares sides of one game, and there is one side only: leave it out")
+        return config.play.scoring
     kinds = {
         tuple(sorted(digest(interface.agents[agent].model_dump(mode="json")) for agent in agents))
         for agents in interface.sides.values()
@@ -174,7 +180,7 @@ def _schedule(
     compared: Scoring | None = None,
     of: str | None = None,
 ) -> Schedule:
-    compared = compared or scoring(interface)
+    compared = compared or scoring(config, interface)
     if not pairings:
         raise EnvironmentMismatch(f"a schedule of league {config.league} needs two contestants that can meet")
     content: dict[str, Any] = {

@@ -8,10 +8,9 @@ are never more than workers: one chunk per worker is the most that a kill can co
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice, pairwise
 from typing import get_args
@@ -20,6 +19,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from evaluation.budget import UNLIMITED, Budget, Limit
+from evaluation.cluster import cluster, start
 from evaluation.contestants import ANCHOR, baselines
 from evaluation.course import DEFAULT_BLOCKS, MOST_BLOCKS, Course, Kind, draw_up
 from evaluation.cross_play import cross_play_table
@@ -175,7 +175,7 @@ def _report(
     row: LeagueRow, kind: Kind, course: Course, matches: Sequence[Match], stopped_by: StoppedBy
 ) -> EvaluationReport:
     tournament = () if kind == "cross_play" else course.contestants
-    compared = "team" if kind == "cross_play" else scoring(row.interface)
+    compared = "team" if kind == "cross_play" else scoring(row.config, row.interface)
     distinct = {ref: distinct_games(matches, ref) for ref in tournament}
     table = ranked((match.result() for match in matches), distinct) if tournament else ()
     order, sides = [standing.ref for standing in table], tuple(row.interface.sides)
@@ -195,29 +195,6 @@ def _report(
         population=population(order, matches) if tournament else None,
         cross_play=None if tournament else cross_play_table(course.contestants, matches),
         forfeits={ref: lost for ref in course.contestants if (lost := forfeits(matches, ref))},
-    )
-
-
-@contextmanager
-def cluster() -> Iterator[None]:
-    """Owns the Ray that `run` may start inside the block: it ends with it. A Ray that was there before is
-    left alone.
-    """
-    owner = not ray.is_initialized()
-    try:
-        yield
-    finally:
-        if owner and ray.is_initialized():
-            ray.shutdown()
-
-
-def _start_ray(workers: int) -> None:
-    ray.init(
-        address="local",
-        num_cpus=workers,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level=logging.ERROR,
     )
 
 
@@ -250,8 +227,7 @@ def _in_ray(
 
     Raises ConfigError if the nodes of the cluster do not share `storage`.
     """
-    if not ray.is_initialized():
-        _start_ray(workers)
+    start(workers)
     storage.check_reach({node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]})
     job = ray.put((schedule, storage, config))
     waiting = enumerate(chunks)

@@ -72,6 +72,9 @@ class PlayConfig(_Part):
     opening_plies: int = Field(default=0, ge=0)
     """Random legal steps at the start of each game. A deterministic game between greedy policies needs some:
     without them it repeats one game for ever."""
+    scoring: Literal["game", "side"] | None = None
+    """Whom a contestant is compared with: its opponents in the same game, or the other contestant on the same side of
+    the block's other game. By default `game` where there are several sides and all are alike, else `side`."""
     copies: int = Field(default=32, ge=1)
     """Games stepped together in one worker. Has no influence on any result."""
     max_moves: int = Field(default=10_000, ge=1)

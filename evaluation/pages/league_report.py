@@ -151,7 +151,7 @@ def league_report(
         environment=row.config.environment.entry_point,
         environment_digest=row.environment_digest,
         sides=tuple(row.interface.sides),
-        scoring=scoring(row.interface),
+        scoring=scoring(row.config, row.interface),
         made_at=_when(now or datetime.now(UTC)),
         champion=None if champion is None else f"{league}@{champion}",
         games=played.games,
@@ -173,7 +173,7 @@ class _Played:
 
     def __init__(self, registry: Registry, league: LeagueRow) -> None:
         self._sides = tuple(league.interface.sides)
-        self._is_rated_by_side = scoring(league.interface) == "side" and len(self._sides) > 1
+        self._is_rated_by_side = scoring(league.config, league.interface) == "side" and len(self._sides) > 1
         ledger = Ledger(registry)
         purged = ledger.purged(league.slug)
         schedules = {

@@ -35,7 +35,7 @@ class Schedule:
     id: str
     league: str
     kind: str
-    """`verdict`, `anchor`, `confirmation`, `gauntlet` (a night's); `round_robin`, `challenge`, `adaptive`, `cross_play`"""
+    """`verdict`, `anchor`, `confirmation`, `gauntlet`; `round_robin`, `challenge`, `adaptive` or `cross_play`"""
     seed: int
     environment_digest: str
     sides: tuple[str, ...]

@@ -46,6 +46,7 @@ def test_each_command_and_option_explains_itself(name: str) -> None:
         (("evaluate", "tictactoe", "--minutes", "0"), ("minutes", "got 0")),
         (("evaluate", "tictactoe", "--precision", "-5"), ("precision", "got -5")),
         (("evaluate", "tictactoe", "--schedule", "cross_play"), ("cross-play", "2 side(s)")),
+        (("evaluate", "tictactoe", "--address", "127.0.0.1:1"), ("no Ray cluster at '127.0.0.1:1'",)),
         (("nightly", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
         (("train", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
         (("act", "script:random"), ("script",)),

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from evaluation.schedule import gauntlet, round_robin, scoring, verdict
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.errors import EnvironmentMismatch
+from league.errors import ConfigError, EnvironmentMismatch
 from league.results.records import Schedule
 from tests.evaluation.examples import config
 
@@ -104,4 +104,14 @@ def test_sides_are_alike_when_their_agents_have_the_same_spaces(
     has_roles = "push" in entry_point or "adversary" in entry_point
     policies = {"adversary": ["adversary_*"], "good": ["agent_*"]} if has_roles else {"shared": ["*"]}
     document = {"league": "mpe", "environment": {"entry_point": entry_point}, "policies": policies, "sides": sides}
-    assert scoring(interface(LeagueConfig.from_mapping(document))) == expected
+    league = LeagueConfig.from_mapping(document)
+    assert scoring(league, interface(league)) == expected
+
+
+def test_a_league_may_say_whom_a_contestant_is_compared_with() -> None:
+    """General-sum games between alike sides: how much either gets may matter more than who gets more."""
+    general: LeagueConfig = config(play={"scoring": "side"})
+    assert round_robin(general, INTERFACE, ["tictactoe@1", "script:random"], 3).scoring == "side"
+    alone: LeagueConfig = config(play={"scoring": "game"}, sides={"both": ["player_*"]})
+    with pytest.raises(ConfigError, match=r"play\.scoring: game compares sides"):
+        round_robin(alone, interface(alone), ["tictactoe@1", "script:random"], 3)
