@@ -193,6 +193,20 @@ class OffPolicyConfig(TrainingSettings):
         return self
 
 
+class QLearningConfig(OffPolicyConfig):
+    """What algorithms share that choose the action of the largest value."""
+
+    double: bool = True
+    """The network that learns chooses the next action, the target network values it (van Hasselt, Guez and Silver,
+    2016, arXiv 1509.06461)."""
+
+    @model_validator(mode="after")
+    def _probabilities(self) -> Self:
+        if max(self.exploration.initial, self.exploration.final) > 1:
+            raise ValueError("exploration: initial and final are probabilities of a random action, at most 1")
+        return self
+
+
 class DistributionalConfig(Part):
     """Values as distributions over atoms: C51 (Bellemare, Dabney and Munos, 2017, arXiv 1707.06887)."""
 
@@ -208,30 +222,51 @@ class DistributionalConfig(Part):
         return self
 
 
-class DQNConfig(OffPolicyConfig):
+class DQNConfig(QLearningConfig):
     """Deep Q-learning with action masks (Mnih et al., 2015, Nature 518)."""
 
     algorithm: Literal["dqn"]
-    double: bool = True
-    """The network that learns chooses the next action, the target network values it (van Hasselt, Guez and Silver,
-    2016, arXiv 1509.06461)."""
     dueling: bool = True
     """Values of states and advantages of actions have heads of their own (Wang et al., 2016, arXiv 1511.06581)."""
     noisy: bool = False
     """Explore by noise in the weights of the heads, too (Fortunato et al., 2018, arXiv 1706.10295)."""
     distributional: DistributionalConfig | None = None
 
+
+class GatedRecurrenceConfig(Part):
+    """A gated recurrent unit before the head (Cho et al., 2014, arXiv 1406.1078), which also reads the last action."""
+
+    width: int = Field(default=64, ge=1)
+    sequence: int = Field(default=50, ge=1)
+    """Steps that are learned from together. Episodes up to this length are learned from whole; of longer ones, parts
+    that begin at its multiples, without what was remembered before them."""
+
+
+class QMIXConfig(QLearningConfig):
+    """Values of actions that are mixed to a value of the team's (Rashid et al., 2018, arXiv 1803.11485)."""
+
+    algorithm: Literal["qmix"]
+    mixer: Literal["qmix", "vdn", "none"] = "qmix"
+    """How: by a monotonic network that the global state decides, by their sum (Sunehag et al., 2017, arXiv 1706.05296),
+    or not at all: each agent then learns by itself, from its own rewards."""
+    mixing_width: int = Field(default=32, ge=1)
+    """Of the hidden layer of the mixing network."""
+    groups: dict[str, tuple[str, ...]] | None = None
+    """Group → the agents whose values are mixed, as names or patterns; null: the league's sides."""
+    recurrence: GatedRecurrenceConfig | None = None
+    """A memory over the steps of an episode, null for none. Transitions of `batch_size` are then sequences."""
+
     @model_validator(mode="after")
-    def _probabilities(self) -> Self:
-        if max(self.exploration.initial, self.exploration.final) > 1:
-            raise ValueError("exploration: initial and final are probabilities of a random action, at most 1")
+    def _sequences_fit(self) -> Self:
+        if self.recurrence is not None and (self.n_step > 1 or self.priorities is not None):
+            raise ValueError("recurrence learns from whole sequences: leave n_step at 1 and priorities out")
         return self
 
 
 # Each algorithm: a class above, a member of the union, and a name here.
 
-AnyTraining = PPOConfig | DQNConfig
-ALGORITHMS = ("ppo", "dqn")
+AnyTraining = PPOConfig | DQNConfig | QMIXConfig
+ALGORITHMS = ("ppo", "dqn", "qmix")
 
 
 def _algorithm(settings: Any) -> str:
@@ -241,7 +276,7 @@ def _algorithm(settings: Any) -> str:
 
 
 TrainingConfig = Annotated[
-    Annotated[PPOConfig, Tag("ppo")] | Annotated[DQNConfig, Tag("dqn")],
+    Annotated[PPOConfig, Tag("ppo")] | Annotated[DQNConfig, Tag("dqn")] | Annotated[QMIXConfig, Tag("qmix")],
     Discriminator(_algorithm),
 ]
 """The settings of one algorithm, told apart by `algorithm`."""

@@ -62,7 +62,8 @@ class Block:
 @dataclass(frozen=True, slots=True)
 class Sample:
     """k transitions of n steps each, or fewer. rows: as above, with `discounts` (k,) float32: γ^m behind m steps, also
-    where an agent terminated. indices: to give priorities to. weights: (k,) float32 of importance; 1 if uniform."""
+    where an agent terminated. indices: to give priorities to. weights: (k,) float32 of importance, 1 if uniform; 0 of
+    rows behind the end of a sequence."""
 
     rows: Rows
     indices: NDArray
@@ -78,6 +79,7 @@ class Replay:
         self._rng = generator(seed, "replay")
         self._columns: Rows = {}
         self._following = np.full(capacity, NONE, dtype=np.int64)
+        self._positions = np.zeros(capacity, dtype=np.int64)
         # Stream → its newest row and the number of rows ever added until then, by which an overwritten one is known.
         self._newest: dict[int, int] = {}
         self._added = 0
@@ -128,6 +130,25 @@ class Replay:
             weights = (scaled / scaled.max()).astype(np.float32)
         return Sample(self.rows(indices, n_step=n_step, gamma=gamma), indices, weights)
 
+    def sample_sequences(self, size: int, length: int) -> Sample:
+        """Draw, with replacement, `size` sequences of `length` rows that follow one another in an episode.
+
+        They begin at an episode's first row, or at a multiple of `length` after it; where there is none in the buffer,
+        anywhere. Returns size · length rows, one sequence behind another. Where one ends earlier, its last row is
+        repeated with weight 0.
+        """
+        starts = np.flatnonzero(self._positions[: len(self)] % length == 0)
+        if not len(starts):
+            starts = np.arange(len(self))
+        indices = np.empty((size, length), dtype=np.int64)
+        weights = np.ones((size, length), dtype=np.float32)
+        indices[:, 0] = self._rng.choice(starts, size)
+        for step in range(1, length):
+            following = self._following[indices[:, step - 1]]
+            weights[:, step] = weights[:, step - 1] * (following != NONE)
+            indices[:, step] = np.where(following != NONE, following, indices[:, step - 1])
+        return Sample(self.rows(indices.ravel()), indices.ravel(), weights.ravel())
+
     def rows(self, indices: NDArray, *, n_step: int = 1, gamma: float = 1.0) -> Rows:
         """The transitions that begin at `indices` (k,)."""
         lasts, steps, rewards = self._returns(indices, n_step, gamma)
@@ -153,7 +174,7 @@ class Replay:
         directory.mkdir(parents=True, exist_ok=True)
         size = len(self)
         kept = {f"column/{name}": column[:size] for name, column in self._columns.items()}
-        kept |= {"following": self._following[:size]}
+        kept |= {"following": self._following[:size], "positions": self._positions[:size]}
         kept |= {"streams": np.array([*self._newest, *self._newest.values()], dtype=np.int64)}
         if self._tree is not None:
             kept["priorities"] = self._tree.get(np.arange(size))
@@ -176,6 +197,7 @@ class Replay:
                     self._columns[key.removeprefix("column/")] = whole
             self._following[:] = NONE
             self._following[: len(self)] = kept["following"]
+            self._positions[: len(self)] = kept["positions"]
             streams, newest = np.split(kept["streams"], 2)
             self._newest = dict(zip(streams.tolist(), newest.tolist(), strict=True))
             if self._tree is not None:
@@ -184,12 +206,16 @@ class Replay:
                 self._tree.set(np.arange(len(self)), known)
 
     def _link(self, block: Block) -> None:
-        """Let each row that goes on from one before be that one's successor."""
+        """Let each row that goes on from one before be that one's successor, and count the rows of an episode."""
         number = self._added
         for stream, is_first in zip(block.streams.tolist(), block.firsts.tolist(), strict=True):
             before = self._newest.get(stream, NONE)
             if not is_first and before != NONE and number - before < self.capacity:
                 self._following[before % self.capacity] = number % self.capacity
+                position = self._positions[before % self.capacity] + 1
+            else:
+                position = 0
+            self._positions[number % self.capacity] = position
             self._newest[stream] = number
             number += 1
 

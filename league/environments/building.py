@@ -115,9 +115,9 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
         for agent in names
     }
     divided = config.policies
-    policies = _mapped(divided, names) if isinstance(divided, str) else _divide("policies", divided, names)
+    policies = _mapped(divided, names) if isinstance(divided, str) else divide("policies", divided, names)
     sides = config.sides or {agent: (agent,) for agent in names}
-    side_of = _divide("sides", sides, names)
+    side_of = divide("sides", sides, names)
     _same_spaces(agents, policies)
     return Interface(
         agents=agents,
@@ -182,7 +182,7 @@ def _mapped(entry_point: str, agents: list[str]) -> dict[str, str]:
     return mapped
 
 
-def _divide(key: str, groups: dict[str, tuple[str, ...]], agents: list[str]) -> dict[str, str]:
+def divide(key: str, groups: dict[str, tuple[str, ...]], agents: list[str]) -> dict[str, str]:
     """agent → the first group one of whose patterns fits it."""
     of_agent = {}
     for agent in agents:

@@ -47,7 +47,7 @@ from training.algorithms.setup import begin_anew, configure
 from training.curves import EXPLORATION
 from training.learners.off_policy import OffPolicyLearner
 from training.modules.acting import Acting
-from training.replay import Block, Replay
+from training.replay import Block, Replay, Sample
 from training.sampling.closed import JOINT
 from training.sampling.env_runner import LEAGUE
 from training.sampling.replay_runner import JointRunner, ReplayRunner
@@ -108,6 +108,11 @@ class OffPolicy(Algorithm):
         for key, replay in self.replays.items():
             replay.reseed(derive(self.config.seed or 0, key), steps)
 
+    def draw(self, replay: Replay) -> Sample:
+        """What a gradient step learns from."""
+        settings = self.settings
+        return replay.sample(settings.batch_size, n_step=settings.n_step, gamma=settings.gamma, beta=self._beta)
+
     def save_to_path(self, path: str | Path, **kwargs: Any) -> str:
         """As RLlib's, with the buffers beside it."""
         written = super().save_to_path(path, **kwargs)
@@ -152,12 +157,7 @@ class OffPolicy(Algorithm):
         if not ready:
             return
         for _ in range(settings.updates):
-            samples = {
-                key: self.replays[key].sample(
-                    settings.batch_size, n_step=settings.n_step, gamma=settings.gamma, beta=self._beta
-                )
-                for key in ready
-            }
+            samples = {key: self.draw(self.replays[key]) for key in ready}
             for key, errors in self._learner.learn(samples, learning).items():
                 self.replays[key].prioritize(samples[key].indices, errors)
 

@@ -13,6 +13,7 @@ from league.policies.actions import to_environment
 from league.settings import Storage
 from league.spaces import ACTION_MASK
 from league.training_config import TrainingSettings
+from training.modules.acting import ACTED
 from training.sampling.distributions import distribution
 from training.sampling.memories import Memories, State
 from training.sampling.openings import Openings, RandomMover
@@ -150,7 +151,7 @@ class SelfPlay:
             dist_inputs = answer.dist_inputs
             raw, log_p = drawing.sample(dist_inputs, self._rng) if explore else drawing.mode(dist_inputs)
             if answer.state is not None:
-                self._memories[policy].keep(batch, answer.state)
+                self._memories[policy].keep(batch, _with_action(answer.state, raw))
         self.recorder.act(policy, raw, log_p, dist_inputs, ask.state)
         self.metrics.add_play(policy, dist_inputs)
         return to_environment(raw, self._actions[policy])
@@ -159,3 +160,8 @@ class SelfPlay:
         """Random legal raw actions, and the inputs that stand for them."""
         mask = batch.observations.get(ACTION_MASK)
         return self._distributions[policy].uniform(mask, len(batch.copies), self._rng)
+
+
+def _with_action(state: State, raw: NDArray) -> State:
+    """The state after, with the action that was drawn where it is remembered."""
+    return state | {ACTED: raw[:, np.newaxis].astype(np.float32)} if ACTED in state else state

@@ -1,0 +1,173 @@
+"""QMIX's loss: the temporal difference of each team's value, from joint transitions.
+
+Columns of the buffer stand by policy (training/sampling/closed.py). Here the agents of all policies stand beside one
+another, policy by policy, (k, N), and a team is some of these columns. Who was not there counts nothing: its value is
+0 in the mixture, as is the value of what follows for who has terminated. Who was truncated is bootstrapped.
+"""
+
+from collections.abc import Collection, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from league.config import LeagueConfig
+from league.interface import Interface
+from league.spaces import ACTION_MASK
+from league.training_config import QMIXConfig
+from training.learners.off_policy import Batch, Loss, OffPolicyLearner
+from training.learners.q_targets import next_actions, returns
+from training.modules.agent_network import AgentNetwork, Observations, flat
+from training.modules.mixer import Mixer, MonotonicMixer, summed, unmixed
+from training.replay import DISCOUNTS, NEXT, names
+from training.sampling.closed import (
+    ACTIONS,
+    JOINT,
+    OBSERVATIONS,
+    PRESENT,
+    REWARDS,
+    STATE,
+    TERMINATED,
+    state_size,
+)
+from training.sampling.env_runner import LEAGUE
+from training.teams import Teams, teams
+
+
+class QMIXLearner(OffPolicyLearner):
+    """`networks`: the policies' AgentNetworks, and for QMIX a MonotonicMixer `mixer/<team>` for each team."""
+
+    settings: QMIXConfig
+
+    def extra_networks(self) -> dict[str, nn.Module]:
+        self.teams = teams(self.settings.groups, self.interface)
+        self.columns = columns(self.teams, self.interface)
+        if self.settings.mixer != "qmix":
+            return {}
+        environment = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).environment
+        size = state_size(environment, self.interface)
+        width, normalize = self.settings.mixing_width, self.settings.normalize_observations
+        return {
+            _mixer(team): MonotonicMixer(len(members), size, width, normalize) for team, members in self.teams.items()
+        }
+
+    def losses(self, batches: Mapping[str, Batch], learning: Collection[str]) -> dict[str, Loss]:
+        rows, weights = batches[JOINT].rows, batches[JOINT].weights
+        chosen, following = self._values(rows, learning)
+        present, terminated, rewards = (self._by_agent(rows, head) for head in (PRESENT, TERMINATED, REWARDS))
+        goes_on = present & ~terminated
+        chosen, following = torch.where(present, chosen, 0.0), torch.where(goes_on, following, 0.0)
+        totals, errors, values = [], [], []
+        networks = [policy for policy in self.interface.policy_ids if policy in learning]
+        for team, members in self._learning_teams(learning).items():
+            own = self.columns[team]
+            networks += [name for name in (_mixer(team),) if name in self.networks]
+            self._update_statistics(team, rows[STATE][weights > 0])
+            mixed = self._mixer(self.networks, team)(chosen[:, own], rows[STATE])
+            with torch.no_grad():
+                targets = self._mixer(self.targets, team)(following[:, own], rows[NEXT + STATE])
+                paid, ended, counted = rewards[:, own], ~goes_on[:, own], present[:, own]
+                if self.settings.mixer != "none":
+                    paid = paid.sum(-1, keepdim=True) / len(members)
+                    ended, counted = ended.all(-1, keepdim=True), counted.any(-1, keepdim=True)
+                targets = returns(paid, rows[DISCOUNTS].unsqueeze(-1), ended, targets)
+                counted = counted & (weights > 0).unsqueeze(-1)
+            differences = torch.where(counted, mixed - targets, 0.0)
+            totals.append((weights.unsqueeze(-1) * differences.square()).sum() / counted.sum().clamp(min=1))
+            errors.append(differences.abs().amax(-1))
+            values.append(mixed[counted])
+        largest = torch.stack(errors).amax(0)
+        loss = Loss(
+            total=torch.stack(totals).sum(),
+            errors=largest,
+            networks=tuple(networks),
+            statistics={"value": torch.cat(values).mean(), "error": largest[weights > 0].mean()},
+        )
+        return {JOINT: loss}
+
+    def _learning_teams(self, learning: Collection[str]) -> Teams:
+        """Those that somebody learns in."""
+        policies = self.interface.policies
+        return {team: own for team, own in self.teams.items() if any(policies[agent] in learning for agent in own)}
+
+    def _mixer(self, networks: Mapping[str, nn.Module], team: str) -> Mixer:
+        match self.settings.mixer:
+            case "qmix":
+                return networks[_mixer(team)]
+            case "vdn":
+                return summed
+        return unmixed
+
+    def _update_statistics(self, team: str, states: Tensor) -> None:
+        if isinstance(mixer := self.networks.get(_mixer(team)), MonotonicMixer):
+            mixer.update_statistics(states)
+
+    def _by_agent(self, rows: Mapping[str, Tensor], head: str) -> Tensor:
+        """(k, N)"""
+        return torch.cat([rows[f"{head}/{policy}"] for policy in self.interface.policy_ids], dim=1)
+
+    def _values(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> tuple[Tensor, Tensor]:
+        """(k, N) values of the actions that were taken, with gradients, and of those that are best next, without."""
+        taken, best = [], []
+        for policy in self.interface.policy_ids:
+            network, target = self.networks[policy], self.targets[policy]
+            assert isinstance(network, AgentNetwork)
+            assert isinstance(target, AgentNetwork)
+            seen, coming = (names(rows, f"{head}/{policy}") for head in (OBSERVATIONS, NEXT + OBSERVATIONS))
+            actions, present = rows[f"{ACTIONS}/{policy}"], rows[f"{PRESENT}/{policy}"]
+            if policy in learning:
+                network.encoder.update_statistics({name: column[present] for name, column in seen.items()})
+            values, online = self._both(network, seen, coming, actions, present)
+            taken.append(values.gather(-1, actions.unsqueeze(-1)).squeeze(-1))
+            with torch.no_grad():
+                _, valued = self._both(target, seen, coming, actions, present)
+                mask = coming[ACTION_MASK].flatten(2) if ACTION_MASK in coming else None
+                chosen = next_actions(online if self.settings.double else None, valued, mask)
+                best.append(valued.gather(-1, chosen.unsqueeze(-1)).squeeze(-1))
+        return torch.cat(taken, dim=1), torch.cat(best, dim=1)
+
+    def _both(
+        self, network: AgentNetwork, seen: Observations, coming: Observations, actions: Tensor, present: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Values of what n agents saw, (k, n, actions), and of what they saw next, without gradients."""
+        if self.settings.recurrence is None:
+            values = network.values(flat(seen)).unflatten(0, present.shape)
+            with torch.no_grad():
+                return values, network.values(flat(coming)).unflatten(0, present.shape)
+        return self._in_sequences(self.settings.recurrence.sequence, network, seen, coming, actions, present)
+
+    @staticmethod
+    def _in_sequences(
+        steps: int,
+        network: AgentNetwork,
+        seen: Observations,
+        coming: Observations,
+        actions: Tensor,
+        present: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """As `_both`: rows (S · T, n, …) become T steps of S · n agents, and rows again."""
+        agents = present.shape[1]
+
+        def in_time(column: Tensor) -> Tensor:
+            return column.unflatten(0, (-1, steps)).transpose(0, 1).flatten(1, 2)
+
+        def in_rows(column: Tensor) -> Tensor:
+            return column.unflatten(1, (-1, agents)).transpose(0, 1).flatten(0, 1)
+
+        acted, there = in_time(actions), in_time(present)
+        values, behind = network.unroll({name: in_time(column) for name, column in seen.items()}, acted, there)
+        with torch.no_grad():
+            next_seen = flat({name: in_time(column) for name, column in coming.items()})
+            following = network.values_after(next_seen, acted.flatten(), behind.flatten(0, 1))
+        return in_rows(values), in_rows(following.unflatten(0, (steps, -1)))
+
+
+def columns(of_teams: Teams, interface: Interface) -> dict[str, list[int]]:
+    """team → where its agents stand when those of all policies stand beside one another, policy by policy."""
+    order = [
+        agent for policy in interface.policy_ids for agent in interface.agents if interface.policies[agent] == policy
+    ]
+    return {team: [order.index(agent) for agent in members] for team, members in of_teams.items()}
+
+
+def _mixer(team: str) -> str:
+    return f"mixer/{team}"
