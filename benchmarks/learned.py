@@ -2,11 +2,14 @@
 
 import logging
 import math
+import multiprocessing
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import ray
@@ -24,6 +27,7 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from training.trial import build
 
+Work, Result = TypeVar("Work"), TypeVar("Result")
 Z = 1.96
 
 
@@ -84,7 +88,7 @@ def learn(
         prepare(algorithm)
     try:
         curve = list(_updates(algorithm, seconds, steps))
-        greedy, random = (_returns(algorithm, episodes, random_actions=random) for random in (False, True))
+        greedy, random = greedy_returns(algorithm, episodes), _returns(algorithm, episodes, random_actions=True)
         return Learned(curve, greedy, random, _parameters(algorithm))
     finally:
         algorithm.stop()
@@ -99,6 +103,11 @@ def _updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[Poi
         taken += int(play[NUM_ENV_STEPS_SAMPLED])
         returns = {policy: float(value) for policy, value in play.get(EPISODE_MODULE_RETURN_MEAN, {}).items()}
         yield Point(taken, spent, int(play.get(NUM_EPISODES, 0)), returns)
+
+
+def greedy_returns(algorithm: Algorithm, episodes: int) -> NDArray:
+    """Of agents in so many fresh episodes, in which the policies take their most probable actions."""
+    return _returns(algorithm, episodes, random_actions=False)
 
 
 def _returns(algorithm: Algorithm, episodes: int, random_actions: bool) -> NDArray:
@@ -116,6 +125,19 @@ def _parameters(algorithm: Algorithm) -> int:
     modules = algorithm.learner_group._learner.module.values()
     unique = {id(p): p.numel() for module in modules for p in module.parameters() if p.requires_grad}
     return sum(unique.values())
+
+
+def two_at_once(work: Callable[[Work], Result], jobs: Sequence[Work]) -> list[Result]:
+    """Each job in a process of its own, the results in the order of the jobs."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
+        return list(pool.map(work, jobs))
+
+
+def told(what: str, target: str, met: bool) -> bool:
+    """Print whether a target is met."""
+    print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
+    return met
 
 
 def one_thread() -> None:

@@ -1,16 +1,15 @@
 """Do the shipped configurations learn? Each part trains one by the clock and measures what came of it.
 
-Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball. Where several seeds or opponents are trained,
-two learn at once, each in a process of its own on one core. All seeds are printed, none is left out. Returns are per
-agent and episode, of policies that act greedily in fresh episodes, unless it says otherwise.
+Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball, two_step_game, simple_spread_qmix. Where several
+seeds or opponents are trained, two learn at once, each in a process of its own on one core. All seeds are printed, none
+is left out. Returns are per agent and episode, of policies that act greedily in fresh episodes, unless it says
+otherwise.
 """
 
 import argparse
 import math
-import multiprocessing
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread
+from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread, told, two_at_once
 from benchmarks.truncation import as_rllib
+from benchmarks.two_step import two_step_game
 from examples import traffic
 from league.config import LeagueConfig
 
@@ -53,20 +53,13 @@ def work(job: Job) -> Learned:
         return learn(league, seconds=job.seconds, steps=job.steps, episodes=400, prepare=prepare)
 
 
-def work_all(jobs: Sequence[Job]) -> list[Learned]:
-    """Two at a time, the results in the order of the jobs."""
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
-        return list(pool.map(work, jobs))
-
-
 def rps(scale: float) -> bool:
     """The best response to each fixed opponent is known: to win every round, or nothing against a random one."""
     rounds = 15.0
     best = {"script:first": rounds, "script:mirror": rounds, "script:random": 0.0}
     met = True
     jobs = [Job("rps", {"opponents": [ref]}, 30 * scale) for ref in best]
-    for (ref, value), learned in zip(best.items(), work_all(jobs), strict=True):
+    for (ref, value), learned in zip(best.items(), two_at_once(work, jobs), strict=True):
         low, high = interval(learned.greedy)
         met &= low <= value <= high or learned.greedy.mean() >= value
         print(
@@ -82,7 +75,7 @@ def cars_and_lights(scale: float) -> bool:
     best = traffic.optimum(**league.environment.kwargs)
     jobs = [Job("cars_and_lights", {"seed": seed}, 120 * scale) for seed in range(3)]
     met = True
-    for seed, learned in zip(range(3), work_all(jobs), strict=True):
+    for seed, learned in zip(range(3), two_at_once(work, jobs), strict=True):
         own, other = learned.greedy.mean(), learned.random.mean()
         share = (own - other) / (best - other)
         met &= bool(share >= NEAR_OPTIMUM)
@@ -97,7 +90,7 @@ def shared_encoder(scale: float) -> bool:
     """Five seeds with a shared encoder, five with separate networks."""
     settings = {"shared": {"shared_encoder": True}, "separate": {"shared_encoder": False}}
     jobs = [Job("shared_encoder", own | {"seed": s}, 90 * scale) for own in settings.values() for s in SEEDS]
-    learned = work_all(jobs)
+    learned = two_at_once(work, jobs)
     means = {}
     for label, part in zip(settings, (learned[:5], learned[5:]), strict=True):
         means[label] = np.array([each.greedy.mean() for each in part])
@@ -119,7 +112,7 @@ def simple_spread(scale: float) -> bool:
         for ablated in (False, True)
         for seed in SEEDS
     ]
-    learned = work_all(jobs)
+    learned = two_at_once(work, jobs)
     met = True
     print(
         f"{'truncation':>12} {'seed':>5} {'actions':>11} {'seconds':>8} {'return':>8} {'random':>8} {'better by':>10}"
@@ -135,6 +128,23 @@ def simple_spread(scale: float) -> bool:
     for label, part in (("bootstraps", learned[:5]), ("as RLlib", learned[5:])):
         finals = np.array([each.greedy.mean() for each in part])
         print(f"  truncation {label}: {finals.mean():.2f} ± {finals.std(ddof=1):.2f} over the seeds")
+    return told("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
+
+
+def simple_spread_qmix(scale: float) -> bool:
+    """Three seeds by QMIX, each with its curve."""
+    jobs = [Job("simple_spread_qmix", {"seed": seed}, steps=SPREAD_STEPS * scale) for seed in range(3)]
+    met = True
+    for job, each in zip(jobs, two_at_once(work, jobs), strict=True):
+        last, better = each.curve[-1], each.greedy.mean() - each.random.mean()
+        print(
+            f"seed {job.settings['seed']}: {last.steps:,} actions in {last.seconds:.0f} s; return"
+            f" {each.greedy.mean():.2f}, random {each.random.mean():.2f}, better by {better:.2f}"
+        )
+        ended = [point for point in each.curve if point.episodes]
+        for point in ended[:: max(1, len(ended) // 10)]:
+            print(f"    {point.steps:>9,} actions: {point.returns['shared']:8.2f} while exploring")
+        met &= bool(better >= SPREAD_BETTER_BY)
     return told("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
 
 
@@ -170,14 +180,17 @@ def last_episodes(curve: Sequence[Point], share: float) -> NDArray:
     return np.array([next(iter(point.returns.values())) for point in chosen])
 
 
-def told(what: str, target: str, met: bool) -> bool:
-    """Print whether a target is met."""
-    print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
-    return met
-
-
 PARTS: dict[str, Callable[[float], bool]] = {
-    part.__name__: part for part in (rps, cars_and_lights, shared_encoder, simple_spread, pistonball)
+    part.__name__: part
+    for part in (
+        rps,
+        cars_and_lights,
+        shared_encoder,
+        simple_spread,
+        pistonball,
+        two_step_game,
+        simple_spread_qmix,
+    )
 }
 
 

@@ -22,13 +22,13 @@ from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
 AGENTS = ("agent_0", "agent_1")
 FIRST, GAME_A, GAME_B = range(3)
-STATES = 3
+STATES, ACTIONS = 3, 2
 PAYOFFS = {GAME_A: np.full((2, 2), 7.0), GAME_B: np.array([[0.0, 1.0], [1.0, 8.0]])}
 """Game → (2, 2)."""
 
 
 def values(gamma: float) -> NDArray:
-    """(3, 2, 2): the value of each pair of actions in each state, by the first agent's action, then the second's, of
+    """(3, 2, 2): the value of each pair of actions in each state, by the first agent's action, then the second's, with
     the best play after it. Bellman: Q(s₁, u) = γ max Q(s₂, ·)."""
     later = [gamma * PAYOFFS[game].max() for game in (GAME_A, GAME_B)]
     return np.stack([np.repeat(later, 2).reshape(2, 2), PAYOFFS[GAME_A], PAYOFFS[GAME_B]])

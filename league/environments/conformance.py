@@ -61,6 +61,8 @@ class Examination:
     agents: int = 0
     lengths: list[int] = field(default_factory=list)
     steps_per_second: float = 0.0
+    state_size: int | None = None
+    """Numbers of the global state; None where there is none."""
 
     @property
     def passed(self) -> bool:
@@ -142,6 +144,7 @@ def _episode(
     reports = copy.reset(seed)
     actions.seed(seed)
     for _ in range(steps):
+        _check_state(copy, found)
         moves = []
         for agent, observation, reward, terminated, truncated in reports:
             trace.append((agent, _bytes(observation), reward, terminated, truncated))
@@ -195,6 +198,23 @@ def _check_report(agent: str, report: Report, found: Examination) -> None:
     for name, array in observation.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             found.add("fault", f"observes NaN or infinity in {name}", agent)
+
+
+def _check_state(copy: Copy, found: Examination) -> None:
+    """Centralised learners read the global state as one row of numbers, always of one size."""
+    try:
+        state = copy.state()
+        size = None if state is None else np.size(np.asarray(state, dtype=np.float32))
+    except Exception as error:
+        found.add("note", f"its global state cannot be read, which only centralised learners need: {_told(error)}")
+        return
+    if size is None:
+        return
+    if found.state_size not in (None, size):
+        found.add("fault", f"its global state has {size} numbers, after {found.state_size}: expected always as many")
+    if not np.isfinite(np.asarray(state, dtype=np.float32)).all():
+        found.add("fault", "its global state has NaN or infinity")
+    found.state_size = size
 
 
 class _Check:

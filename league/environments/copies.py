@@ -96,13 +96,22 @@ class AECCopy:
 class _Simultaneous:
     """Who is in the episode, what each agent is owed, what it saw last, and who has left."""
 
-    def __init__(self, agents: Sequence[str], splits: Sequence[Split]) -> None:
-        self._agents, self._splits = tuple(agents), splits
-        self._index = {agent: index for index, agent in enumerate(agents)}
+    def __init__(self, env: Any, splits: Sequence[Split]) -> None:
+        self._env, self._splits = env, splits
+        self._agents = tuple(env.possible_agents)
+        self._index = {agent: index for index, agent in enumerate(self._agents)}
+        self._infos: Mapping[str, Any] = {}
         self._present: set[str] = set()
         self._gone: set[str] = set()
         self._owed: dict[str, float] = {}
         self._seen: dict[str, Observation] = {}
+
+    def state(self) -> Any:
+        """`info["state"]` of any agent, or in RLlib's common info; else what the environment's own `state()` gives."""
+        for info in self._infos.values():
+            if isinstance(info, Mapping) and "state" in info:
+                return info["state"]
+        return _state(self._env)
 
     def _begin(self, observations: Mapping[str, Any]) -> list[Report]:
         self._present, self._gone, self._owed, self._seen = set(), set(), dict.fromkeys(self._agents, 0.0), {}
@@ -156,16 +165,12 @@ class _Simultaneous:
 class ParallelCopy(_Simultaneous):
     """PettingZoo's Parallel API: all living agents act at once."""
 
-    def __init__(self, env: ParallelEnv, splits: Sequence[Split]) -> None:
-        super().__init__(env.possible_agents, splits)
-        self._env = env
-
     def reset(self, seed: int) -> list[Report]:
-        observations, _ = self._env.reset(seed=seed)
+        observations, self._infos = self._env.reset(seed=seed)
         return self._begin(observations)
 
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
-        observations, rewards, terminated, truncated, _ = self._env.step(self._actions(moves))
+        observations, rewards, terminated, truncated, self._infos = self._env.step(self._actions(moves))
         reports = self._reports(observations, rewards, terminated, truncated)
         if self._present:
             self._check_agents(observations)
@@ -178,9 +183,6 @@ class ParallelCopy(_Simultaneous):
         for agent in agents - observations.keys() - self._gone:
             raise EnvironmentMismatch(f"agent {agent} is among the agents, but has no observation to act on")
 
-    def state(self) -> Any:
-        return _state(self._env)
-
     def render(self) -> Any:
         return self._env.render()
 
@@ -190,10 +192,6 @@ class ParallelCopy(_Simultaneous):
 
 class MultiAgentCopy(_Simultaneous):
     """RLlib's MultiAgentEnv: who has an observation acts; `__all__` ends the episode for everybody who is left."""
-
-    def __init__(self, env: Any, splits: Sequence[Split]) -> None:
-        super().__init__(env.possible_agents, splits)
-        self._env = env
 
     def reset(self, seed: int) -> list[Report]:
         observations, self._infos = self._env.reset(seed=seed)
@@ -216,11 +214,6 @@ class MultiAgentCopy(_Simultaneous):
             actions, ended = {}, reports
         raise EnvironmentMismatch(f"nobody has acted for {MOST_IDLE_STEPS} steps of the environment")
 
-    def state(self) -> Any:
-        """RLlib's API has no method for it: `info["state"]` of any agent, or in the common info."""
-        told = (info["state"] for info in self._infos.values() if isinstance(info, Mapping) and "state" in info)
-        return next(told, _state(self._env))
-
     def render(self) -> Any:
         return self._env.render()
 
@@ -234,9 +227,15 @@ class MultiAgentCopy(_Simultaneous):
 
 
 def _state(env: Any) -> Any:
+    """PettingZoo's `state()` is optional; elsewhere, an attribute of that name may mean something else."""
+    base = getattr(env, "unwrapped", env)
+    if getattr(type(base), "state", None) in (AECEnv.state, ParallelEnv.state) or not callable(
+        state := getattr(env, "state", None)
+    ):
+        return None
     try:
-        return env.state()
-    except (AttributeError, NotImplementedError):
+        return state()
+    except NotImplementedError:
         return None
 
 

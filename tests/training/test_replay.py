@@ -157,3 +157,54 @@ def test_a_saved_buffer_goes_on_as_the_one_that_saved(tmp_path: Path, priorities
     restored.load(tmp_path / "kept")
     for before, after in zip(go_on(replay), go_on(restored), strict=True):
         np.testing.assert_array_equal(before, after)
+
+
+def sequences(replay: Replay, size: int, length: int) -> list[list[int]]:
+    """The observations of each sequence that was drawn, without what is behind its end."""
+    sample = replay.sample_sequences(size, length)
+    numbers = sample.rows["observations/x"][:, 0].reshape(size, length).astype(int)
+    weights = sample.weights.reshape(size, length)
+    assert set(np.unique(weights)) <= {0.0, 1.0}
+    assert (np.diff(weights) <= 0).all(), "what is behind an end stays behind it"
+    return [own[: int(count)].tolist() for own, count in zip(numbers, weights.sum(axis=1), strict=True)]
+
+
+def test_sequences_are_episodes_or_their_parts_from_the_beginning() -> None:
+    """Stream 0: an episode of five rows and one under way; stream 1: one of two."""
+    replay = Replay(32)
+    replay.add(block([0, 100, 1, 101, 2, 3], [0, 1, 0, 1, 0, 0], [True, True, False, False, False, False]))
+    replay.add(block([4, 10, 11], [0, 0, 0], [False, True, False]))
+    assert {tuple(own) for own in sequences(replay, 200, 9)} == {(0, 1, 2, 3, 4), (10, 11), (100, 101)}
+    assert {tuple(own) for own in sequences(replay, 200, 3)} == {(0, 1, 2), (3, 4), (10, 11), (100, 101)}
+
+
+@given(
+    capacity=st.integers(4, 20), lengths=st.lists(st.integers(1, 9), min_size=1, max_size=12), seed=st.integers(0, 99)
+)
+@settings(deadline=None)
+def test_sequences_survive_the_rows_that_were_overwritten(capacity: int, lengths: list[int], seed: int) -> None:
+    """Episode e has rows 100 e, 100 e + 1, …; two streams take turns."""
+    replay = Replay(capacity)
+    replay.reseed(seed, 0)
+    for episode, length in enumerate(lengths):
+        for row in range(length):
+            replay.add(block([100 * episode + row], [episode % 2], [row == 0]))
+    for own in sequences(replay, 30, 4):
+        assert own == list(range(own[0], own[0] + len(own)))
+        episode, begin = divmod(own[0], 100)
+        is_kept = begin + sum(lengths[:episode]) >= sum(lengths) - capacity
+        assert is_kept
+        assert begin % 4 == 0 or capacity < 4 * max(lengths), "anywhere, only where there is no other"
+        assert len(own) == min(4, lengths[episode] - begin)
+
+
+def test_a_saved_buffer_gives_the_same_sequences(tmp_path: Path) -> None:
+    replay = Replay(7)
+    replay.add(block([0, 1, 2, 3, 4], [0] * 5, [True, False, False, False, False]))
+    replay.save(tmp_path / "kept")
+    restored = Replay(7)
+    restored.load(tmp_path / "kept")
+    for each in (replay, restored):
+        each.reseed(3, 100)
+        each.add(block([5, 6], [0, 0], [False, False]))
+    assert sequences(replay, 20, 3) == sequences(restored, 20, 3)

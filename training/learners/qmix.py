@@ -1,8 +1,7 @@
 """QMIX's loss: the temporal difference of each team's value, from joint transitions.
 
 Columns of the buffer stand by policy (training/sampling/closed.py). Here the agents of all policies stand beside one
-another, policy by policy, (k, N), and a team is some of these columns. Who was not there counts nothing: its value is
-0 in the mixture, as is the value of what follows for who has terminated. Who was truncated is bootstrapped.
+another, policy by policy, (k, N), and a team is some of these columns.
 """
 
 from collections.abc import Collection, Mapping
@@ -15,7 +14,8 @@ from league.interface import Interface
 from league.spaces import ACTION_MASK
 from league.training_config import QMIXConfig
 from training.learners.off_policy import Batch, Loss, OffPolicyLearner
-from training.learners.q_targets import next_actions, returns
+from training.learners.q_targets import next_actions
+from training.learners.team_targets import TeamSteps
 from training.modules.agent_network import AgentNetwork, Observations, flat
 from training.modules.mixer import Mixer, MonotonicMixer, summed, unmixed
 from training.replay import DISCOUNTS, NEXT, names
@@ -53,24 +53,16 @@ class QMIXLearner(OffPolicyLearner):
     def losses(self, batches: Mapping[str, Batch], learning: Collection[str]) -> dict[str, Loss]:
         rows, weights = batches[JOINT].rows, batches[JOINT].weights
         chosen, following = self._values(rows, learning)
-        present, terminated, rewards = (self._by_agent(rows, head) for head in (PRESENT, TERMINATED, REWARDS))
-        goes_on = present & ~terminated
-        chosen, following = torch.where(present, chosen, 0.0), torch.where(goes_on, following, 0.0)
-        totals, errors, values = [], [], []
         networks = [policy for policy in self.interface.policy_ids if policy in learning]
-        for team, members in self._learning_teams(learning).items():
-            own = self.columns[team]
+        totals, errors, values = [], [], []
+        for team, steps in self._steps(rows, learning).items():
             networks += [name for name in (_mixer(team),) if name in self.networks]
-            self._update_statistics(team, rows[STATE][weights > 0])
-            mixed = self._mixer(self.networks, team)(chosen[:, own], rows[STATE])
+            own = self.columns[team]
+            self._update_statistics(team, steps.states[weights > 0])
+            mixed = steps.mixed(self.mixer(self.networks, team), chosen[:, own])
             with torch.no_grad():
-                targets = self._mixer(self.targets, team)(following[:, own], rows[NEXT + STATE])
-                paid, ended, counted = rewards[:, own], ~goes_on[:, own], present[:, own]
-                if self.settings.mixer != "none":
-                    paid = paid.sum(-1, keepdim=True) / len(members)
-                    ended, counted = ended.all(-1, keepdim=True), counted.any(-1, keepdim=True)
-                targets = returns(paid, rows[DISCOUNTS].unsqueeze(-1), ended, targets)
-                counted = counted & (weights > 0).unsqueeze(-1)
+                targets = steps.targets(self.mixer(self.targets, team), following[:, own])
+                counted = steps.counted() & (weights > 0).unsqueeze(-1)
             differences = torch.where(counted, mixed - targets, 0.0)
             totals.append((weights.unsqueeze(-1) * differences.square()).sum() / counted.sum().clamp(min=1))
             errors.append(differences.abs().amax(-1))
@@ -84,12 +76,21 @@ class QMIXLearner(OffPolicyLearner):
         )
         return {JOINT: loss}
 
-    def _learning_teams(self, learning: Collection[str]) -> Teams:
-        """Those that somebody learns in."""
-        policies = self.interface.policies
-        return {team: own for team, own in self.teams.items() if any(policies[agent] in learning for agent in own)}
+    def _steps(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> dict[str, TeamSteps]:
+        """Of the teams in which somebody learns."""
+        rewards, present, terminated = (self._by_agent(rows, head) for head in (REWARDS, PRESENT, TERMINATED))
+        policies, together = self.interface.policies, self.settings.mixer != "none"
+        discounts, states, next_states = rows[DISCOUNTS], rows[STATE], rows[NEXT + STATE]
+        return {
+            team: TeamSteps(
+                rewards[:, own], present[:, own], terminated[:, own], discounts, states, next_states, together
+            )
+            for team, own in self.columns.items()
+            if any(policies[agent] in learning for agent in self.teams[team])
+        }
 
-    def _mixer(self, networks: Mapping[str, nn.Module], team: str) -> Mixer:
+    def mixer(self, networks: Mapping[str, nn.Module], team: str) -> Mixer:
+        """That of a team among `networks`, or `targets`."""
         match self.settings.mixer:
             case "qmix":
                 return networks[_mixer(team)]

@@ -13,7 +13,7 @@ from training.modules.distributions import Categorical
 from training.modules.encoder import Encoder, linear
 from training.modules.gated_memory import GatedMemory
 from training.modules.memory import HIDDEN
-from training.modules.q_network import epsilon_greedy, legal, masked
+from training.modules.q_network import epsilon_greedy, masked
 
 Observations = dict[str, Tensor]
 
@@ -83,7 +83,7 @@ class AgentNetwork(Acting):
 
     def _forward_exploration(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         values, hidden = self._step(batch)
-        log_p = epsilon_greedy(values, legal(values, batch[Columns.OBS]), self.exploration)
+        log_p = epsilon_greedy(values, self.exploration)
         if hidden is None:
             return {Columns.ACTION_DIST_INPUTS: log_p}
         return {Columns.ACTION_DIST_INPUTS: log_p, Columns.STATE_OUT: _state(hidden, values)}
