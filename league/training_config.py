@@ -239,7 +239,7 @@ class GatedRecurrenceConfig(Part):
     width: int = Field(default=64, ge=1)
     sequence: int = Field(default=50, ge=1)
     """Steps that are learned from together. Episodes up to this length are learned from whole; of longer ones, parts
-    that begin at its multiples, without what was remembered before them."""
+    that begin at its multiples, with what was remembered there when they were played."""
 
 
 class QMIXConfig(QLearningConfig):

@@ -130,7 +130,7 @@ class Replay:
             weights = (scaled / scaled.max()).astype(np.float32)
         return Sample(self.rows(indices, n_step=n_step, gamma=gamma), indices, weights)
 
-    def sample_sequences(self, size: int, length: int) -> Sample:
+    def sample_sequences(self, size: int, length: int, *, gamma: float = 1.0) -> Sample:
         """Draw, with replacement, `size` sequences of `length` rows that follow one another in an episode.
 
         They begin at an episode's first row, or at a multiple of `length` after it; where there is none in the buffer,
@@ -147,7 +147,7 @@ class Replay:
             following = self._following[indices[:, step - 1]]
             weights[:, step] = weights[:, step - 1] * (following != NONE)
             indices[:, step] = np.where(following != NONE, following, indices[:, step - 1])
-        return Sample(self.rows(indices.ravel()), indices.ravel(), weights.ravel())
+        return Sample(self.rows(indices.ravel(), gamma=gamma), indices.ravel(), weights.ravel())
 
     def rows(self, indices: NDArray, *, n_step: int = 1, gamma: float = 1.0) -> Rows:
         """The transitions that begin at `indices` (k,)."""

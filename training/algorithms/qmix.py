@@ -31,7 +31,7 @@ class QMIX(OffPolicy):
         assert isinstance(settings, QMIXConfig)
         if settings.recurrence is None:
             return super().draw(replay)
-        return replay.sample_sequences(settings.batch_size, settings.recurrence.sequence)
+        return replay.sample_sequences(settings.batch_size, settings.recurrence.sequence, gamma=settings.gamma)
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:

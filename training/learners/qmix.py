@@ -5,6 +5,7 @@ another, policy by policy, (k, N), and a team is some of these columns.
 """
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -16,12 +17,14 @@ from league.training_config import QMIXConfig
 from training.learners.off_policy import Batch, Loss, OffPolicyLearner
 from training.learners.q_targets import next_actions
 from training.learners.team_targets import TeamSteps
+from training.modules.acting import ACTED, NOT_ACTED
 from training.modules.agent_network import AgentNetwork, Observations, flat
 from training.modules.mixer import Mixer, MonotonicMixer, summed, unmixed
 from training.replay import DISCOUNTS, NEXT, names
 from training.sampling.closed import (
     ACTIONS,
     JOINT,
+    MEMORY,
     OBSERVATIONS,
     PRESENT,
     REWARDS,
@@ -31,6 +34,18 @@ from training.sampling.closed import (
 )
 from training.sampling.env_runner import LEAGUE
 from training.teams import Teams, teams
+
+
+@dataclass(frozen=True, slots=True)
+class _Play:
+    """k rows of the n agents of a policy: what they saw, what they saw next, both input name → (k, n, …); what they
+    remembered, key → (k, n, width); what they did (k, n), and whether they were there."""
+
+    seen: Observations
+    coming: Observations
+    memory: dict[str, Tensor]
+    actions: Tensor
+    present: Tensor
 
 
 class QMIXLearner(OffPolicyLearner):
@@ -113,53 +128,57 @@ class QMIXLearner(OffPolicyLearner):
             network, target = self.networks[policy], self.targets[policy]
             assert isinstance(network, AgentNetwork)
             assert isinstance(target, AgentNetwork)
-            seen, coming = (names(rows, f"{head}/{policy}") for head in (OBSERVATIONS, NEXT + OBSERVATIONS))
-            actions, present = rows[f"{ACTIONS}/{policy}"], rows[f"{PRESENT}/{policy}"]
+            play = _Play(
+                seen=names(rows, f"{OBSERVATIONS}/{policy}"),
+                coming=names(rows, f"{NEXT}{OBSERVATIONS}/{policy}"),
+                memory=names(rows, f"{MEMORY}/{policy}"),
+                actions=rows[f"{ACTIONS}/{policy}"],
+                present=rows[f"{PRESENT}/{policy}"],
+            )
             if policy in learning:
-                network.encoder.update_statistics({name: column[present] for name, column in seen.items()})
-            values, online = self._both(network, seen, coming, actions, present)
-            taken.append(values.gather(-1, actions.unsqueeze(-1)).squeeze(-1))
+                network.encoder.update_statistics({name: rows[play.present] for name, rows in play.seen.items()})
+            values, online = self._both(network, play)
+            taken.append(values.gather(-1, play.actions.unsqueeze(-1)).squeeze(-1))
             with torch.no_grad():
-                _, valued = self._both(target, seen, coming, actions, present)
-                mask = coming[ACTION_MASK].flatten(2) if ACTION_MASK in coming else None
+                _, valued = self._both(target, play)
+                mask = play.coming[ACTION_MASK].flatten(2) if ACTION_MASK in play.coming else None
                 chosen = next_actions(online if self.settings.double else None, valued, mask)
                 best.append(valued.gather(-1, chosen.unsqueeze(-1)).squeeze(-1))
         return torch.cat(taken, dim=1), torch.cat(best, dim=1)
 
-    def _both(
-        self, network: AgentNetwork, seen: Observations, coming: Observations, actions: Tensor, present: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _both(self, network: AgentNetwork, play: _Play) -> tuple[Tensor, Tensor]:
         """Values of what n agents saw, (k, n, actions), and of what they saw next, without gradients."""
-        if self.settings.recurrence is None:
-            values = network.values(flat(seen)).unflatten(0, present.shape)
-            with torch.no_grad():
-                return values, network.values(flat(coming)).unflatten(0, present.shape)
-        return self._in_sequences(self.settings.recurrence.sequence, network, seen, coming, actions, present)
-
-    @staticmethod
-    def _in_sequences(
-        steps: int,
-        network: AgentNetwork,
-        seen: Observations,
-        coming: Observations,
-        actions: Tensor,
-        present: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """As `_both`: rows (S · T, n, …) become T steps of S · n agents, and rows again."""
-        agents = present.shape[1]
-
-        def in_time(column: Tensor) -> Tensor:
-            return column.unflatten(0, (-1, steps)).transpose(0, 1).flatten(1, 2)
-
-        def in_rows(column: Tensor) -> Tensor:
-            return column.unflatten(1, (-1, agents)).transpose(0, 1).flatten(0, 1)
-
-        acted, there = in_time(actions), in_time(present)
-        values, behind = network.unroll({name: in_time(column) for name, column in seen.items()}, acted, there)
+        if self.settings.recurrence is not None:
+            return _in_sequences(network, play, self.settings.recurrence.sequence)
+        values = network.values(flat(play.seen)).unflatten(0, play.present.shape)
         with torch.no_grad():
-            next_seen = flat({name: in_time(column) for name, column in coming.items()})
-            following = network.values_after(next_seen, acted.flatten(), behind.flatten(0, 1))
-        return in_rows(values), in_rows(following.unflatten(0, (steps, -1)))
+            return values, network.values(flat(play.coming)).unflatten(0, play.present.shape)
+
+
+def _in_sequences(network: AgentNetwork, play: _Play, steps: int) -> tuple[Tensor, Tensor]:
+    """As `_both`: rows (S · T, n, …) become T steps of S · n agents, and rows again.
+
+    What an agent remembered before the first step is what it had when it acted (Kapturowski et al., 2019, "Recurrent
+    experience replay in distributed reinforcement learning", stored state); nothing, where an episode begins.
+    """
+    agents = play.present.shape[1]
+
+    def in_time(column: Tensor) -> Tensor:
+        return column.unflatten(0, (-1, steps)).transpose(0, 1).flatten(1, 2)
+
+    def in_rows(column: Tensor) -> Tensor:
+        return column.unflatten(1, (-1, agents)).transpose(0, 1).flatten(0, 1)
+
+    acted, there = in_time(play.actions), in_time(play.present)
+    state = {key: in_time(column)[0] for key, column in play.memory.items()}
+    # Who comes later has done nothing yet, which is not the zero of rows that are not there.
+    state[ACTED] = torch.where(there[0].unsqueeze(-1), state[ACTED], NOT_ACTED)
+    seen = {name: in_time(column) for name, column in play.seen.items()}
+    values, behind = network.unroll(seen, state, acted, there)
+    with torch.no_grad():
+        coming = flat({name: in_time(column) for name, column in play.coming.items()})
+        following = network.values_after(coming, acted.flatten(), behind.flatten(0, 1))
+    return in_rows(values), in_rows(following.unflatten(0, (steps, -1)))
 
 
 def columns(of_teams: Teams, interface: Interface) -> dict[str, list[int]]:

@@ -50,16 +50,18 @@ class AgentNetwork(Acting):
         assert self.memory is None
         return self.head(self.encoder(observations))
 
-    def unroll(self, observations: Observations, actions: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-        """T steps of B agents, from nothing remembered: values and what is remembered behind each step, (T, B, …).
+    def unroll(
+        self, observations: Observations, state: dict[str, Tensor], actions: Tensor, present: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """T steps of B agents: values and what is remembered behind each step, (T, B, …).
 
-        observations: (T, B, …). actions: (T, B) that were taken. present: (T, B) bool; who is not there remembers on.
+        observations: (T, B, …). state: before the first step, key → (B, width). actions: (T, B) that were taken.
+        present: (T, B) bool; who is not there remembers on.
         """
         assert self.memory is not None
         steps, agents = present.shape
         embeddings = self.encoder(flat(observations)).unflatten(0, (steps, agents))
-        hidden = embeddings.new_zeros(agents, self.memory.width)
-        acted = embeddings.new_full((agents,), NOT_ACTED)
+        hidden, acted = state[HIDDEN], state[ACTED].squeeze(-1)
         remembered = []
         for step in range(steps):
             new = self.memory(self._recalling(embeddings[step], acted), hidden)

@@ -7,6 +7,7 @@ Columns of `OwnTransitions`, a block for each policy, rows (k, …):
 | `rewards` | float32, all since the action; in a turn-based game also those of others' moves |
 | `terminated`, `truncated` | of the agent; truncated alone is bootstrapped |
 | `next_observations/<input>` | at the agent's own next turn, or the last one of its episode |
+| `memory/<key>` | of a policy with a memory: the state before the action |
 
 Columns of `JointTransitions`, one block for all policies, a row per step of a copy. Policy p has n_p agents, in the
 order of the environment's `possible_agents`, and each of its columns an axis for them:
@@ -14,6 +15,7 @@ order of the environment's `possible_agents`, and each of its columns an axis fo
 | `observations/<p>/<input>`, `next_observations/<p>/<input>` | (k, n_p, …); zeros for an agent that is not there |
 | `actions/<p>` | (k, n_p) or (k, n_p, m) |
 | `rewards/<p>`, `terminated/<p>`, `truncated/<p>` | (k, n_p) |
+| `memory/<p>/<key>` | (k, n_p, width) |
 | `present/<p>` | (k, n_p) bool: whether the agent acted; nothing else of it counts where it did not |
 | `state`, `next_state` | (k, s) float32: the environment's own, else all observations of all agents but masks, flat |
 
@@ -37,9 +39,12 @@ from training.replay import NEXT, Block, Rows
 from training.sampling.reset_seeds import ResetSeeds
 
 OBSERVATIONS, ACTIONS, REWARDS, TERMINATED, TRUNCATED = "observations", "actions", "rewards", "terminated", "truncated"
-PRESENT, STATE = "present", "state"
+PRESENT, STATE, MEMORY = "present", "state", "memory"
 JOINT = "joint"
 """The key of the buffer of joint transitions, where there would be a policy's id."""
+Initial = Mapping[str, Mapping[str, NDArray]]
+"""Policy id → its state before an episode, key → (width,); empty without a memory."""
+NO_MEMORY: Initial = {}
 
 
 @dataclass
@@ -49,6 +54,7 @@ class _Open:
     is_open: NDArray
     is_first: NDArray
     observations: Rows = field(default_factory=dict)
+    memory: Rows = field(default_factory=dict)
     actions: NDArray | None = None
     places: NDArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """Of the rows that must act now."""
@@ -57,8 +63,8 @@ class _Open:
 class OwnTransitions:
     """Each policy's own transitions, in the order in which they were closed."""
 
-    def __init__(self, interface: Interface, agents: Sequence[str], copies: int) -> None:
-        self._copies = copies
+    def __init__(self, interface: Interface, agents: Sequence[str], copies: int, initial: Initial = NO_MEMORY) -> None:
+        self._copies, self._initial = copies, initial
         self._policies = interface.policy_ids
         by_agent = [interface.policies[agent] for agent in agents]
         self._policy_of = by_agent
@@ -72,7 +78,13 @@ class OwnTransitions:
 
     def restart(self) -> None:
         self._open = {
-            policy: _Open(np.zeros(self._copies * n, dtype=bool), np.ones(self._copies * n, dtype=bool))
+            policy: _Open(
+                np.zeros(self._copies * n, dtype=bool),
+                np.ones(self._copies * n, dtype=bool),
+                memory={
+                    key: np.stack([each] * self._copies * n) for key, each in self._initial.get(policy, {}).items()
+                },
+            )
             for policy, n in self._sizes.items()
         }
 
@@ -86,9 +98,12 @@ class OwnTransitions:
         raw: NDArray,
         log_p: NDArray,  # noqa: ARG002  # off-policy learners have no use for it
         dist_inputs: NDArray,  # noqa: ARG002
-        state: Mapping[str, NDArray] | None,  # noqa: ARG002
+        state: Mapping[str, NDArray] | None,
     ) -> None:
         own = self._open[policy]
+        for key, kept in own.memory.items():
+            assert state is not None, "a policy with a memory has a state"
+            kept[own.places] = state[key]
         if own.actions is None:
             own.actions = np.zeros((len(own.is_open), *raw.shape[1:]), raw.dtype)
         own.actions[own.places] = raw
@@ -155,6 +170,7 @@ class OwnTransitions:
         places = places[chosen]
         assert own.actions is not None, "an open place has acted"
         rows = {f"{OBSERVATIONS}/{name}": seen[places] for name, seen in own.observations.items()}
+        rows |= {f"{MEMORY}/{key}": before[places] for key, before in own.memory.items()}
         rows |= {ACTIONS: own.actions[places], REWARDS: rewards[chosen]}
         rows |= {TERMINATED: terminated[chosen], TRUNCATED: truncated[chosen]}
         rows |= {
@@ -190,13 +206,15 @@ class OwnTransitions:
 class JointTransitions:
     """All agents' transitions of one step of a copy as one row. All that are there must act at once."""
 
-    def __init__(self, interface: Interface, agents: Sequence[str], copies: int) -> None:
-        self._own = OwnTransitions(interface, agents, copies)
+    def __init__(self, interface: Interface, agents: Sequence[str], copies: int, initial: Initial = NO_MEMORY) -> None:
+        self._own = OwnTransitions(interface, agents, copies, initial)
         self._copies = copies
         self._stream_offset = 0
         self._closed: list[Block] = []
         self._states: NDArray | None = None
-        self._empty = {policy: _no_rows(interface.of_policy(policy)) for policy in interface.policy_ids}
+        self._empty = {
+            policy: _no_rows(interface.of_policy(policy), initial.get(policy, {})) for policy in interface.policy_ids
+        }
 
     def begin(self, seeds: ResetSeeds) -> None:
         self._own.begin(seeds)
@@ -291,10 +309,11 @@ def joined(blocks: Sequence[Block]) -> Block:
     )
 
 
-def _no_rows(spaces: AgentInterface) -> Block:
+def _no_rows(spaces: AgentInterface, initial: Mapping[str, NDArray]) -> Block:
     """The columns of a policy, of whose agents none is there."""
     seen = {name: np.zeros((0, *leaf.shape), leaf.dtype) for name, leaf in inputs(spaces.observation).items()}
     rows: Rows = {f"{OBSERVATIONS}/{name}": column for name, column in seen.items()}
+    rows |= {f"{MEMORY}/{key}": np.zeros((0, *each.shape), each.dtype) for key, each in initial.items()}
     match spaces.action:
         case Discrete():
             rows[ACTIONS] = np.zeros(0, np.int64)

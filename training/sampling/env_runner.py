@@ -76,7 +76,7 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
         with self._named():
             copies, crashes = self.config.num_envs_per_env_runner, self.league.training.crashes
             self.env = stepping(self.league.environment, copies, crashes=crashes, states=self.gives_states)
-            initial = {policy: _arrays(module.get_initial_state()) for policy, module in self.module.items()}
+            initial = initial_states(self.module)
             storage = self.config.env_config.get(STORAGE)
             self._chunks = Chunks(self.interface, self.env.agents, copies)
             self._play = SelfPlay(self.env, self.interface, self.league.training, self._chunks, initial, storage)
@@ -272,6 +272,11 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def initial_states(module: MultiRLModule) -> dict[str, dict[str, NDArray]]:
+    """Policy id → its state before an episode; empty without a memory."""
+    return {policy: _arrays(each.get_initial_state()) for policy, each in module.items()}
 
 
 def _arrays(state: Mapping[str, Any]) -> dict[str, NDArray]:

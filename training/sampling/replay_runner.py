@@ -8,7 +8,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from league.seeds import derive
 from training.replay import Block
 from training.sampling.closed import JointTransitions, OwnTransitions
-from training.sampling.env_runner import LockstepEnvRunner, one_thread
+from training.sampling.env_runner import LockstepEnvRunner, initial_states, one_thread
 
 
 class ReplayRunner(LockstepEnvRunner):
@@ -20,7 +20,8 @@ class ReplayRunner(LockstepEnvRunner):
         super().make_env()
         assert self.env is not None
         assert self._play is not None
-        self._closed = self.recorders(self.interface, self.env.agents, self.env.copies)
+        initial = initial_states(self.module)
+        self._closed = self.recorders(self.interface, self.env.agents, self.env.copies, initial)
         self._play.recorder = self._closed
 
     def transitions(self, actions: int, exploration: float) -> tuple[int, dict[str, Block]]:

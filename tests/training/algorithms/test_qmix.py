@@ -29,7 +29,6 @@ from training.sampling.closed import JOINT, PRESENT, STATE, TERMINATED, TRUNCATE
 
 pytestmark = pytest.mark.usefixtures("ray_session")
 MEMORY = {"recurrence": {"width": 16, "sequence": 3}, "batch_size": 32, "hidden": [16]}
-RETURN = 1 / (1 - 0.9)
 Look = Callable[[OffPolicy, dict[str, Any]], Any]
 
 
@@ -117,10 +116,10 @@ def test_the_memory_holds_the_actions_that_were_drawn(monkeypatch: pytest.Monkey
         assert rows == ([-1.0] * 4 if step % ROUNDS == 0 else [float(action) for action in drawn[step - 1]])
 
 
-def check_values(**settings: Any) -> None:
+def check_values(gamma: float = 0.9, **settings: Any) -> None:
     """An agent that is truncated could have gone on: the state is worth what it is worth for ever, and an illegal
     action that seems to be worth a million counts for nothing."""
-    league = mixed("masked", gamma=0.9, exploration={"initial": 0.5, "final": 0.5}, mixer="vdn", **settings)
+    league = mixed("masked", gamma=gamma, exploration={"initial": 0.5, "final": 0.5}, mixer="vdn", **settings)
 
     def look(algorithm: OffPolicy, _: Any) -> NDArray:
         learner = algorithm.learner_group._learner
@@ -136,10 +135,10 @@ def check_values(**settings: Any) -> None:
 
     found = trained(league, 1, look)
     assert found[1] == MASKED
-    np.testing.assert_allclose(found[[0, 2]], RETURN, rtol=0.1)
+    np.testing.assert_allclose(found[[0, 2]], 1 / (1 - gamma), rtol=0.1)
 
 
-@pytest.mark.parametrize("settings", [{}, {"n_step": 3}, {"double": False}, MEMORY], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"n_step": 3}, {"double": False}, {"gamma": 0.5} | MEMORY], ids=str)
 def test_values_are_those_of_legal_play_that_goes_on(settings: dict[str, Any]) -> None:
     check_values(**settings)
 

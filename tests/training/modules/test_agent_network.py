@@ -66,7 +66,7 @@ def test_learning_sees_the_values_that_were_acted_by() -> None:
     actions = torch.randint(0, ACTIONS, (steps, agents))
     present = torch.ones(steps, agents, dtype=torch.bool)
     present[2, 1] = False
-    values, behind = module.unroll(observed, actions, present)
+    values, behind = module.unroll(observed, first(agents), actions, present)
     following = module.values_after(
         {name: rows.flatten(0, 1) for name, rows in after.items()}, actions.flatten(), behind.flatten(0, 1)
     ).unflatten(0, (steps, agents))
