@@ -29,8 +29,9 @@ def check_env(
         emit(asdict(found) | {"passed": found.passed})
     else:
         if found.lengths:
+            state = "no global state" if found.state_size is None else f"a global state of {found.state_size:,} numbers"
             say(
-                f"{league.environment.entry_point}: {found.api}, {found.agents} agents, episodes of"
+                f"{league.environment.entry_point}: {found.api}, {found.agents} agents, {state}, episodes of"
                 f" {min(found.lengths)} to {max(found.lengths)} reports, {found.steps_per_second:,.0f} a second"
             )
         if found.findings:

@@ -200,6 +200,74 @@ def assert_abandoning_conforms(
     ), "no episode was broken off"
 
 
+def assert_states_conform(
+    make: Callable[[int], BatchedEnvironment], stock: Callable[[], Any], seeds: list[int], copies: int
+) -> None:
+    """The global states of each episode, its last one included, are those of a fresh `stock()` that is played alike.
+
+    make: an environment that gives states along. Agents act at once, all from the first step to the last.
+    """
+    env = stock()
+    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    batched, queue = make(copies), list(seeds)
+    playing: dict[int, int] = {}
+    starting: dict[int, int] = {}
+    found: dict[int, list[np.ndarray]] = defaultdict(list)
+
+    def next_episode(copy: int) -> Episode | None:
+        if not queue:
+            return None
+        starting[copy] = queue.pop(0)
+        return Episode(starting[copy], batched.agents)
+
+    turn = batched.start(next_episode)
+    while True:
+        for copy, state in turn.last_states.items():
+            found[playing[copy]].append(state)
+        assert set(turn.last_states) == set(turn.finished)
+        playing.update(starting)
+        starting.clear()
+        for copy, state in turn.states.items():
+            found[playing[copy]].append(state)
+        if not turn.batches:
+            break
+        turn = batched.step(
+            {
+                agent: np.array(
+                    [
+                        draw(spaces[agent], playing[copy], index, len(found[playing[copy]]) - 1, None)
+                        for copy, index in zip(batch.copies, batch.agents, strict=True)
+                    ]
+                )
+                for agent, batch in turn.batches.items()
+            }
+        )
+    for seed in seeds:
+        expected = plain_states(stock(), spaces, seed)
+        assert len(found[seed]) == len(expected)
+        for own, theirs in zip(found[seed], expected, strict=True):
+            np.testing.assert_array_equal(own, np.asarray(theirs, dtype=np.float32).ravel())
+
+
+def plain_states(env: Any, spaces: Mapping[str, gymnasium.Space], seed: int) -> list[Any]:
+    """What `state()`, or the info of an agent, tells at the reset and behind each step of an episode."""
+
+    def told(infos: Mapping[str, Any]) -> Any:
+        return np.array(env.state() if isinstance(env, ParallelEnv) else next(iter(infos.values()))["state"])
+
+    observations, infos = env.reset(seed=seed)
+    states = [told(infos)]
+    while True:
+        actions = {
+            agent: draw(spaces[agent], seed, env.possible_agents.index(agent), len(states) - 1, None)
+            for agent in observations
+        }
+        observations, _, terminated, truncated, infos = env.step(actions)
+        states.append(told(infos))
+        if any(terminated.values()) or any(truncated.values()):
+            return states
+
+
 def assert_same_episode(actual: Reports, expected: Reports) -> None:
     """Each agent has the same reports, in the same order, down to the dtype."""
     assert set(actual) == set(expected)

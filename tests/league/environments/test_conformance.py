@@ -31,6 +31,8 @@ def told(found: Examination, severity: str) -> str:
         "pettingzoo.classic.rps_v2",
         "mpe2.simple_spread_v3",
         "examples.traffic:crossing",
+        "examples.two_step:parallel_env",
+        "examples.two_step:multi_agent_env",
         f"{HERE}.counting:counting",
         f"{HERE}.simultaneous:meeting",
         f"{HERE}.simultaneous:rllib_meeting",
@@ -38,7 +40,7 @@ def told(found: Examination, severity: str) -> str:
 )
 def test_sound_environments_pass(entry_point: str) -> None:
     config = league(entry_point)
-    if entry_point.startswith("examples"):
+    if "traffic" in entry_point:
         config = LeagueConfig.load("configs/cars_and_lights.yaml")
     found = examine(config)
     assert found.passed, found.findings
@@ -147,3 +149,45 @@ def twofold() -> Twofold:
 
 def test_actions_that_no_policy_can_give_are_a_fault() -> None:
     assert "expected Discrete, MultiDiscrete or Box" in told(examine(league(f"{__name__}:twofold")), "fault")
+
+
+class Stateful(Counting):
+    """Its global state grows, is not finite, or cannot be had."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__([3, 3], [])
+        self.kind, self.asked = kind, 0
+
+    def state(self) -> Any:
+        self.asked += 1
+        match self.kind:
+            case "grows":
+                return np.zeros(self.asked)
+            case "nan":
+                return np.full((2, 2), np.nan)
+            case "raises":
+                raise RuntimeError("no camera")
+        return np.zeros((2, 3), np.int8)
+
+
+def stateful(kind: str) -> Stateful:
+    return Stateful(kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "severity", "expected"),
+    [
+        ("grows", "fault", "its global state has 2 numbers, after 1: expected always as many"),
+        ("nan", "fault", "its global state has NaN or infinity"),
+        ("raises", "note", "its global state cannot be read, which only centralised learners need: RuntimeError: no"),
+    ],
+)
+def test_a_global_state_is_one_row_of_numbers(kind: str, severity: str, expected: str) -> None:
+    found = examine(league(f"{HERE}.test_conformance:stateful", kind=kind))
+    assert expected in told(found, severity)
+    assert found.passed == (severity == "note")
+
+
+def test_the_size_of_a_global_state_is_told() -> None:
+    assert examine(league(f"{HERE}.test_conformance:stateful", kind="sound")).state_size == 6
+    assert examine(league("pettingzoo.classic.rps_v2")).state_size is None

@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 
+from examples import two_step
 from examples.traffic import crossing
 from league.config import EnvironmentConfig
 from league.environments.lockstep import stepping
-from tests.conformance.stepping import assert_abandoning_conforms, assert_stepping_conforms
+from league.environments.stepping import Episode
+from tests.conformance.stepping import assert_abandoning_conforms, assert_states_conform, assert_stepping_conforms
 from tests.league.environments.simultaneous import meeting, rllib_meeting
 
 PARALLEL: dict[str, dict[str, Any]] = {
@@ -31,6 +33,8 @@ OWN: dict[str, tuple[Any, dict[str, Any]]] = {
     ),
     "tests.league.environments.simultaneous:rllib_meeting": (rllib_meeting, {"ends": 4}),
     "examples.traffic:crossing": (crossing, {}),
+    "examples.two_step:parallel_env": (two_step.parallel_env, {}),
+    "examples.two_step:multi_agent_env": (two_step.multi_agent_env, {}),
 }
 
 
@@ -59,3 +63,21 @@ def test_lockstep_is_the_plain_loop(case: Case, copies: int) -> None:
 def test_an_episode_that_is_broken_off_leaves_no_trace(case: Case) -> None:
     config, stock = case
     assert_abandoning_conforms(lambda n: stepping(config, n), stock, seeds=[11, 12, 13, 14], copies=2)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize(
+    "entry_point", ["mpe2.simple_spread_v3", "examples.two_step:parallel_env", "examples.two_step:multi_agent_env"]
+)
+def test_states_are_those_of_the_plain_loop(entry_point: str, copies: int) -> None:
+    module, _, name = entry_point.partition(":")
+    stock = getattr(importlib.import_module(module), name or "parallel_env")
+    config = EnvironmentConfig(entry_point=entry_point)
+    assert_states_conform(lambda n: stepping(config, n, states=True), stock, seeds=[11, 12, 13, 14], copies=copies)
+
+
+def test_who_has_no_state_gives_none() -> None:
+    env = stepping(EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2"), 2, states=True)
+    turn = env.start(lambda copy: Episode(copy, env.agents))
+    assert (turn.states, turn.last_states) == ({}, {})
+    env.close()
