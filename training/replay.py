@@ -27,6 +27,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from league.errors import ConfigError
 from league.seeds import generator
 from league.training_config import PrioritiesConfig
 from training.sum_tree import SumTree
@@ -162,9 +163,13 @@ class Replay:
         (directory / STATE_FILE).write_text(json.dumps(state))
 
     def load(self, directory: Path) -> None:
-        """Take over what `save` wrote, of a buffer of the same capacity."""
+        """Take over what `save` wrote. Raises ConfigError where that was of another capacity."""
         state = json.loads((directory / STATE_FILE).read_text())
-        assert state["capacity"] == self.capacity, "a buffer of another capacity"
+        if state["capacity"] != self.capacity:
+            raise ConfigError(
+                f"training.replay_capacity: the checkpoint's buffer has {state['capacity']}, got {self.capacity}: take"
+                " that, or leave the buffer behind by replay_in_checkpoint: false"
+            )
         self._added, self._largest = state["added"], state["largest"]
         with np.load(directory / ROWS_FILE, allow_pickle=False) as kept:
             self._columns = {}
