@@ -228,10 +228,10 @@ class DQNConfig(OffPolicyConfig):
         return self
 
 
-# Each algorithm: a class above, a member of the union, and a name here.
+# Each algorithm: a class above, and a member of the three below.
 
 AnyTraining = PPOConfig | DQNConfig
-ALGORITHMS = ("ppo", "dqn")
+ALGORITHMS: dict[str, type[TrainingSettings]] = {"ppo": PPOConfig, "dqn": DQNConfig}
 
 
 def _algorithm(settings: Any) -> str:

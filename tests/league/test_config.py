@@ -32,6 +32,18 @@ def test_only_league_and_environment_are_required() -> None:
         ({"training": {"algorithm": "dqm"}}, "training.algorithm: expected one of ppo, dqn, got 'dqm'"),
         ({"training": {"lr": "fast"}}, "training.lr: input should be a valid number"),
         ({"training": {"lrr": 1}}, "training.lrr: unknown key, did you mean 'lr'?"),
+        ({"training": {"algorithm": "dqn", "epochs": 4}}, "training.epochs: unknown key, "),
+        ({"training": {"algorithm": "dqn", "n_stepp": 4}}, "training.n_stepp: unknown key, did you mean 'n_step'?"),
+        (
+            {"training": {"algorithm": "dqn", "exploration": {"finall": 0}}},
+            "training.exploration.finall: unknown key, did you mean 'final'?",
+        ),
+        ({"training": {"algorithm": "dqn", "exploration": {"final": 2}}}, "training: exploration: initial and final"),
+        ({"training": {"algorithm": "dqn", "learning_starts": 10**6}}, "training: learning_starts must be at most"),
+        (
+            {"training": {"algorithm": "dqn", "distributional": {"low": 1, "high": -1}}},
+            "training.distributional: high must be greater than low (1)",
+        ),
         ({"training": {"minibatch_size": 4096, "train_batch_size": 64}}, "minibatch_size must be at most"),
         ({"training": 3}, "training: "),
         ({"policies": {}}, "policies: must name at least one"),
