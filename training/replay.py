@@ -59,6 +59,11 @@ class Block:
     def __len__(self) -> int:
         return len(self.streams)
 
+    def newest(self, count: int) -> "Block":
+        """Its last rows alone."""
+        rows = {name: column[-count:] for name, column in self.rows.items()}
+        return Block(rows, self.streams[-count:], self.firsts[-count:])
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:
@@ -101,7 +106,8 @@ class Replay:
         """Take rows in, over the oldest ones where there is no room."""
         if not len(block):
             return
-        assert len(block) <= self.capacity, f"{len(block)} rows at once into a buffer of {self.capacity}"
+        if len(block) > self.capacity:
+            block = block.newest(self.capacity)
         if not self._columns:
             self._columns = {name: np.zeros((self.capacity, *c.shape[1:]), c.dtype) for name, c in block.rows.items()}
         indices = (self._added + np.arange(len(block))) % self.capacity
