@@ -1,9 +1,9 @@
 """Do the shipped configurations learn? Each part trains one by the clock and measures what came of it.
 
-Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball, two_step_game, simple_spread_qmix. Where several
-seeds or opponents are trained, two learn at once, each in a process of its own on one core. All seeds are printed, none
-is left out. Returns are per agent and episode, of policies that act greedily in fresh episodes, unless it says
-otherwise.
+Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem, connect_four_dqn
+by DQN; two_step_game, simple_spread_qmix. Where several seeds or opponents are trained, two learn at once, each in a
+process of its own on one core. All seeds are printed, none is left out. Returns are per agent and episode, of policies
+that act greedily in fresh episodes, unless it says otherwise.
 """
 
 import argparse
@@ -20,6 +20,7 @@ from scipy import stats
 from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread, told, two_at_once
 from benchmarks.truncation import as_rllib
 from benchmarks.two_step import two_step_game
+from benchmarks.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
 from examples import traffic
 from league.config import LeagueConfig
 
@@ -183,13 +184,9 @@ def last_episodes(curve: Sequence[Point], share: float) -> NDArray:
 PARTS: dict[str, Callable[[float], bool]] = {
     part.__name__: part
     for part in (
-        rps,
-        cars_and_lights,
-        shared_encoder,
-        simple_spread,
-        pistonball,
-        two_step_game,
-        simple_spread_qmix,
+        *(rps, cars_and_lights, shared_encoder, simple_spread, pistonball),
+        *(leduc_vs_random, leduc_holdem, connect_four_dqn),
+        *(two_step_game, simple_spread_qmix),
     )
 }
 

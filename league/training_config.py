@@ -263,10 +263,10 @@ class QMIXConfig(QLearningConfig):
         return self
 
 
-# Each algorithm: a class above, a member of the union, and a name here.
+# Each algorithm: a class above, and a member of the three below.
 
 AnyTraining = PPOConfig | DQNConfig | QMIXConfig
-ALGORITHMS = ("ppo", "dqn", "qmix")
+ALGORITHMS: dict[str, type[TrainingSettings]] = {"ppo": PPOConfig, "dqn": DQNConfig, "qmix": QMIXConfig}
 
 
 def _algorithm(settings: Any) -> str:

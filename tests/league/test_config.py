@@ -5,6 +5,7 @@ import pytest
 
 from league.config import LeagueConfig
 from league.errors import ConfigError
+from league.training_config import ALGORITHMS
 
 CONFIGS = sorted(Path("configs").glob("*.yaml"))
 MINIMAL = {"league": "mini", "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}}
@@ -29,9 +30,21 @@ def test_only_league_and_environment_are_required() -> None:
         ({"environment": {}}, "environment.entry_point: missing, it is required"),
         ({"gate": {"alpha": 2}}, "gate.alpha: input should be less than 0.5, got 2"),
         ({"gate": {"elo0": 10, "elo1": 5}}, "gate: elo1 must be greater than elo0 (10)"),
-        ({"training": {"algorithm": "dqm"}}, "training.algorithm: expected one of ppo, dqn, got 'dqm'"),
+        ({"training": {"algorithm": "dqm"}}, f"training.algorithm: expected one of {', '.join(ALGORITHMS)}, got 'dqm'"),
         ({"training": {"lr": "fast"}}, "training.lr: input should be a valid number"),
         ({"training": {"lrr": 1}}, "training.lrr: unknown key, did you mean 'lr'?"),
+        ({"training": {"algorithm": "dqn", "epochs": 4}}, "training.epochs: unknown key, "),
+        ({"training": {"algorithm": "dqn", "n_stepp": 4}}, "training.n_stepp: unknown key, did you mean 'n_step'?"),
+        (
+            {"training": {"algorithm": "dqn", "exploration": {"finall": 0}}},
+            "training.exploration.finall: unknown key, did you mean 'final'?",
+        ),
+        ({"training": {"algorithm": "dqn", "exploration": {"final": 2}}}, "training: exploration: initial and final"),
+        ({"training": {"algorithm": "dqn", "learning_starts": 10**6}}, "training: learning_starts must be at most"),
+        (
+            {"training": {"algorithm": "dqn", "distributional": {"low": 1, "high": -1}}},
+            "training.distributional: high must be greater than low (1)",
+        ),
         ({"training": {"minibatch_size": 4096, "train_batch_size": 64}}, "minibatch_size must be at most"),
         ({"training": 3}, "training: "),
         ({"policies": {}}, "policies: must name at least one"),
