@@ -100,6 +100,27 @@ def test_an_off_policy_run_goes_the_same_way(registry: Registry) -> None:
         train(league.with_training(dueling=False), registry=registry, parent=CheckpointRef("tictactoe", 1))
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_a_team_with_a_memory_goes_the_same_way(registry: Registry) -> None:
+    """Trained by a remote runner, published, and trained on; its versions know nothing of the mixer."""
+    config = LeagueConfig.load("configs/two_step_game.yaml").with_training(
+        runners=1, steps=2048, checkpoint_every=1024, recurrence={"width": 8, "sequence": 2}, batch_size=16
+    )
+    versions = train(config, registry=registry, console=Console(file=io.StringIO()))
+    assert lineage(versions) == [(1, 1024, None), (2, 2048, 1)]
+    policy = versions[1].manifest.policies["shared"]
+    assert [tensor.name for tensor in policy.inputs if tensor not in policy.state] == ["observation"]
+    assert [tensor.shape for tensor in policy.state] == [(None, 8), (None, 1)]
+    assert [path.name for path in registry.fetch("two_step_game", 2).glob("*.onnx")] == ["shared.onnx"]
+    (run,) = (registry.storage.home / "runs" / "two_step_game").iterdir()
+    assert {"joint/loss", "joint/value", "joint/error"} <= set(curves(run).Tags()["scalars"])
+    parent = CheckpointRef("two_step_game", 1)
+    (further,) = train(config.with_training(steps=1024), registry=registry, parent=parent)
+    assert (further.steps, further.parent) == (2048, 1)
+    with pytest.raises(ConfigError, match=r"training\.mixer: two_step_game@1 was trained with qmix, got vdn"):
+        train(config.with_training(mixer="vdn"), registry=registry, parent=parent)
+
+
 def test_what_cannot_be_trained_is_refused_before_anything_starts(registry: Registry) -> None:
     with pytest.raises(ConfigError, match="either --from or --resume"):
         train(LEAGUE, registry=registry, parent=CheckpointRef("tictactoe", 1), resume=True)
