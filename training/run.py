@@ -7,7 +7,7 @@ from pydantic import TypeAdapter
 from ray import tune
 from rich.console import Console
 
-from league.config import LeagueConfig, TrainingConfig
+from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, InterfaceChanged
 from league.interface import Interface
@@ -15,7 +15,9 @@ from league.refs import CheckpointRef
 from league.registry.manifest import TRAINING
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
-from training.algorithms.ppo import algorithm_config, module_spec
+from league.training_config import AnyTraining, TrainingConfig
+from training.algorithms.dispatch import algorithm_config, module_spec
+from training.algorithms.off_policy import replay_is_lost
 from training.cluster import UNLIMITED, LocalRay, connected
 from training.faults import told
 from training.interrupts import Interrupted
@@ -28,7 +30,10 @@ from training.runs import CHECKPOINTS, END, Run
 from training.trial import AFRESH, Plan, Start, Trial, read_progress
 from training.tuning import Unpickled, fit, quiet, run_config
 
-NETWORK = ("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder")
+NETWORK = (
+    *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
+    *("dueling", "noisy", "distributional"),
+)
 """Settings that decide what the network is: a version's weights fit no other."""
 
 
@@ -120,11 +125,12 @@ def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
 def check_network(version: VersionRow, config: LeagueConfig) -> None:
     """Raise ConfigError if `config` trains another network than the version has. What its settings do not name yet,
     it has by default."""
-    settings: TrainingConfig = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
     before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
     for key in NETWORK:
-        if before[key] != now[key]:
-            raise ConfigError(f"training.{key}: {version.ref} was trained with {before[key]}, got {now[key]}")
+        # An algorithm has some of them only.
+        if (was := before.get(key)) != (wanted := now.get(key)):
+            raise ConfigError(f"training.{key}: {version.ref} was trained with {was}, got {wanted}")
 
 
 def _publish_rest(run: Run, publisher: Publisher) -> None:
@@ -154,7 +160,10 @@ def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publish
     config, life = run.record.config, run.next_life()
     (life / CHECKPOINTS).mkdir(parents=True)
     share = cpu_share(config.training.runners)
-    plan = Plan(_start(run, registry), life / CHECKPOINTS, life / END, registry.storage, cpus=share)
+    start = _start(run, registry)
+    if start.checkpoint is not None and replay_is_lost(config.training, start.checkpoint):
+        progress.say("The replay buffer begins empty: nothing is learned until training.learning_starts transitions.")
+    plan = Plan(start, life / CHECKPOINTS, life / END, registry.storage, cpus=share)
 
     def ask_to_end() -> None:
         plan.end.touch()
