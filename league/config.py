@@ -6,37 +6,26 @@ Unknown keys are refused, everything is frozen, and an error names the file, the
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args, get_origin
+from typing import Any, Literal, Self, get_args, get_origin
 
 import yaml
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from league.errors import ConfigError, InvalidReference
 from league.interface import digest
+from league.parts import Part
 from league.refs import check_slug
+from league.training_config import ALGORITHMS, PPOConfig, TrainingConfig
 
 JSON = dict[str, Any]
-ALGORITHMS = ("ppo",)
+ONE_POLICY: dict[str, tuple[str, ...]] = {"shared": ("*",)}
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class WrapperConfig(_Part):
+class WrapperConfig(Part):
     """One SuperSuit wrapper by name, `{name: {argument: value}}` in YAML, applied in the order of the list."""
 
     name: str
-    kwargs: JSON = {}
+    kwargs: JSON = Field(default={})
 
     @model_validator(mode="before")
     @classmethod
@@ -49,7 +38,7 @@ class WrapperConfig(_Part):
         return value
 
 
-class EnvironmentConfig(_Part):
+class EnvironmentConfig(Part):
     """Which environment is played, and with which wrappers."""
 
     entry_point: str
@@ -57,7 +46,7 @@ class EnvironmentConfig(_Part):
     api: Literal["aec", "parallel", "rllib"] | None = None
     """PettingZoo's AEC or Parallel API, or RLlib's MultiAgentEnv. By default that of what a function returns; a module
     with `parallel_env` is taken as Parallel, one with `env` alone as AEC."""
-    kwargs: JSON = {}
+    kwargs: JSON = Field(default={})
     """Arguments of the environment's constructor."""
     wrappers: tuple[WrapperConfig, ...] = ()
 
@@ -66,7 +55,7 @@ class EnvironmentConfig(_Part):
         return digest(self.model_dump(mode="json"))
 
 
-class PlayConfig(_Part):
+class PlayConfig(Part):
     """How matches are played."""
 
     opening_plies: int = Field(default=0, ge=0)
@@ -82,141 +71,11 @@ class PlayConfig(_Part):
     and not of the other games that are stepped beside it."""
 
 
-class ConvolutionConfig(_Part):
-    """One convolution over the planes of an observation, without padding."""
-
-    filters: int = Field(ge=1)
-    kernel: int = Field(default=3, ge=1)
-    stride: int = Field(default=1, ge=1)
-
-
-class RecurrenceConfig(_Part):
-    """A long short-term memory between the hidden layers and the heads (Hochreiter and Schmidhuber, 1997)."""
-
-    width: int = Field(default=128, ge=1)
-    sequence: int = Field(default=20, ge=1)
-    """Steps through which gradients flow back."""
-
-
-class OpponentConfig(_Part):
-    """Somebody who plays the other sides in a share of the episodes, and does not learn."""
-
-    ref: str
-    """A script (`script:random`), a version (`connect_four@3`), or an alias, which is pinned when training begins;
-    `@3` and `@champion` are short for those of the league itself."""
-    share: float = Field(gt=0, le=1)
-    """Of the episodes. What is left of 1 is self-play."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_yaml(cls, value: Any) -> Any:
-        return {"ref": value, "share": 1.0} if isinstance(value, str) else value
-
-
-class PhaseConfig(_Part):
-    """A part of training in which some policies learn and the others stay as they are."""
-
-    policies: tuple[str, ...] = Field(min_length=1)
-    iterations: int = Field(ge=1)
-    """Updates until the next phase; after the last one the first follows again."""
-
-
-class PolicySettings(_Part):
-    """Settings of one policy that differ from the league's. See PPOConfig."""
-
-    lr: float | None = Field(default=None, gt=0)
-    gamma: float | None = Field(default=None, ge=0, le=1)
-    lambda_: float | None = Field(default=None, ge=0, le=1, alias="lambda")
-    clip: float | None = Field(default=None, gt=0)
-    entropy: float | None = Field(default=None, ge=0)
-
-
-class PPOConfig(_Part):
-    """Proximal policy optimisation by self-play (Schulman et al., 2017, arXiv 1707.06347)."""
-
-    algorithm: Literal["ppo"] = "ppo"
-    seed: int = Field(default=0, ge=0)
-    steps: int = Field(default=1_000_000, ge=1)
-    """Actions of all agents after which training ends."""
-    minutes: float | None = Field(default=None, gt=0)
-    """Wall-clock limit of training; it ends at whichever of the two limits comes first."""
-    checkpoint_every: int | None = Field(default=200_000, ge=1)
-    """Actions between two published versions, null for no such cadence. The end of training publishes one too."""
-    checkpoint_minutes: float | None = Field(default=None, gt=0)
-    """Wall-clock minutes of training between two published versions; the sooner of the two counts."""
-    runners: int = Field(default=1, ge=0)
-    """Sampling processes; 0 samples in the learner's process."""
-    copies: int = Field(default=32, ge=1)
-    """Environment copies stepped together in each runner."""
-    train_batch_size: int = Field(default=2048, ge=1)
-    """Actions per update."""
-    minibatch_size: int = Field(default=256, ge=1)
-    epochs: int = Field(default=4, ge=1)
-    lr: float = Field(default=3e-4, gt=0)
-    gamma: float = Field(default=0.99, ge=0, le=1)
-    lambda_: float = Field(default=0.95, ge=0, le=1, alias="lambda")
-    clip: float = Field(default=0.2, gt=0)
-    entropy: float = Field(default=0.05, ge=0)
-    value_loss: float = Field(default=0.5, ge=0)
-    grad_clip: float = Field(default=0.5, gt=0)
-    convolutions: tuple[ConvolutionConfig, ...] = ()
-    """Layers over those parts of the observation that are planes, (height, width, channels). Others are flattened."""
-    hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
-    """Widths of the hidden layers."""
-    recurrence: RecurrenceConfig | None = None
-    """A memory over the steps of an episode, null for none."""
-    normalize_observations: bool = False
-    """Shift and scale each number of the observations by its running mean and deviation, inside the exported graph."""
-    shared_encoder: bool = False
-    """All policies share the convolutions and hidden layers, each has heads of its own."""
-    per_policy: dict[str, PolicySettings] = {}
-    """policy id → settings that differ for it."""
-    policies_to_train: tuple[str, ...] | tuple[PhaseConfig, ...] | None = None
-    """The policies that learn, or phases that follow one another in a circle; null for all. The others play on with the
-    weights that they have: those of the version that training began from (`--from`), else their initial ones."""
-    opponents: tuple[OpponentConfig, ...] = ()
-    """Who plays against the learners in some episodes: one side, drawn anew in each, learns, and the opponent has all
-    others."""
-    gpus: float = Field(default=0, ge=0)
-    """GPUs of the learner; a fraction shares one."""
-    runner_gpus: float = Field(default=0, ge=0)
-    """GPUs of each runner, for its inference."""
-    crashes: int = Field(default=3, ge=0)
-    """Times in a row that a copy of the environment may raise and is built anew; its episode is not learned from."""
-    opening_plies: int = Field(default=0, ge=0)
-    """Up to this many random legal moves begin each episode. They are not learned from, but lead to positions that
-    self-play alone would not visit."""
-
-    @model_validator(mode="after")
-    def _minibatch_fits(self) -> Self:
-        if self.minibatch_size > self.train_batch_size:
-            raise ValueError(f"minibatch_size must be at most train_batch_size ({self.train_batch_size})")
-        return self
-
-    @model_validator(mode="after")
-    def _shares_fit(self) -> Self:
-        if (total := sum(opponent.share for opponent in self.opponents)) > 1 + 1e-9:
-            raise ValueError(f"the shares of opponents must not exceed 1, got {total:g}")
-        if self.shared_encoder and self.recurrence is not None:
-            raise ValueError("shared_encoder has no memory: leave recurrence out")
-        return self
-
-
-def _algorithm(settings: Any) -> str:
-    if isinstance(settings, Mapping):
-        return str(settings.get("algorithm", "ppo"))
-    return str(getattr(settings, "algorithm", "ppo"))
-
-
-TrainingConfig = Annotated[Annotated[PPOConfig, Tag("ppo")], Discriminator(_algorithm)]
-"""The settings of one algorithm, told apart by `algorithm`."""
-
-
 LARGEST_NORMALIZED_ELO = 190
 """Farther hypotheses have no usable test: see evaluation/sequential.py."""
 
 
-class AnchorConfig(_Part):
+class AnchorConfig(Part):
     """Somebody held out of training, to whom a challenger must not be inferior."""
 
     ref: str
@@ -231,7 +90,7 @@ class AnchorConfig(_Part):
         return {"ref": value} if isinstance(value, str) else value
 
 
-class GateConfig(_Part):
+class GateConfig(Part):
     """What a challenger must show to be promoted. See docs/statistics.md."""
 
     model: Literal["logistic", "normalized", "returns"] = "normalized"
@@ -310,7 +169,7 @@ class GateConfig(_Part):
         return self.model_copy(update={"alpha": alpha, "nights": None})
 
 
-class AshaConfig(_Part):
+class AshaConfig(Part):
     """Asynchronous successive halving: bad trials end early (Li et al., 2020, arXiv 1810.05934)."""
 
     grace_steps: int = Field(default=50_000, ge=1)
@@ -319,7 +178,7 @@ class AshaConfig(_Part):
     """One of this many trials goes on at each rung."""
 
 
-class SweepConfig(_Part):
+class SweepConfig(Part):
     """A search over training settings: `league sweep`."""
 
     parameters: dict[str, JSON | list[Any]] = Field(min_length=1)
@@ -336,12 +195,12 @@ class SweepConfig(_Part):
     """End bad trials early; null lets each use its whole budget."""
 
 
-class LeagueConfig(_Part):
+class LeagueConfig(Part):
     """One league. Only `league` and `environment` are required."""
 
     league: str
     environment: EnvironmentConfig
-    policies: dict[str, tuple[str, ...]] | str = {"shared": ("*",)}
+    policies: dict[str, tuple[str, ...]] | str = Field(default=ONE_POLICY)
     """policy id → agents, by name or pattern (`player_*`); the first policy whose pattern fits takes the agent. Or a
     function `package.module:function`: agent → policy id."""
     sides: dict[str, tuple[str, ...]] | None = None

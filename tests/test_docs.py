@@ -10,7 +10,8 @@ import yaml
 from typer.core import TyperGroup
 
 from cli.main import app
-from league.config import LeagueConfig, PPOConfig
+from league.config import LeagueConfig
+from league.training_config import PPOConfig
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

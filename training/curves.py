@@ -7,6 +7,8 @@
 | `<policy>/return`, `<policy>/length` | mean over the agents of a policy |
 | `<policy>/entropy` | of the distributions that were played from, in nats |
 | `<policy>/policy_loss`, `value_loss`, `kl`, `clip_fraction`, `explained_variance`, `gradient_norm` | of its learning |
+| `<policy>/loss`, `value`, `error` | off-policy: its loss, the values of its actions, TD errors; `joint/…` if centralised |
+| `exploration` | off-policy: how much is explored |
 | `agents/<agent>/return`, `agents/<agent>/length` | of one agent |
 | `time/sampling`, `time/learning`, `time/weights`, `time/checkpoint` | seconds of wall time in the report |
 | `gpu/memory_gb`, `gpu/utilization` | where there is one: most that the learner held, percent of time busy |
@@ -33,6 +35,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.interface import Interface
+from training.sampling.closed import JOINT
 from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 
 RETURN = "return"
@@ -51,6 +54,10 @@ LEARNED = {
     "gradient_norm": "gradient_norm",
 }
 
+OFF_POLICY = ("loss", "value", "error", "gradient_norm")
+EXPLORATION = "exploration"
+"""Logged by off-policy algorithms at the top of RLlib's result."""
+
 
 def time_each_update(algorithm: Algorithm) -> None:
     """Have the algorithm report the phases of its newest update: RLlib's own timers average over hundreds."""
@@ -58,9 +65,9 @@ def time_each_update(algorithm: Algorithm) -> None:
         algorithm.metrics.log_time((TIMERS, timer), reduce="mean", window=1)
 
 
-def names(interface: Interface) -> set[str]:
+def names(interface: Interface, algorithm: str = "ppo") -> set[str]:
     """The curves that training has of what was learned."""
-    of_policy = {RETURN, "length", "entropy", *LEARNED}
+    of_policy = {RETURN, "length", "entropy", *(LEARNED if algorithm == "ppo" else OFF_POLICY)}
     return (
         {RETURN, "length"}
         | {f"{policy}/{name}" for policy in interface.policy_ids for name in of_policy}
@@ -74,13 +81,16 @@ def curves(result: Mapping[str, Any], interface: Interface) -> dict[str, float]:
     found: dict[str, Any] = {
         RETURN: play.get(EPISODE_RETURN_MEAN),
         "length": play.get(EPISODE_LEN_MEAN),
+        EXPLORATION: result.get(EXPLORATION),
     }
     for policy in interface.policy_ids:
-        learned = result[LEARNER_RESULTS].get(policy, {})
         found[f"{policy}/return"] = play.get(EPISODE_MODULE_RETURN_MEAN, {}).get(policy)
         found[f"{policy}/length"] = play.get(EPISODE_MODULE_LEN_MEAN, {}).get(policy)
         found[f"{policy}/entropy"] = play.get(policy, {}).get(ENTROPY)
-        found |= {f"{policy}/{name}": learned.get(key) for name, key in LEARNED.items()}
+    for key in (*interface.policy_ids, JOINT):
+        learned = result.get(LEARNER_RESULTS, {}).get(key, {})
+        found |= {f"{key}/{name}": learned.get(metric) for name, metric in LEARNED.items()}
+        found |= {f"{key}/{name}": learned.get(name) for name in OFF_POLICY}
     for agent in interface.agents:
         found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
         found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)

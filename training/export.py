@@ -16,7 +16,7 @@ from league.policies.actions import bounds, dist_inputs_size
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.registry.manifest import Tensor as TensorManifest
 from league.spaces import Box, DictSpace, Discrete, MultiDiscrete, Space, inputs
-from training.modules.actor_critic import ActorCritic
+from training.modules.acting import Acting
 
 BATCH = "batch"
 
@@ -27,7 +27,7 @@ class ActingGraph(nn.Module):
     `action` is greedy and in the agent's own action space; as the distribution's inputs are masked, it is legal.
     """
 
-    def __init__(self, module: ActorCritic, observed: tuple[str, ...], action: Space) -> None:
+    def __init__(self, module: Acting, observed: tuple[str, ...], action: Space) -> None:
         super().__init__()
         self.module = module
         self.observed = observed
@@ -89,7 +89,7 @@ class Spanned(nn.Module):
         return (spanned if self.is_bounded else torch.where(self.finite, spanned, clipped)).to(self.dtype)
 
 
-def export_policy(module: ActorCritic, spaces: AgentInterface, path: Path) -> None:
+def export_policy(module: Acting, spaces: AgentInterface, path: Path) -> None:
     """Write the graph of `module` to `path`. Inputs and outputs are those of `graph_tensors`, the batch is dynamic."""
     taken, answered, _ = graph_tensors(module, spaces)
     # Two rows: torch.export takes a batch of one for a constant.
@@ -112,7 +112,7 @@ def export_policy(module: ActorCritic, spaces: AgentInterface, path: Path) -> No
 Tensors = tuple[TensorManifest, ...]
 
 
-def graph_tensors(module: ActorCritic, spaces: AgentInterface) -> tuple[Tensors, Tensors, Tensors]:
+def graph_tensors(module: Acting, spaces: AgentInterface) -> tuple[Tensors, Tensors, Tensors]:
     """Inputs, outputs and recurrent inputs of a policy's graph, as its manifest states them. The last are among the
     first, behind the observations."""
     assert not isinstance(spaces.action, DictSpace), "module_spec refuses it"

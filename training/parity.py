@@ -25,7 +25,7 @@ from league.policies.probes import Probes
 from league.registry.manifest import Parity
 from league.seeds import derive, generator
 from league.spaces import ACTION_MASK, Space
-from training.modules.actor_critic import ActorCritic
+from training.modules.acting import Acting
 from training.sampling.distributions import distribution
 from training.sampling.memories import Memories
 from training.sampling.reset_seeds import SEEDS
@@ -80,7 +80,7 @@ def _one_thread() -> Iterator[None]:
 
 @_one_thread()
 def gather(
-    environment: EnvironmentConfig, interface: Interface, modules: Mapping[str, ActorCritic], seed: int
+    environment: EnvironmentConfig, interface: Interface, modules: Mapping[str, Acting], seed: int
 ) -> dict[str, list[Met]]:
     """Play until each policy has met enough observations; policy → batches of them, with its states carried along.
 
@@ -120,7 +120,7 @@ def gather(
 
 
 @_one_thread()
-def prove(path: Path, policy: str, module: ActorCritic, batches: list[Met], space: Space) -> Parity:
+def prove(path: Path, policy: str, module: Acting, batches: list[Met], space: Space) -> Parity:
     """Compare the graph at `path`, as it is served, with `module`, row by row. space: that of the actions.
 
     Raises ParityError if a greedy action differs that is no near tie, or an input of the distribution, or a number of
@@ -170,7 +170,7 @@ def _state_in(state: Mapping[str, NDArray]) -> dict[str, NDArray]:
     return {f"{STATE_IN}{i}": value for i, value in enumerate(state.values())}
 
 
-def answer(module: ActorCritic, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:
+def answer(module: Acting, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:
     """What a module answers: inputs of its distribution (k, d), and the states after."""
     outputs = module.forward_inference(
         {

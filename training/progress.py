@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.progress import BarColumn, ProgressColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bars
 
-from league.config import PPOConfig
 from league.registry.rows import VersionRow
+from league.training_config import TrainingSettings
 
 SECONDS_PER_LINE = 10.0
 MOST_POLICIES = 3
@@ -19,7 +19,7 @@ MOST_POLICIES = 3
 class Progress:
     """Use as a context manager around the run. May be told of versions by another thread."""
 
-    def __init__(self, console: Console, settings: PPOConfig, policies: tuple[str, ...]) -> None:
+    def __init__(self, console: Console, settings: TrainingSettings, policies: tuple[str, ...]) -> None:
         self._console = console
         self._settings = settings
         self._policies = policies
@@ -67,7 +67,7 @@ def bars(console: Console, *columns: ProgressColumn) -> Bars:
     )
 
 
-def fraction(metrics: Mapping[str, Any], settings: PPOConfig) -> float:
+def fraction(metrics: Mapping[str, Any], settings: TrainingSettings) -> float:
     """How much of the budget is spent: of steps or of time, whichever is further."""
     spent = metrics["steps"] / settings.steps
     if settings.minutes is not None:

@@ -15,9 +15,9 @@ from league.registry.registry import Registry
 from league.registry.rows import VersionRow
 from league.stack import installed
 from training import parity
-from training.algorithms.ppo import module_spec
+from training.algorithms.dispatch import module_spec
 from training.export import export_policy, graph_tensors
-from training.modules.actor_critic import ActorCritic
+from training.modules.acting import Acting
 
 MODULES = Path(COMPONENT_LEARNER_GROUP, COMPONENT_LEARNER, COMPONENT_RL_MODULE)
 """Where RLlib keeps the modules inside an Algorithm's checkpoint."""
@@ -77,7 +77,7 @@ def publish(
     return registry.publish(config.league, build, source=checkpoint.source, parent=parent)
 
 
-def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, ActorCritic]:
+def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, Acting]:
     """The policies' modules in the state of `checkpoint`. Reads pickles: only for what our own training wrote."""
     modules = module_spec(config.training, interface).build()
     modules.restore_from_path(checkpoint / MODULES)
@@ -102,7 +102,7 @@ def _git(directory: Path, *arguments: str) -> str:
 
 
 def _export(
-    staging: Path, policy: str, module: ActorCritic, interface: Interface, observations: list[parity.Met]
+    staging: Path, policy: str, module: Acting, interface: Interface, observations: list[parity.Met]
 ) -> PolicyManifest:
     spaces = interface.of_policy(policy)
     file, probes = f"{policy}.onnx", f"{policy}{PROBES}"

@@ -3,8 +3,8 @@
 import ray
 from ray import tune
 
-from league.config import PPOConfig
 from league.errors import ConfigError
+from league.training_config import TrainingSettings
 
 SMALLEST_SHARE = 0.05
 """Of a CPU. More processes than twenty on one do nothing but wait for one another."""
@@ -23,7 +23,7 @@ def cpu_share(runners: int, at_once: int = 1) -> float:
     return share
 
 
-def placement(settings: PPOConfig, cpus: float) -> tune.PlacementGroupFactory:
+def placement(settings: TrainingSettings, cpus: float) -> tune.PlacementGroupFactory:
     """The learner on the driver's machine, where checkpoints are read; each runner anywhere.
 
     cpus: of each. Raises ConfigError if it asks for more GPUs than there are: it would wait for ever.

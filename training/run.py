@@ -7,7 +7,7 @@ from pydantic import TypeAdapter
 from ray import tune
 from rich.console import Console
 
-from league.config import LeagueConfig, TrainingConfig
+from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, InterfaceChanged
 from league.interface import Interface
@@ -15,7 +15,8 @@ from league.refs import CheckpointRef
 from league.registry.manifest import TRAINING
 from league.registry.registry import Registry
 from league.registry.rows import VersionRow
-from training.algorithms.ppo import algorithm_config, module_spec
+from league.training_config import AnyTraining, TrainingConfig
+from training.algorithms.dispatch import algorithm_config, module_spec
 from training.cluster import UNLIMITED, LocalRay, connected
 from training.faults import told
 from training.interrupts import Interrupted
@@ -120,7 +121,7 @@ def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
 def check_network(version: VersionRow, config: LeagueConfig) -> None:
     """Raise ConfigError if `config` trains another network than the version has. What its settings do not name yet,
     it has by default."""
-    settings: TrainingConfig = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
     before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
     for key in NETWORK:
         if before[key] != now[key]:

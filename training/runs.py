@@ -19,10 +19,11 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict
 
-from league.config import LeagueConfig, PPOConfig
+from league.config import LeagueConfig
 from league.errors import ConfigError, NotFound
 from league.registry.faults import disk_faults
 from league.settings import Storage
+from league.training_config import TrainingSettings
 from training.pinning import with_pins
 from training.records import locked, write
 
@@ -155,7 +156,7 @@ def changed_part(old: LeagueConfig, new: LeagueConfig) -> str | None:
     return None
 
 
-def _has_larger_budget(old: PPOConfig, new: PPOConfig) -> bool:
+def _has_larger_budget(old: TrainingSettings, new: TrainingSettings) -> bool:
     """Whether one limit is larger; the trial finds out whether the other one was what ended it."""
     before, now = (settings.minutes or math.inf for settings in (old, new))
     return new.steps > old.steps or now > before

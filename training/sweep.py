@@ -126,7 +126,7 @@ def _conclude(
 
 
 def _check(config: LeagueConfig, sweep: SweepConfig, trials: list[Settings], interface: Interface) -> None:
-    if sweep.metric not in (known := curves.names(interface)):
+    if sweep.metric not in (known := curves.names(interface, config.training.algorithm)):
         raise ConfigError(f"sweep.metric: no curve {sweep.metric!r}; expected one of {', '.join(sorted(known))}")
     for settings in trials:
         try:

@@ -24,7 +24,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from league.config import LeagueConfig
 from league.interface import Interface
 from league.settings import Storage
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.dispatch import algorithm_config
 from training.curves import CHECKPOINT_TIME, amounts, curves, gpu_use, time_each_update
 
 STEP_SECONDS = 2.0

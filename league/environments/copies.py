@@ -30,6 +30,10 @@ class Copy(Protocol):
         """Act: (agent, action) for each agent that must, in the order of `possible_agents`."""
         ...
 
+    def state(self) -> Any:
+        """The environment's own global state as it stands; None where it has none."""
+        ...
+
     def render(self) -> Any:
         """What the environment's own render gives."""
         ...
@@ -61,6 +65,9 @@ class AECCopy:
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
         self._env.step(moves[0][1])
         return self._reports()
+
+    def state(self) -> Any:
+        return _state(self._env)
 
     def render(self) -> Any:
         return self._env.render()
@@ -171,6 +178,9 @@ class ParallelCopy(_Simultaneous):
         for agent in agents - observations.keys() - self._gone:
             raise EnvironmentMismatch(f"agent {agent} is among the agents, but has no observation to act on")
 
+    def state(self) -> Any:
+        return _state(self._env)
+
     def render(self) -> Any:
         return self._env.render()
 
@@ -186,14 +196,14 @@ class MultiAgentCopy(_Simultaneous):
         self._env = env
 
     def reset(self, seed: int) -> list[Report]:
-        observations, _ = self._env.reset(seed=seed)
+        observations, self._infos = self._env.reset(seed=seed)
         return self._begin(self._kept(observations)) or self.step(())
 
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
         actions = self._actions(moves)
         ended: list[Report] = []
         for _ in range(MOST_IDLE_STEPS):
-            observations, rewards, terminated, truncated, _ = self._env.step(actions)
+            observations, rewards, terminated, truncated, self._infos = self._env.step(actions)
             is_over = terminated.get("__all__", False) or truncated.get("__all__", False)
             if is_over:
                 # Who has no flag of its own ends as the episode does.
@@ -206,6 +216,11 @@ class MultiAgentCopy(_Simultaneous):
             actions, ended = {}, reports
         raise EnvironmentMismatch(f"nobody has acted for {MOST_IDLE_STEPS} steps of the environment")
 
+    def state(self) -> Any:
+        """RLlib's API has no method for it: `info["state"]` of any agent, or in the common info."""
+        told = (info["state"] for info in self._infos.values() if isinstance(info, Mapping) and "state" in info)
+        return next(told, _state(self._env))
+
     def render(self) -> Any:
         return self._env.render()
 
@@ -216,6 +231,13 @@ class MultiAgentCopy(_Simultaneous):
     def _kept(observations: Mapping[str, Any]) -> dict[str, Any]:
         """Copies, since the last of them may be asked for after the environment has gone on."""
         return {agent: _copied(value) for agent, value in observations.items()}
+
+
+def _state(env: Any) -> Any:
+    try:
+        return env.state()
+    except (AttributeError, NotImplementedError):
+        return None
 
 
 def _flag(agent: str, terminated: Mapping[str, bool], truncated: Mapping[str, bool]) -> bool:

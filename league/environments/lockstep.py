@@ -27,14 +27,20 @@ Rows = dict[Group, tuple[list[int], list[int], list[Observation], list[float]]]
 
 
 def stepping(
-    config: EnvironmentConfig, copies: int, *, crashes: int = 0, render_mode: str | None = None
+    config: EnvironmentConfig,
+    copies: int,
+    *,
+    crashes: int = 0,
+    render_mode: str | None = None,
+    states: bool = False,
 ) -> BatchedEnvironment:
     """`copies` environments in lockstep.
 
     crashes: how often in a row a copy may raise and is built anew; beyond, its exception goes to the caller.
+    states: give the environment's global states along.
     render_mode: PettingZoo's, for copies that shall be rendered (`rgb_array`, `human`).
     """
-    return Lockstep(lambda: build(config, render_mode), copies, crashes)
+    return Lockstep(lambda: build(config, render_mode), copies, crashes, states)
 
 
 class Lockstep:
@@ -44,8 +50,8 @@ class Lockstep:
     object itself, which PettingZoo's contract requires `reset` to clear.
     """
 
-    def __init__(self, make: Callable[[], Any], copies: int, crashes: int = 0) -> None:
-        self._make, self._most_crashes = make, crashes
+    def __init__(self, make: Callable[[], Any], copies: int, crashes: int = 0, states: bool = False) -> None:
+        self._make, self._most_crashes, self._gives_states = make, crashes, states
         envs = [make() for _ in range(copies)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
         spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.agents]
@@ -180,6 +186,9 @@ class Lockstep:
             agents.append(agent)
             observations.append(observation)
             rewards.append(reward)
+        if self._gives_states and (state := self._copies[copy].state()) is not None:
+            known = turn.last_states if is_over else turn.states
+            known[copy] = np.array(state, dtype=np.float32).ravel()
         if is_over:
             turn.finished.append(copy)
             self._crashes[copy] = 0

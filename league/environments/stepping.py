@@ -83,6 +83,10 @@ class Turn:
     crashed: list[int] = field(default_factory=list)
     """Copies whose environment raised and was built anew. Their episode has no endings and is not in `finished`: what
     was reported of it is to be dropped. Their next one has begun in this call."""
+    states: dict[int, NDArray] = field(default_factory=dict)
+    """Copy → the global state as it stands, float32 and flat, where it is asked for and the environment has one."""
+    last_states: dict[int, NDArray] = field(default_factory=dict)
+    """Of the finished copies, the state that their episode ended in."""
 
 
 class BatchedEnvironment(Protocol):

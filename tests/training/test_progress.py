@@ -2,7 +2,7 @@ import io
 
 from rich.console import Console
 
-from league.config import PPOConfig
+from league.training_config import PPOConfig
 from training.progress import Progress, clock
 
 SETTINGS = PPOConfig(steps=1000, minutes=2)

@@ -1,8 +1,8 @@
 import pytest
 import ray
 
-from league.config import PPOConfig
 from league.errors import ConfigError
+from league.training_config import PPOConfig
 from training.resources import cpu_share, placement
 
 

@@ -6,13 +6,9 @@ generalised advantage estimates (Schulman et al., 2016, arXiv 1506.02438).
 """
 
 from collections.abc import Collection
-from functools import partial
 
-import torch
 from ray.rllib.algorithms import ppo
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule, MultiRLModuleSpec
-from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.execution.rollout_ops import synchronous_parallel_sample
 from ray.rllib.utils.metrics import (
     ENV_RUNNER_RESULTS,
@@ -23,19 +19,19 @@ from ray.rllib.utils.metrics import (
     TIMERS,
 )
 
-from league.config import LeagueConfig, PPOConfig
+from league.config import LeagueConfig
 from league.errors import ConfigError
 from league.interface import Interface
-from league.policies.actions import dist_inputs_size
-from league.seeds import derive
 from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
+from league.training_config import PPOConfig
 from training.algorithms import phases
+from training.algorithms.setup import begin_anew, configure, specs
 from training.learners.hyperparameters import hyperparameters
 from training.learners.ppo import PPOLearner
 from training.modules.actor_critic import ActorCritic
 from training.modules.shared_encoder import SharedEncoder
-from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, LockstepEnvRunner, module_spaces
+from training.sampling.env_runner import LEAGUE, LockstepEnvRunner
 
 
 class PPO(ppo.PPO):
@@ -67,14 +63,8 @@ class PPO(ppo.PPO):
                 )
 
     def begin_anew(self, steps: int) -> None:
-        """Leave all episodes under way, and derive every random choice from here on from the seed and `steps`.
-
-        Called at each checkpoint, and where training goes on from one: both then go on alike.
-        """
-        # A runner beside remote ones only keeps weights.
-        is_local = self.env_runner_group.num_remote_env_runners() == 0
-        self.env_runner_group.foreach_env_runner(partial(_begin_anew, steps=steps), local_env_runner=is_local)
-        torch.manual_seed(derive(self.config.seed or 0, "learner", steps))
+        """Leave all episodes under way, and derive every random choice from here on from the seed and `steps`."""
+        begin_anew(self, steps)
 
     def _learning(self) -> Collection[str]:
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
@@ -91,35 +81,17 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
     Raises ConfigError where settings name policies that there are not, or spaces do not fit the module.
     """
     settings = league.training
-    phases.check(settings, interface.policy_ids)
+    assert isinstance(settings, PPOConfig)
     hyperparameters(settings, interface.policy_ids)
     config = ppo.PPOConfig(algo_class=PPO)
-    config.environment(
-        env_config={
-            LEAGUE: league.model_dump(mode="json", by_alias=True),
-            INTERFACE: interface.model_dump(mode="json"),
-            STORAGE: storage,
-        }
-    )
-    config.multi_agent(
-        policies=interface.policy_ids,  # in this order, by which seeded weights and minibatches are drawn
-        policy_mapping_fn=lambda agent, *_, **__: interface.policies[agent],
-    )
-    config.rl_module(rl_module_spec=module_spec(settings, interface))
-    config.env_runners(
-        env_runner_cls=LockstepEnvRunner,
-        num_env_runners=settings.runners,
-        num_envs_per_env_runner=settings.copies,
-        num_gpus_per_env_runner=settings.runner_gpus,
-        # The runners have no connector state that could be merged.
-        merge_env_runner_states=False,
-    )
-    # The learner works in the process of the algorithm.
-    config.learners(
-        learner_class=PPOLearner,
-        num_learners=0,
-        num_gpus_per_learner=settings.gpus,
-        add_default_connectors_to_learner_pipeline=False,
+    configure(
+        config,
+        league,
+        interface,
+        storage,
+        modules=module_spec(settings, interface),
+        runner=LockstepEnvRunner,
+        learner=PPOLearner,
     )
     config.training(
         train_batch_size_per_learner=settings.train_batch_size,
@@ -136,10 +108,6 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
         grad_clip=settings.grad_clip,
         grad_clip_by="global_norm",
     )
-    # An environment's fault shall be seen, not tried again for ever; a run that broke off can be resumed.
-    config.fault_tolerance(restart_failed_env_runners=False, ignore_env_runner_failures=False)
-    config.debugging(seed=settings.seed, log_level="ERROR")
-    config.reporting(min_time_s_per_iteration=0)
     return config
 
 
@@ -151,20 +119,11 @@ def module_spec(settings: PPOConfig, interface: Interface) -> MultiRLModuleSpec:
         "recurrence": settings.recurrence and settings.recurrence.width,
         "normalize": settings.normalize_observations,
     }
-    specs = {}
-    for policy in interface.policy_ids:
-        try:
-            dist_inputs_size(interface.of_policy(policy).action)
-        except ConfigError as error:
-            raise ConfigError(f"policies.{policy}: {error}") from error
-        observation, action = module_spaces(interface, policy)
-        specs[policy] = RLModuleSpec(
-            module_class=ActorCritic, observation_space=observation, action_space=action, model_config=model_config
-        )
     if settings.shared_encoder:
         _check_shared(interface)
     return MultiRLModuleSpec(
-        multi_rl_module_class=SharedEncoder if settings.shared_encoder else MultiRLModule, rl_module_specs=specs
+        multi_rl_module_class=SharedEncoder if settings.shared_encoder else MultiRLModule,
+        rl_module_specs=specs(interface, ActorCritic, model_config),
     )
 
 
@@ -183,7 +142,3 @@ def _check_shared(interface: Interface) -> None:
                 f"training.shared_encoder: policies {first} and {other} observe different spaces: leave it out, or pad"
                 " the observations with SuperSuit"
             )
-
-
-def _begin_anew(runner: EnvRunner, steps: int) -> None:
-    runner.begin_anew(steps)

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, fields
 
-from league.config import PPOConfig
 from league.errors import ConfigError
+from league.training_config import PPOConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,9 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ALL_MODULES, NUM_MODULE_STEPS_TRAINED
 from torch import Tensor
 
-from league.config import LeagueConfig, PPOConfig
+from league.config import LeagueConfig
 from league.errors import ConfigError
+from league.training_config import PPOConfig
 from training.learners.hyperparameters import hyperparameters
 from training.learners.minibatches import minibatches
 from training.learners.ppo_loss import PPOLoss, ppo_loss
@@ -55,7 +56,9 @@ class PPOLearner(TorchLearner):
             raise ConfigError(
                 f"training.gpus: {self.config.num_gpus_per_learner:g} asked for the learner, but torch sees no GPU here"
             )
-        self.settings: PPOConfig = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
+        settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
+        assert isinstance(settings, PPOConfig)
+        self.settings = settings
         self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies))
         super().build()
 

@@ -2,27 +2,24 @@
 
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
-from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
 from league.spaces import ACTION_MASK
+from training.modules.acting import MASKED, Acting
 from training.modules.distributions import Gaussian, distribution
 from training.modules.encoder import Encoder, linear
 from training.modules.memory import Memory, State
 
-MASKED = -1e9
-"""Logit of an illegal action: its probability is exactly 0 in float32, and entropy and gradients stay finite."""
 FIRST_LOG_DEVIATION = -0.5
 """Of the actions of a Box; exp(-0.5) = 0.6 explores most of the span [-1, 1] without being clipped all the time."""
 LOG_DEVIATIONS = -5.0, 2.0
 
 
-class ActorCritic(TorchRLModule, ValueFunctionAPI):
+class ActorCritic(Acting, ValueFunctionAPI):
     """Encoder, memory where asked for, a policy head and a value head.
 
     Observations are dictionaries ONNX input name → tensor (B, …) in the environment's dtype; `action_mask` (B, d) of
@@ -52,18 +49,6 @@ class ActorCritic(TorchRLModule, ValueFunctionAPI):
             if isinstance(self.distribution, Gaussian)
             else None
         )
-
-    def train(self, mode: bool = True) -> "ActorCritic":
-        """As nn.Module's, which RLlib calls at every forward pass, but without the walk where nothing changes."""
-        return self if self.training == mode else super().train(mode)
-
-    def get_state(self, *_: Any, **__: Any) -> dict[str, NDArray]:
-        """Weights by name. RLlib's makes floats of doubles, but the statistics of observations must stay exact."""
-        return {name: np.array(tensor.detach().cpu()) for name, tensor in self.state_dict().items()}
-
-    def set_state(self, state: dict[str, NDArray]) -> None:
-        """Take over what `get_state` gave."""
-        self.load_state_dict({name: torch.tensor(array) for name, array in state.items()})
 
     def get_initial_state(self) -> dict[str, NDArray]:
         """The state before an episode's first step, key → (width,); empty without a memory."""

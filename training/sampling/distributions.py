@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from league.policies.actions import dist_inputs_size
 from league.spaces import Discrete, MultiDiscrete, Space
-from training.modules.actor_critic import MASKED
+from training.modules.acting import MASKED
 from training.sampling import categorical
 
 Drawn = tuple[NDArray, NDArray]

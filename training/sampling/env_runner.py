@@ -27,6 +27,7 @@ from league.errors import ConfigError, LeagueError
 from league.interface import Interface
 from league.seeds import generator
 from league.spaces import inputs, to_gymnasium
+from training.sampling.recorder import Chunks
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import Answer, Ask, SelfPlay
 
@@ -47,6 +48,8 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
     with a memory also leaves the state before each step, under STATE_IN. Actions are raw (league.policies.actions).
     """
 
+    gives_states = False
+    """Whether the environments' global states are wanted."""
     env: BatchedEnvironment | None
     module: MultiRLModule
     worker_index: int
@@ -72,10 +75,11 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
         self.stop()
         with self._named():
             copies, crashes = self.config.num_envs_per_env_runner, self.league.training.crashes
-            self.env = stepping(self.league.environment, copies, crashes=crashes)
+            self.env = stepping(self.league.environment, copies, crashes=crashes, states=self.gives_states)
             initial = {policy: _arrays(module.get_initial_state()) for policy, module in self.module.items()}
             storage = self.config.env_config.get(STORAGE)
-            self._play = SelfPlay(self.env, self.interface, self.league.training, initial, storage)
+            self._chunks = Chunks(self.interface, self.env.agents, copies)
+            self._play = SelfPlay(self.env, self.interface, self.league.training, self._chunks, initial, storage)
         self._has_begun = False
 
     def make_module(self) -> None:
@@ -126,7 +130,7 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
         explore = self.config.explore if explore is None else explore
         think = None if random_actions else self._explore if explore else self._infer
         play = self._play
-        with self._named(), _one_thread():
+        with self._named(), one_thread():
             if not self._has_begun:
                 self.begin_anew(self.num_env_steps_sampled_lifetime)
             elif force_reset:
@@ -135,7 +139,7 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
             episodes = play.metrics.episodes + (num_episodes or 0)
             while play.metrics.steps < steps or play.metrics.episodes < episodes:
                 play.step(think, explore)
-            while not (chunks := play.cut()):
+            while not (chunks := self._chunks.cut()):
                 play.step(think, explore)
         return chunks
 
@@ -260,7 +264,7 @@ class LockstepEnvRunner(EnvRunner, Checkpointable):
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Rows of one step are too few to be shared out, and each runner has one core."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

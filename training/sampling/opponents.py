@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from league.config import OpponentConfig
 from league.environments.stepping import Batch
 from league.errors import ConfigError
 from league.interface import Interface
@@ -15,6 +14,7 @@ from league.policies.policy import Policy
 from league.refs import ScriptRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
+from league.training_config import OpponentConfig
 from training.sampling.memories import Memories
 from training.sampling.seats import Opposing
 

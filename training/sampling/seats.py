@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from league.config import OpponentConfig
 from league.errors import ConfigError
 from league.interface import Interface
+from league.training_config import OpponentConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,22 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
-from league.config import PPOConfig
 from league.environments.stepping import Batch, BatchedEnvironment, Episode, Group, Turn
 from league.interface import Interface
 from league.policies.actions import to_environment
 from league.settings import Storage
 from league.spaces import ACTION_MASK
+from league.training_config import TrainingSettings
 from training.sampling.distributions import distribution
 from training.sampling.memories import Memories, State
 from training.sampling.openings import Openings, RandomMover
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import PlayMetrics
+from training.sampling.recorder import Recorder
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.seats import Opposing, Seats
-from training.sampling.transitions import Transitions
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +50,17 @@ class SelfPlay:
         self,
         stepping: BatchedEnvironment,
         interface: Interface,
-        settings: PPOConfig,
+        settings: TrainingSettings,
+        recorder: Recorder,
         initial_states: Mapping[str, Mapping[str, NDArray]],
         storage: Storage | None = None,
     ) -> None:
-        """initial_states: policy id → its state before an episode; empty for a policy without a memory.
+        """recorder: what becomes of the play of the league's own policies. initial_states: policy id → its state before
+        an episode; empty for a policy without a memory.
 
         Raises ConfigError for opponents that there can be none of, and what loading them raises.
         """
-        self._stepping = stepping
+        self._stepping, self.recorder = stepping, recorder
         self._policies = tuple(interface.policies[agent] for agent in stepping.agents)
         self._actions = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
         self._distributions = {policy: distribution(space) for policy, space in self._actions.items()}
@@ -73,18 +74,23 @@ class SelfPlay:
         """As `restart`; what comes is decided by `seeds` and `rng` alone."""
         self._seeds, self._rng = seeds, rng
         self._begun = [itertools.count() for _ in range(self._stepping.copies)]
-        self._chunk_ids = (f"{seeds.runner}-{seeds.steps}-{i}" for i in itertools.count())
+        self.recorder.begin(seeds)
         self.restart()
 
     def restart(self) -> None:
         """Leave the episodes that are under way, and begin new ones in all copies."""
-        agents, copies = self._stepping.agents, self._stepping.copies
-        self._transitions = {policy: Transitions(policy, agents, copies) for policy in self._actions}
+        self.recorder.restart()
         self._memories = {policy: Memories(initial) for policy, initial in self._initial_states.items()}
-        for copy in range(copies):
+        for copy in range(self._stepping.copies):
             self.metrics.forget(copy)
             self._opponents.forget(copy)
         self._read(self._stepping.start(self._next_episode))
+
+    def record_by(self, recorder: Recorder) -> None:
+        """Leave the episodes under way, and have another record those that begin now."""
+        self.recorder = recorder
+        recorder.begin(self._seeds)
+        self.restart()
 
     def step(self, think: Think | None, explore: bool) -> None:
         """One step in each copy. think: None acts at random. explore: draw actions, instead of the most probable."""
@@ -109,10 +115,6 @@ class SelfPlay:
         self.metrics.add_step()
         self._read(self._stepping.step(actions))
 
-    def cut(self) -> list[SingleAgentEpisode]:
-        """The transitions that were closed since the last cut."""
-        return [chunk for transitions in self._transitions.values() for chunk in transitions.cut(self._chunk_ids)]
-
     def _next_episode(self, copy: int) -> Episode:
         seats = self._seats.draw(self._rng)
         return Episode(self._seeds(copy, next(self._begun[copy])), self._openings.begin(copy, seats, self._rng))
@@ -120,14 +122,11 @@ class SelfPlay:
     def _read(self, turn: Turn) -> None:
         """Take what has ended, then what goes on or begins."""
         self._turn = turn
+        self.recorder.read(turn)
         for copy in turn.crashed:
-            for transitions in self._transitions.values():
-                transitions.lose(copy)
             self.metrics.add_crash(copy)
             self._forget(copy)
         for ending in turn.endings:
-            slot = ending.copy * len(self._policies) + ending.agent
-            self._transitions[self._policies[ending.agent]].end(slot, ending)
             self.metrics.add_agent(ending)
         for copy in turn.finished:
             self.metrics.add_episode(copy)
@@ -136,8 +135,6 @@ class SelfPlay:
             slots = np.array(batch.copies) * len(self._policies) + np.array(batch.agents)
             rewards = np.array(batch.rewards, dtype=np.float64)
             self.metrics.add_rows(slots, rewards, are_own=isinstance(group, str))
-            if isinstance(group, str):
-                self._transitions[group].observe(slots, rewards, batch.observations)
 
     def _forget(self, copy: int) -> None:
         for memories in self._memories.values():
@@ -154,7 +151,7 @@ class SelfPlay:
             raw, log_p = drawing.sample(dist_inputs, self._rng) if explore else drawing.mode(dist_inputs)
             if answer.state is not None:
                 self._memories[policy].keep(batch, answer.state)
-        self._transitions[policy].act(raw, log_p, dist_inputs, ask.state)
+        self.recorder.act(policy, raw, log_p, dist_inputs, ask.state)
         self.metrics.add_play(policy, dist_inputs)
         return to_environment(raw, self._actions[policy])
 

@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
-from league.config import OpponentConfig, PPOConfig
 from league.errors import ConfigError
 from league.policies.actions import to_environment
 from league.seeds import generator
+from league.training_config import OpponentConfig, PPOConfig
 from tests.training.sampling.scripted import ACTIONS, Played, Scripted, Seen, interface
 from training.modules.actor_critic import MASKED
 from training.sampling.play_metrics import AgentEpisode
+from training.sampling.recorder import Chunks
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.seats import Opposing
 from training.sampling.self_play import Answer, Ask, SelfPlay
@@ -41,7 +42,8 @@ def think(asks: Mapping[str, Ask]) -> dict[str, Answer]:
 
 def self_play(env: Scripted, sides: int = 2, **training: object) -> SelfPlay:
     config = PPOConfig.model_validate(training)
-    play = SelfPlay(env, interface(len(env.agents), sides), config, INITIAL)
+    described = interface(len(env.agents), sides)
+    play = SelfPlay(env, described, config, Chunks(described, env.agents, env.copies), INITIAL)
     begin(play, env)
     return play
 
@@ -55,7 +57,7 @@ def sampled(play: SelfPlay, cuts: Iterable[int]) -> list[SingleAgentEpisode]:
     for steps in cuts:
         for _ in range(steps):
             play.step(think, explore=True)
-        chunks += play.cut()
+        chunks += play.recorder.cut()
     return chunks
 
 
@@ -156,7 +158,7 @@ def test_nothing_of_a_crashed_episode_comes_after_its_crash(cuts: list[int]) -> 
         lost = {seed for seed, played in env.played.items() if played.is_lost}
         for _ in range(steps):
             play.step(think, explore=True)
-        assert not {seed for seed, _ in put_together(play.cut())} & lost
+        assert not {seed for seed, _ in put_together(play.recorder.cut())} & lost
 
 
 def test_in_each_episode_an_opponent_plays_all_sides_but_one_or_none() -> None:
@@ -241,7 +243,7 @@ def test_random_play_is_uniform_over_what_is_legal() -> None:
     play = self_play(env)
     for _ in range(60):
         play.step(None, explore=False)
-    for chunk in play.cut():
+    for chunk in play.recorder.cut():
         np.testing.assert_allclose(np.exp(chunk.extra_model_outputs[Columns.ACTION_LOGP].data), 0.5, rtol=1e-6)
         legal = to_environment(chunk.actions.data, interface(2).of_policy("policy_0").action)
         assert set(legal.tolist()) <= {1, 2, 3}
