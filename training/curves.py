@@ -8,6 +8,7 @@
 | `<policy>/entropy` | of the distributions that were played from, in nats |
 | `<policy>/policy_loss`, `value_loss`, `kl`, `clip_fraction`, `explained_variance`, `gradient_norm` | of its learning |
 | `<policy>/loss`, `value`, `error` | off-policy: its loss, the values of its actions, TD errors; `joint/…` if centralised |
+| `<policy>/policy_loss`, `critic_gradient_norm` | of actors with critics; loss, value and error are the critic's |
 | `exploration` | off-policy: how much is explored |
 | `agents/<agent>/return`, `agents/<agent>/length` | of one agent |
 | `time/sampling`, `time/learning`, `time/weights`, `time/checkpoint` | seconds of wall time in the report |
@@ -55,6 +56,9 @@ LEARNED = {
 }
 
 OFF_POLICY = ("loss", "value", "error", "gradient_norm")
+ACTORS = ("policy_loss", "critic_gradient_norm")
+"""Of actors with critics: `loss`, `value` and `error` are then the critic's, `gradient_norm` the actor's."""
+LEARNED_BY = {"ppo": tuple(LEARNED), "maddpg": (*OFF_POLICY, *ACTORS)}
 EXPLORATION = "exploration"
 """Logged by off-policy algorithms at the top of RLlib's result."""
 
@@ -67,7 +71,7 @@ def time_each_update(algorithm: Algorithm) -> None:
 
 def names(interface: Interface, algorithm: str = "ppo") -> set[str]:
     """The curves that training has of what was learned."""
-    of_policy = {RETURN, "length", "entropy", *(LEARNED if algorithm == "ppo" else OFF_POLICY)}
+    of_policy = {RETURN, "length", "entropy", *LEARNED_BY.get(algorithm, OFF_POLICY)}
     return (
         {RETURN, "length"}
         | {f"{policy}/{name}" for policy in interface.policy_ids for name in of_policy}
@@ -90,7 +94,7 @@ def curves(result: Mapping[str, Any], interface: Interface) -> dict[str, float]:
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
         found |= {f"{key}/{name}": learned.get(metric) for name, metric in LEARNED.items()}
-        found |= {f"{key}/{name}": learned.get(name) for name in OFF_POLICY}
+        found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY, *ACTORS)}
     for agent in interface.agents:
         found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
         found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
