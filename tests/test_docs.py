@@ -3,6 +3,7 @@
 import re
 import shlex
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import typer
@@ -11,7 +12,7 @@ from typer.core import TyperGroup
 
 from cli.main import app
 from league.config import LeagueConfig
-from league.training_config import PPOConfig
+from league.training_config import ALGORITHMS, AnyTraining, TrainingSettings
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -71,13 +72,24 @@ def test_each_league_shown_is_a_valid_configuration(page: str, block: str) -> No
     LeagueConfig.from_mapping(yaml.safe_load(block), source=page)
 
 
-def test_every_training_setting_is_documented_with_its_default() -> None:
-    rows = dict(re.findall(r"^\| `(\w+)` \| `?(.*?)`? \|", (ROOT / "docs/configuration.md").read_text(), flags=re.M))
-    defaults = {field.alias or name: field.get_default() for name, field in PPOConfig.model_fields.items()}
-    assert set(rows) == set(defaults)
-    for name, default in defaults.items():
-        shown = yaml.safe_load(rows[name]) if rows[name] != "–" else None
-        assert PPOConfig.model_validate({name: shown}).model_dump(by_alias=True)[name] == default or shown == default
+def settings_of(heading: str) -> dict[str, str]:
+    """Key → default, as the table below a heading shows them."""
+    _, _, section = (ROOT / "docs/configuration.md").read_text().partition(f"\n## {heading}\n")
+    return dict(re.findall(r"^\| `(\w+)` \| `?(.*?)`? \|", section.partition("\n## ")[0], flags=re.M))
+
+
+@pytest.mark.parametrize("model", get_args(AnyTraining), ids=ALGORITHMS)
+def test_every_training_setting_is_documented_with_its_default(model: type[TrainingSettings]) -> None:
+    name = get_args(model.model_fields["algorithm"].annotation)[0]
+    rows = settings_of("`training`, whatever the algorithm") | settings_of(f"`training` with `algorithm: {name}`")
+    fields = {field.alias or key for key, field in model.model_fields.items()}
+    assert set(rows) == fields
+    for key in fields:
+        if key == "algorithm":
+            continue
+        shown = yaml.safe_load(rows[key]) if rows[key] != "–" else None
+        default = model.model_validate({"algorithm": name}).model_dump(by_alias=True)[key]
+        assert model.model_validate({"algorithm": name, key: shown}).model_dump(by_alias=True)[key] == default
 
 
 def test_every_file_has_a_caption_in_the_architecture_page() -> None:

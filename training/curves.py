@@ -7,7 +7,7 @@
 | `<policy>/return`, `<policy>/length` | mean over the agents of a policy |
 | `<policy>/entropy` | of the distributions that were played from, in nats |
 | `<policy>/policy_loss`, `value_loss`, `kl`, `clip_fraction`, `explained_variance`, `gradient_norm` | of its learning |
-| `<policy>/loss`, `value`, `error` | off-policy: its loss, the values of its actions, TD errors; `joint/…` if centralised |
+| `<policy>/loss`, `value`, `error` | off-policy: loss, values of actions, TD errors; centralised ones under `joint` |
 | `<policy>/policy_loss`, `critic_gradient_norm` | of actors with critics; loss, value and error are the critic's |
 | `exploration` | off-policy: how much is explored |
 | `agents/<agent>/return`, `agents/<agent>/length` | of one agent |

@@ -27,7 +27,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.stepping import Turn
+from league.config import EnvironmentConfig
+from league.environments.lockstep import stepping
+from league.environments.stepping import Episode, Turn
 from league.errors import EnvironmentMismatch
 from league.interface import AgentInterface, Interface
 from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, inputs
@@ -268,6 +270,23 @@ class JointWithoutStates(JointTransitions):
     """Without the columns `state` and `next_state`: what agents see and do is enough."""
 
     keeps_states = False
+
+
+def state_size(environment: EnvironmentConfig, interface: Interface) -> int:
+    """s: how many numbers `state` has in an environment. Raises ConfigError for one that cannot be made."""
+    batched = stepping(environment, 1, states=True)
+    try:
+        turn = batched.start(lambda _: Episode(0, list(interface.policies.values())))
+    finally:
+        batched.close()
+    if turn.states:
+        return len(turn.states[0])
+    return sum(
+        math.prod(leaf.shape)
+        for agent in interface.agents
+        for name, leaf in inputs(interface.agents[agent].observation).items()
+        if name != ACTION_MASK
+    )
 
 
 def joined(blocks: Sequence[Block]) -> Block:
