@@ -78,7 +78,7 @@ class Replay:
         self._rng = generator(seed, "replay")
         self._columns: Rows = {}
         self._following = np.full(capacity, NONE, dtype=np.int64)
-        # Stream → its newest row and the number of rows ever added until then, by which an overwritten one is known.
+        # Stream → its newest row, as the number of rows that were ever added before it.
         self._newest: dict[int, int] = {}
         self._added = 0
         self._tree = SumTree(capacity) if priorities else None
@@ -185,10 +185,10 @@ class Replay:
 
     def _link(self, block: Block) -> None:
         """Let each row that goes on from one before be that one's successor."""
-        number = self._added
+        number, oldest = self._added, self._added + len(block) - self.capacity
         for stream, is_first in zip(block.streams.tolist(), block.firsts.tolist(), strict=True):
             before = self._newest.get(stream, NONE)
-            if not is_first and before != NONE and number - before < self.capacity:
+            if not is_first and before != NONE and before >= oldest:
                 self._following[before % self.capacity] = number % self.capacity
             self._newest[stream] = number
             number += 1

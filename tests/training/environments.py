@@ -137,6 +137,40 @@ def remembering() -> ParallelEnv:
     return Remembering()
 
 
+class Masked(ParallelEnv):
+    """One is paid in each step, whatever is done; after ROUNDS steps the agent is truncated. Action 1 is illegal, and
+    no learner sees what it is worth. With a discount of γ every state is worth 1 / (1 − γ)."""
+
+    def __init__(self) -> None:
+        self.possible_agents = ["player_0"]
+
+    def observation_space(self, agent: str) -> gymnasium.Space:
+        return spaces.Dict(
+            {"observation": spaces.Box(0, 1, (1,), np.float32), "action_mask": spaces.Box(0, 1, (3,), np.int8)}
+        )
+
+    def action_space(self, agent: str) -> gymnasium.Space:
+        return spaces.Discrete(3)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents, self._steps = self.possible_agents[:], 0
+        return self._seen(), {"player_0": {}}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        assert actions["player_0"] != 1, "an illegal action"
+        self._steps += 1
+        over = self._steps == ROUNDS
+        self.agents = [] if over else self.agents
+        return self._seen(), {"player_0": 1.0}, {"player_0": False}, {"player_0": over}, {"player_0": {}}
+
+    def _seen(self) -> dict[str, Any]:
+        return {"player_0": {"observation": np.ones(1, np.float32), "action_mask": np.array([1, 0, 1], np.int8)}}
+
+
+def masked() -> ParallelEnv:
+    return Masked()
+
+
 class Summing(ParallelEnv):
     """Each of two agents sees a number of its own, and both are paid by how close the sum of what they do comes to
     that of what they see; after ROUNDS tasks all are truncated. Best return: 0; random play: about -1.9 a round.

@@ -55,6 +55,31 @@ def solvable(name: str, kwargs: dict[str, Any] | None = None, policies: Any = No
     )
 
 
+def by_values(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
+    """One of `tests.training.environments`, by DQN, with settings that solve it in a few updates."""
+    settings = {
+        "algorithm": "dqn",
+        "runners": 0,
+        "copies": 16,
+        "hidden": [32],
+        "seed": 5,
+        "lr": 0.003,
+        "gamma": 0.9,
+        "learning_starts": 256,
+        "batch_size": 64,
+        "target_every": 20,
+        "exploration": {"steps": 4000},
+    }
+    return LeagueConfig.from_mapping(
+        {
+            "league": name,
+            "environment": {"entry_point": f"{ENVIRONMENTS}:{name}", "kwargs": kwargs or {}},
+            "policies": policies or {"shared": ["*"]},
+            "training": settings | training,
+        }
+    )
+
+
 def maddpg(name: str, kwargs: dict[str, Any], policies: Any, **training: Any) -> LeagueConfig:
     """One of `tests.training.environments`, with settings that solve it in a few thousand actions."""
     settings = {

@@ -38,14 +38,16 @@ class QNetwork(Acting):
     def answers(self, observations: dict[str, Tensor], noise: bool = False) -> Tensor:
         """(B, n) values, or (B, n, atoms) logits of their distributions; not masked.
 
-        Dueling: V + A − mean A over all actions (Wang et al., 2016, arXiv 1511.06581, equation 9).
+        Dueling: V + A − mean A (Wang et al., 2016, arXiv 1511.06581, equation 9), the mean of the legal actions: what
+        is never played is never learned, and should not move what is.
         """
         noise = noise and self.noisy
         embeddings = self.encoder(observations)
         answers = self._answer(self.advantages, embeddings, noise).unflatten(-1, (self.actions, self.depth))
         if self.value is not None:
             value = self._answer(self.value, embeddings, noise).unsqueeze(-2)
-            answers = value + answers - answers.mean(-2, keepdim=True)
+            counted = legal(observations, self.actions).unsqueeze(-1)
+            answers = value + answers - (answers * counted).sum(-2, keepdim=True) / counted.sum(-2, keepdim=True)
         return answers if self.atoms is not None else answers.squeeze(-1)
 
     def expected(self, answers: Tensor) -> Tensor:
@@ -57,7 +59,7 @@ class QNetwork(Acting):
 
     def _forward_exploration(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         values = self._masked(batch[Columns.OBS], noise=True)
-        return {Columns.ACTION_DIST_INPUTS: epsilon_greedy(values, legal(values, batch[Columns.OBS]), self.exploration)}
+        return {Columns.ACTION_DIST_INPUTS: epsilon_greedy(values, self.exploration)}
 
     def _masked(self, observations: dict[str, Tensor], noise: bool) -> Tensor:
         values = self.expected(self.answers(observations, noise))
@@ -78,18 +80,20 @@ def masked(values: Tensor, observations: dict[str, Tensor]) -> Tensor:
     return torch.where(observations[ACTION_MASK].flatten(1).bool(), values, MASKED)
 
 
-def legal(values: Tensor, observations: dict[str, Tensor]) -> Tensor:
-    """(B, n) bool. It is the mask that says so, never the values: they may be exactly 0."""
+def legal(observations: dict[str, Tensor], actions: int) -> Tensor:
+    """(B, n) bool, which actions the mask allows. Where it allows none, as in some environments' last observations, it
+    says nothing about what could have been done, and all count."""
     if ACTION_MASK not in observations:
-        return torch.ones_like(values, dtype=torch.bool)
-    return observations[ACTION_MASK].flatten(1).bool()
+        return next(iter(observations.values())).new_ones(1, actions, dtype=torch.bool)
+    allowed = observations[ACTION_MASK].flatten(1).bool()
+    return allowed | ~allowed.any(-1, keepdim=True)
 
 
-def epsilon_greedy(values: Tensor, are_legal: Tensor, epsilon: float) -> Tensor:
+def epsilon_greedy(values: Tensor, epsilon: float) -> Tensor:
     """Masked values (B, n) → log-probabilities of acting at random among legal actions with probability ε, else
-    greedily; MASKED where they are 0."""
+    greedily; MASKED where they are 0. A value of exactly 0 is one like others."""
+    are_legal = values > MASKED
     count = are_legal.sum(-1, keepdim=True).clamp(min=1)
-    probabilities = are_legal * (epsilon / count)
     best = nn.functional.one_hot(values.argmax(-1), values.shape[-1])
-    probabilities = probabilities + (1 - epsilon) * best
+    probabilities = are_legal * (epsilon / count) + (1 - epsilon) * best
     return torch.where(probabilities > 0, probabilities.clamp(min=1e-30).log(), MASKED)

@@ -1,4 +1,4 @@
-"""Opponents in training: versions, which explore as they did when they learned, and scripts, which play as they do."""
+"""Opponents in training: versions, drawn from their distributions where they have some, and scripts, as they play."""
 
 from collections.abc import Sequence
 
@@ -18,6 +18,9 @@ from league.training_config import OpponentConfig
 from training.sampling.memories import Memories
 from training.sampling.seats import Opposing
 
+VALUE_BASED = ("dqn", "qmix")
+"""Algorithms whose graphs answer values of actions, not a distribution to draw from: they play greedily."""
+
 
 class Opponents:
     """The loaded policies of all opponents, with the memories of those that have one."""
@@ -29,6 +32,7 @@ class Opponents:
             for config in configs
             for policy_id, policy in _load(config.ref, interface, storage).values()
         }
+        self._greedy = {config.ref for config in configs if _is_greedy(config.ref, storage)}
         self._memories = {
             seat: Memories({key: rows[0] for key, rows in initial.items()})
             for seat, policy in self._policies.items()
@@ -41,7 +45,7 @@ class Opponents:
         answer = policy.act(
             batch.observations,
             state=memories.before(batch) if memories else None,
-            explore=isinstance(policy, OnnxPolicy),
+            explore=isinstance(policy, OnnxPolicy) and seat.ref not in self._greedy,
             rng=[rng] * len(batch.copies),
         )
         if memories and answer.state is not None:
@@ -52,6 +56,17 @@ class Opponents:
         """The episode in `copy` is over."""
         for memories in self._memories.values():
             memories.forget(copy)
+
+
+def _is_greedy(ref: str, storage: Storage | None) -> bool:
+    parsed = parse_ref(ref)
+    if isinstance(parsed, ScriptRef) or storage is None:
+        return False
+    registry = Registry.open(storage)
+    try:
+        return registry.resolve(parsed).manifest.algorithm in VALUE_BASED
+    finally:
+        registry.close()
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:

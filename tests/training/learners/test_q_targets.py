@@ -1,0 +1,65 @@
+"""Golden numbers by hand."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from training.learners.q_targets import best_legal, next_actions, projected, returns
+
+ONLINE = torch.tensor([[1.0, 5.0, 9.0], [-3.0, -2.0, -1.0], [0.0, 0.0, 0.0]])
+TARGET = torch.tensor([[7.0, 2.0, 3.0], [-4.0, -8.0, 4.0], [1.0, 2.0, 3.0]])
+MASK = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.int8)
+
+
+def test_double_chooses_by_the_network_that_learns_among_legal_actions() -> None:
+    assert next_actions(ONLINE, TARGET, MASK).tolist() == [1, 1, 1]
+    assert next_actions(None, TARGET, MASK).tolist() == [0, 0, 1]
+    assert next_actions(ONLINE, TARGET, None).tolist() == [2, 2, 0]
+
+
+def test_a_mask_that_allows_nothing_says_nothing() -> None:
+    """As that of an agent which was truncated while it was another's turn."""
+    assert best_legal(ONLINE, torch.zeros(3, 3)).tolist() == [2, 2, 0]
+
+
+def check_returns(of: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> None:
+    """A step that goes on, one that is truncated, and one that terminated: 1 + 0.9·4 twice, then 1 alone."""
+    rewards, discounts = torch.ones(3), torch.full((3,), 0.9)
+    found = of(rewards, discounts, torch.tensor([False, False, True]), torch.tensor([4.0, 4.0, -1e9]))
+    torch.testing.assert_close(found, torch.tensor([4.6, 4.6, 1.0]))
+
+
+def test_returns_bootstrap_unless_terminated() -> None:
+    check_returns(returns)
+
+
+def test_the_check_sees_a_target_that_takes_truncation_for_termination() -> None:
+    truncated = torch.tensor([False, True, False])
+    with pytest.raises(AssertionError):
+        check_returns(
+            lambda rewards, discounts, terminated, values: returns(rewards, discounts, terminated | truncated, values)
+        )
+
+
+ATOMS = torch.tensor([-1.0, 0.0, 1.0])
+
+
+def project(probabilities: list[float], reward: float, discount: float, terminated: bool) -> list[float]:
+    arguments = torch.tensor([reward]), torch.tensor([discount]), torch.tensor([terminated])
+    return projected(torch.tensor([probabilities]), ATOMS, *arguments)[0].tolist()
+
+
+def test_a_distribution_is_projected_on_its_atoms() -> None:
+    """Returns 0.25 + 0.5·(−1, 0, 1) = −0.25, 0.25, 0.75, each divided among the atoms beside it."""
+    found = project([0.2, 0.5, 0.3], 0.25, 0.5, False)
+    expected = [0.2 * 0.25, 0.2 * 0.75 + 0.5 * 0.75 + 0.3 * 0.25, 0.5 * 0.25 + 0.3 * 0.75]
+    assert found == pytest.approx(expected)
+    assert sum(found) == pytest.approx(1)
+
+
+def test_what_terminated_is_worth_its_reward_and_what_lies_beyond_the_atoms_is_theirs() -> None:
+    assert project([0.2, 0.5, 0.3], 0.5, 0.9, True) == pytest.approx([0, 0.5, 0.5])
+    assert project([0.2, 0.5, 0.3], 3.0, 1.0, False) == pytest.approx([0, 0, 1])
+    assert project([0.2, 0.5, 0.3], 0.0, 1.0, False) == pytest.approx([0.2, 0.5, 0.3])

@@ -1,0 +1,91 @@
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from ray.rllib.core.columns import Columns
+
+from training.modules.acting import MASKED
+from training.modules.noisy import NoisyLinear
+from training.modules.q_network import QNetwork, epsilon_greedy
+
+SPACE = gymnasium.spaces.Dict(
+    {
+        "observation": gymnasium.spaces.Box(-1, 1, (4,), np.float32),
+        "action_mask": gymnasium.spaces.Box(0, 1, (3,), np.int8),
+    }
+)
+
+
+def network(**config: object) -> QNetwork:
+    torch.manual_seed(1)
+    module = QNetwork(
+        observation_space=SPACE,
+        action_space=gymnasium.spaces.Discrete(3),
+        model_config={"hidden": [8]} | config,
+        inference_only=False,
+    )
+    with torch.no_grad():
+        for parameter in module.advantages.parameters():
+            parameter.normal_()
+    return module
+
+
+def batch(mask: list[list[int]]) -> dict[str, dict[str, torch.Tensor]]:
+    torch.manual_seed(2)
+    rows = torch.tensor(mask, dtype=torch.int8)
+    return {Columns.OBS: {"observation": torch.randn(len(rows), 4), "action_mask": rows}}
+
+
+KINDS = [
+    {},
+    {"dueling": True},
+    {"noisy": True},
+    {"atoms": (5, -2.0, 2.0)},
+    {"dueling": True, "noisy": True, "atoms": (5, -2.0, 2.0)},
+]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_illegal_actions_are_neither_best_nor_explored(kind: dict[str, object]) -> None:
+    module, observed = network(**kind), batch([[1, 0, 1], [0, 1, 0], [1, 1, 1]] * 30)
+    allowed = observed[Columns.OBS]["action_mask"].bool()
+    values = module.forward_inference(observed)[Columns.ACTION_DIST_INPUTS]
+    assert allowed[torch.arange(len(values)), values.argmax(-1)].all()
+    assert ((values == MASKED) == ~allowed).all()
+    module.exploration = 0.5
+    explored = module.forward_exploration(observed)[Columns.ACTION_DIST_INPUTS].softmax(-1)
+    assert (explored[~allowed] == 0).all()
+    torch.testing.assert_close(explored.sum(-1), torch.ones(len(values)))
+    assert torch.equal(values, module.forward_inference(observed)[Columns.ACTION_DIST_INPUTS]), "acting draws nothing"
+
+
+def test_epsilon_greedy_by_hand_also_where_values_are_zero() -> None:
+    """RLlib's masks by `q != 0`: it never explores a legal action of value 0, and fails on a row of zeros."""
+    values = torch.tensor([[0.0, 0.0, MASKED], [0.0, 3.0, MASKED], [MASKED, 0.0, MASKED]])
+    found = epsilon_greedy(values, 0.2).softmax(-1)
+    torch.testing.assert_close(found, torch.tensor([[0.9, 0.1, 0.0], [0.1, 0.9, 0.0], [0.0, 1.0, 0.0]]))
+    random = epsilon_greedy(torch.zeros(1, 3), 1.0).softmax(-1)
+    torch.testing.assert_close(random, torch.full((1, 3), 1 / 3))
+
+
+def test_advantages_of_legal_actions_have_mean_zero_around_the_value() -> None:
+    module, observed = network(dueling=True), batch([[1, 0, 1]] * 4)
+    answers = module.answers(observed[Columns.OBS])
+    assert module.value is not None
+    value = module.value(module.encoder(observed[Columns.OBS]))
+    torch.testing.assert_close(answers[:, [0, 2]].mean(-1, keepdim=True), value)
+
+
+def test_noise_is_factorised_and_off_when_acting() -> None:
+    """y − y₀ = σ_w f(ε_out) f(ε_in)ᵀ x + σ_b f(ε_out): for x = 0 only the bias's remains."""
+    torch.manual_seed(3)
+    layer = NoisyLinear(4, 2)
+    x = torch.randn(5, 4)
+    assert torch.equal(layer(x), layer(x))
+    torch.manual_seed(4)
+    noisy = layer(x, noise=True)
+    torch.manual_seed(4)
+    incoming, outgoing = torch.randn(4), torch.randn(2)
+    scaled = [e.sign() * e.abs().sqrt() for e in (outgoing, incoming)]
+    expected = layer(x) + 0.25 * (x @ scaled[1]).unsqueeze(1) * scaled[0] + 0.25 * scaled[0]
+    torch.testing.assert_close(noisy, expected)
