@@ -9,6 +9,7 @@ ORDER = (
     "stepping",
     "sampling",
     "learning",
+    "maddpg",
     "parity",
     "serving",
     "formats",

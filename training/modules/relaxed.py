@@ -89,9 +89,9 @@ class Numbers:
 
 
 def gumbel(like: Tensor) -> Tensor:
-    """Standard Gumbel noise, −log(E) of exponential E, in the shape of `like`."""
-    # An exponential of exactly 0 would choose even what is masked.
-    return -torch.empty_like(like).exponential_().clamp_min(SMALLEST).log()
+    """Standard Gumbel noise, −log(−log(u)) of uniform u, in the shape of `like`."""
+    # A u of exactly 0 would be infinite noise, and choose even what is masked.
+    return -torch.rand_like(like).clamp_min(SMALLEST).log().neg().log()
 
 
 def gumbel_softmax(logits: Tensor, temperature: float, noise: Tensor) -> Tensor:
@@ -103,6 +103,8 @@ def gumbel_softmax(logits: Tensor, temperature: float, noise: Tensor) -> Tensor:
     "Categorical reparameterization with Gumbel-softmax", arXiv 1611.01144, equation 2 and section 2.2.
     """
     assert logits.shape == noise.shape
+    if not torch.is_grad_enabled():
+        return one_hot((logits + noise).argmax(dim=-1), logits.shape[-1])
     soft = torch.softmax((logits + noise) / temperature, dim=-1)
     hard = one_hot(soft.argmax(dim=-1), soft.shape[-1])
     # In this order, as hard + soft − soft would not be exactly one-hot.

@@ -124,10 +124,7 @@ def test_training_that_is_resumed_goes_on_exactly(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["numbers", "several", "discrete", "masked"])
 def test_graphs_act_as_the_actors_do(name: str, tmp_path: Path) -> None:
-    if name == "masked":
-        league = turns()
-    else:
-        league = maddpg(name, {} if name == "numbers" else TWO, {"shared": ["*"]})
+    league = turns() if name == "masked" else maddpg(name, {} if name == "numbers" else TWO, {"shared": ["*"]})
     described = interface(league)
     torch.manual_seed(1)
     actor = module_spec(league.training, described).build()["shared"]
@@ -147,14 +144,14 @@ def test_graphs_act_as_the_actors_do(name: str, tmp_path: Path) -> None:
 
 def test_opponents_are_refused() -> None:
     league = maddpg("discrete", TWO, OWN, opponents=["script:random"])
-    with pytest.raises(ConfigError, match="training.opponents.*what all agents saw and did"):
+    with pytest.raises(ConfigError, match=r"training\.opponents.*what all agents saw and did"):
         algorithm_config(league, interface(league))
 
 
 def test_turns_are_refused_before_anything_is_learned() -> None:
     algorithm = begun(turns())
     try:
-        with pytest.raises(EnvironmentMismatch, match="league turns.*all agents act at once"):
+        with pytest.raises(EnvironmentMismatch, match=r"league turns.*all agents act at once"):
             algorithm.train()
     finally:
         algorithm.stop()

@@ -1,5 +1,7 @@
 """The learner, alone: on joint transitions that a runner in this process has sampled."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -57,7 +59,8 @@ def test_targets_are_those_of_equation_6_and_truncated_agents_are_bootstrapped()
     batch = learner.batch(sample)
     rows = batch.rows
     for head, flags in (("truncated/a", "terminated/a"), ("terminated/b", "truncated/b")):
-        assert rows[head].any() and not rows[flags].any(), "each of the two kinds of end is among them"
+        assert rows[head].any(), "each of the two kinds of end is among them"
+        assert not rows[flags].any()
     order = [learner._seen(Place("a", 0))]
     targets = learner._targets("a", batch, order)
     stays = rows["present/b"] & ~rows["terminated/b"]
@@ -107,7 +110,7 @@ def test_a_step_of_the_actor_raises_its_critics_value() -> None:
         loss = learner._policy_loss("a", seen, done, everyone)
         losses.append(loss.item())
         learner.descend(loss, ["a"])
-    assert all(after < before for before, after in zip(losses, losses[1:], strict=False)), losses
+    assert all(after < before for before, after in itertools.pairwise(losses)), losses
 
 
 def test_independent_critics_see_nothing_of_others() -> None:

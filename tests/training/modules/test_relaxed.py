@@ -66,14 +66,24 @@ def test_a_masked_action_is_never_drawn_and_has_no_gradient() -> None:
     drawn = gumbel_softmax(masked, 1.0, gumbel(masked))
     assert not drawn[:, 1].any()
     (drawn * torch.randn(3)).sum().backward()
-    assert logits.grad is not None and torch.isfinite(logits.grad).all()
+    assert logits.grad is not None
+    assert torch.isfinite(logits.grad).all()
     assert not logits.grad[:, 1].any()
     assert logits.grad[:, [0, 2]].abs().max() > 0
 
 
-def test_the_smallest_exponential_chooses_no_masked_action(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.Tensor, "exponential_", torch.Tensor.zero_)
+def test_the_smallest_uniform_number_chooses_no_masked_action(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "rand_like", torch.zeros_like)
     assert torch.isfinite(gumbel(torch.zeros(3))).all()
+
+
+def test_without_gradients_the_same_is_drawn() -> None:
+    torch.manual_seed(3)
+    logits = torch.randn(ROWS, 4)
+    noise = gumbel(logits)
+    with torch.no_grad():
+        without = gumbel_softmax(logits, 1.0, noise)
+    assert torch.equal(gumbel_softmax(logits, 1.0, noise), without)
 
 
 def test_choices_are_one_hot() -> None:
