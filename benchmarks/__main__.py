@@ -8,6 +8,7 @@ HERE = Path(__file__).parent
 ORDER = (
     "stepping",
     "sampling",
+    "replay",
     "learning",
     "maddpg",
     "parity",

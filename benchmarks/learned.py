@@ -127,3 +127,9 @@ def interval(values: NDArray) -> tuple[float, float]:
     """The two-sided 95 % interval of the mean of independent values, by the normal approximation."""
     mean, error = float(values.mean()), float(values.std(ddof=1) / len(values) ** 0.5)
     return mean - Z * error, mean + Z * error
+
+
+def told(what: str, target: str, met: bool) -> bool:
+    """Print whether a target is met."""
+    print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
+    return met

@@ -1,8 +1,9 @@
 """Do the shipped configurations learn? Each part trains one by the clock and measures what came of it.
 
-Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball. Where several seeds or opponents are trained,
-two learn at once, each in a process of its own on one core. All seeds are printed, none is left out. Returns are per
-agent and episode, of policies that act greedily in fresh episodes, unless it says otherwise.
+Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem, connect_four_dqn
+by DQN. Where several seeds or opponents are trained, two learn at once, each in a process of its own on one core. All
+seeds are printed, none is left out. Returns are per agent and episode, of policies that act greedily in fresh episodes,
+unless it says otherwise.
 """
 
 import argparse
@@ -18,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread
+from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread, told
 from benchmarks.truncation import as_rllib
+from benchmarks.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
 from examples import traffic
 from league.config import LeagueConfig
 
@@ -170,14 +172,12 @@ def last_episodes(curve: Sequence[Point], share: float) -> NDArray:
     return np.array([next(iter(point.returns.values())) for point in chosen])
 
 
-def told(what: str, target: str, met: bool) -> bool:
-    """Print whether a target is met."""
-    print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
-    return met
-
-
 PARTS: dict[str, Callable[[float], bool]] = {
-    part.__name__: part for part in (rps, cars_and_lights, shared_encoder, simple_spread, pistonball)
+    part.__name__: part
+    for part in (
+        *(rps, cars_and_lights, shared_encoder, simple_spread, pistonball),
+        *(leduc_vs_random, leduc_holdem, connect_four_dqn),
+    )
 }
 
 

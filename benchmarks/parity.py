@@ -33,7 +33,7 @@ from league.registry.rows import VersionRow
 from league.settings import Storage
 from league.spaces import Space
 from serve_app.launch import running
-from training.modules.actor_critic import ActorCritic
+from training.modules.acting import Acting
 from training.parity import Met, answer, differing, gather
 from training.publish import Checkpoint, load_modules, publish
 from training.trial import build
@@ -106,7 +106,7 @@ def compare(version: VersionRow, registry: Registry, url: str, observations: int
 
 
 def situations(
-    config: LeagueConfig, described: Interface, modules: Mapping[str, ActorCritic], wanted: int
+    config: LeagueConfig, described: Interface, modules: Mapping[str, Acting], wanted: int
 ) -> dict[str, list[Met]]:
     """Policy → batches from play, of exactly `wanted` observations in all."""
     found: dict[str, list[Met]] = {policy: [] for policy in modules}
@@ -132,7 +132,7 @@ def _first(batches: Sequence[Met], wanted: int) -> Sequence[Met]:
 
 
 def _compare(
-    policy: str, space: Space, module: ActorCritic, graph: Policy, endpoint: Policy, batches: list[Met]
+    policy: str, space: Space, module: Acting, graph: Policy, endpoint: Policy, batches: list[Met]
 ) -> Compared:
     count = ties = graph_differs = endpoint_differs = 0
     for met in _joined(batches):

@@ -266,13 +266,16 @@ def _sentence(model: type[BaseModel], error: ValidationError) -> str:
 
 
 def _fault(model: type[BaseModel], detail: Any) -> str:
-    path = [str(part) for part in detail["loc"] if part not in ALGORITHMS]
+    path, known_by = [str(part) for part in detail["loc"]], model
+    if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
+        # Pydantic names the member of the union, too.
+        known_by = ALGORITHMS[path.pop(1)]
     key = ".".join(path) or "file"
     match detail["type"]:
         case "missing":
             return f"{key}: missing, it is required"
         case "extra_forbidden":
-            known = _known_keys(model, path[:-1])
+            known = _known_keys(known_by, path[:-1] if known_by is model else path[1:-1])
             guess = difflib.get_close_matches(path[-1], known, n=1)
             hint = f"did you mean {guess[0]!r}?" if guess else f"expected one of {', '.join(sorted(known))}"
             return f"{key}: unknown key, {hint}"

@@ -260,10 +260,10 @@ class MADDPGConfig(OffPolicyConfig):
     independent noise."""
 
 
-# Each algorithm: a class above, a member of the union, and a name here.
+# Each algorithm: a class above, and a member of the three below.
 
 AnyTraining = PPOConfig | DQNConfig | MADDPGConfig
-ALGORITHMS = ("ppo", "dqn", "maddpg")
+ALGORITHMS: dict[str, type[TrainingSettings]] = {"ppo": PPOConfig, "dqn": DQNConfig, "maddpg": MADDPGConfig}
 
 
 def _algorithm(settings: Any) -> str:

@@ -3,7 +3,6 @@
 import re
 import shlex
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import typer
@@ -12,7 +11,7 @@ from typer.core import TyperGroup
 
 from cli.main import app
 from league.config import LeagueConfig
-from league.training_config import ALGORITHMS, AnyTraining, TrainingSettings
+from league.training_config import ALGORITHMS
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -78,9 +77,9 @@ def settings_of(heading: str) -> dict[str, str]:
     return dict(re.findall(r"^\| `(\w+)` \| `?(.*?)`? \|", section.partition("\n## ")[0], flags=re.M))
 
 
-@pytest.mark.parametrize("model", get_args(AnyTraining), ids=ALGORITHMS)
-def test_every_training_setting_is_documented_with_its_default(model: type[TrainingSettings]) -> None:
-    name = get_args(model.model_fields["algorithm"].annotation)[0]
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_training_setting_is_documented_with_its_default(name: str) -> None:
+    model = ALGORITHMS[name]
     rows = settings_of("`training`, whatever the algorithm") | settings_of(f"`training` with `algorithm: {name}`")
     fields = {field.alias or key for key, field in model.model_fields.items()}
     assert set(rows) == fields

@@ -27,6 +27,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from league.errors import ConfigError
 from league.seeds import generator
 from league.training_config import PrioritiesConfig
 from training.sum_tree import SumTree
@@ -57,6 +58,11 @@ class Block:
 
     def __len__(self) -> int:
         return len(self.streams)
+
+    def newest(self, count: int) -> "Block":
+        """Its last rows alone."""
+        rows = {name: column[-count:] for name, column in self.rows.items()}
+        return Block(rows, self.streams[-count:], self.firsts[-count:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +106,8 @@ class Replay:
         """Take rows in, over the oldest ones where there is no room."""
         if not len(block):
             return
-        assert len(block) <= self.capacity, f"{len(block)} rows at once into a buffer of {self.capacity}"
+        if len(block) > self.capacity:
+            block = block.newest(self.capacity)
         if not self._columns:
             self._columns = {name: np.zeros((self.capacity, *c.shape[1:]), c.dtype) for name, c in block.rows.items()}
         indices = (self._added + np.arange(len(block))) % self.capacity
@@ -162,9 +169,13 @@ class Replay:
         (directory / STATE_FILE).write_text(json.dumps(state))
 
     def load(self, directory: Path) -> None:
-        """Take over what `save` wrote, of a buffer of the same capacity."""
+        """Take over what `save` wrote. Raises ConfigError where that was of another capacity."""
         state = json.loads((directory / STATE_FILE).read_text())
-        assert state["capacity"] == self.capacity, "a buffer of another capacity"
+        if state["capacity"] != self.capacity:
+            raise ConfigError(
+                f"training.replay_capacity: the checkpoint's buffer has {state['capacity']}, got {self.capacity}: take"
+                " that, or leave the buffer behind by replay_in_checkpoint: false"
+            )
         self._added, self._largest = state["added"], state["largest"]
         with np.load(directory / ROWS_FILE, allow_pickle=False) as kept:
             self._columns = {}

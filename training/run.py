@@ -17,6 +17,7 @@ from league.registry.registry import Registry
 from league.registry.rows import VersionRow
 from league.training_config import AnyTraining, TrainingConfig
 from training.algorithms.dispatch import algorithm_config, module_spec
+from training.algorithms.off_policy import replay_is_lost
 from training.cluster import UNLIMITED, LocalRay, connected
 from training.faults import told
 from training.interrupts import Interrupted
@@ -29,7 +30,10 @@ from training.runs import CHECKPOINTS, END, Run
 from training.trial import AFRESH, Plan, Start, Trial, read_progress
 from training.tuning import Unpickled, fit, quiet, run_config
 
-NETWORK = ("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder")
+NETWORK = (
+    *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
+    *("dueling", "noisy", "distributional"),
+)
 """Settings that decide what the network is: a version's weights fit no other."""
 
 
@@ -124,8 +128,9 @@ def check_network(version: VersionRow, config: LeagueConfig) -> None:
     settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
     before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
     for key in NETWORK:
-        if before[key] != now[key]:
-            raise ConfigError(f"training.{key}: {version.ref} was trained with {before[key]}, got {now[key]}")
+        # An algorithm has some of them only.
+        if (was := before.get(key)) != (wanted := now.get(key)):
+            raise ConfigError(f"training.{key}: {version.ref} was trained with {was}, got {wanted}")
 
 
 def _publish_rest(run: Run, publisher: Publisher) -> None:
@@ -155,7 +160,10 @@ def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publish
     config, life = run.record.config, run.next_life()
     (life / CHECKPOINTS).mkdir(parents=True)
     share = cpu_share(config.training.runners)
-    plan = Plan(_start(run, registry), life / CHECKPOINTS, life / END, registry.storage, cpus=share)
+    start = _start(run, registry)
+    if start.checkpoint is not None and replay_is_lost(config.training, start.checkpoint):
+        progress.say("The replay buffer begins empty: nothing is learned until training.learning_starts transitions.")
+    plan = Plan(start, life / CHECKPOINTS, life / END, registry.storage, cpus=share)
 
     def ask_to_end() -> None:
         plan.end.touch()

@@ -91,7 +91,7 @@ def test_what_is_sampled_is_among_the_newest_that_were_added(
     replay = Replay(capacity, priorities=PrioritiesConfig() if prioritised else None)
     replay.reseed(seed, 0)
     added = 0
-    for size in (min(size, capacity) for size in sizes):
+    for size in sizes:
         numbers = list(range(added, added + size))
         replay.add(block(numbers, [0] * size, [i == 0 for i in numbers]))
         added += size

@@ -80,6 +80,26 @@ def test_a_run_publishes_its_checkpoints_and_further_training_names_its_parent(r
     assert lineage(further) == [(3, 1024, 1), (4, 1536, 3)]
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_an_off_policy_run_goes_the_same_way(registry: Registry) -> None:
+    """Versions, further training from one with its buffer or without, and one as an opponent."""
+    settings = {"algorithm": "dqn", "runners": 1, "steps": 2048, "checkpoint_every": 1024, "learning_starts": 256}
+    league = tictactoe(**settings)
+    versions = train(league, registry=registry, console=Console(file=io.StringIO()))
+    assert lineage(versions) == [(1, 1024, None), (2, 2048, 1)]
+    assert versions[0].manifest.algorithm == "dqn"
+    for kept in (True, False):
+        shown, parent = io.StringIO(), CheckpointRef("tictactoe", 1)
+        further = league.with_training(steps=1024, opponents=["@1"], replay_in_checkpoint=kept)
+        (version,) = train(further, registry=registry, parent=parent, console=Console(file=shown))
+        assert (version.steps, version.parent) == (2048, 1)
+        assert ("The replay buffer begins empty" in shown.getvalue()) is not kept
+    with pytest.raises(ConfigError, match=r"training\.algorithm: tictactoe@1 was trained with dqn, got ppo"):
+        train(tictactoe(), registry=registry, parent=CheckpointRef("tictactoe", 1))
+    with pytest.raises(ConfigError, match=r"training\.dueling: tictactoe@1 was trained with True, got False"):
+        train(league.with_training(dueling=False), registry=registry, parent=CheckpointRef("tictactoe", 1))
+
+
 def test_what_cannot_be_trained_is_refused_before_anything_starts(registry: Registry) -> None:
     with pytest.raises(ConfigError, match="either --from or --resume"):
         train(LEAGUE, registry=registry, parent=CheckpointRef("tictactoe", 1), resume=True)

@@ -50,7 +50,8 @@ def test_training_goes_on_exactly_where_its_checkpoint_was(tmp_path: Path, monke
 
 def trial(directory: Path, start: Start = AFRESH, **training: Any) -> Trial:
     """A trial in this process, which checkpoints below `directory`."""
-    league = tictactoe(train_batch_size=128, minibatch_size=64, epochs=1, **training)
+    of_ppo = {"train_batch_size": 128, "minibatch_size": 64, "epochs": 1}
+    league = tictactoe(**({} if "algorithm" in training else of_ppo), **training)
     (directory / "checkpoints").mkdir(parents=True, exist_ok=True)
     plan = Plan(start, directory / "checkpoints", directory / "end", Storage.at(directory))
     interface_ = interface(league)
@@ -106,6 +107,38 @@ def test_training_from_a_checkpoint_is_the_training_that_made_it(tmp_path: Path)
     assert [[result[name] for name in learned] for result in results] == [
         [result[name] for name in learned] for result in expected[1:]
     ]
+    whole.stop()
+    resumed.stop()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_off_policy_training_from_a_checkpoint_is_the_training_that_made_it(tmp_path: Path) -> None:
+    """Buffer, priorities, targets, schedules and counters, too; and the curves are those that are announced."""
+    settings: dict[str, Any] = {
+        "algorithm": "dqn",
+        "steps": 3072,
+        "checkpoint_every": 1024,
+        "learning_starts": 256,
+        "replay_capacity": 1500,
+        "target_every": 7,
+        "n_step": 2,
+        "noisy": True,
+        "priorities": {},
+        "exploration": {"steps": 2500},
+        "opponents": [{"ref": "script:random", "share": 0.3}],
+    }
+    whole = trial(tmp_path / "whole", **settings)
+    expected = run(whole)
+    checkpoint = tmp_path / "whole" / "checkpoints" / str(expected[0]["steps"])
+    resumed = trial(tmp_path / "resumed", Start(checkpoint, *read_progress(checkpoint)[:1], 0, 0.0), **settings)
+    results = run(resumed)
+    for name, value in weights(whole).items():
+        assert torch.equal(weights(resumed)[name], value)
+    learned = ("shared/length", "shared/loss", "shared/value", "exploration", "agents/player_1/return", "steps")
+    assert [[result[name] for name in learned] for result in results] == [
+        [result[name] for name in learned] for result in expected[1:]
+    ]
+    assert names(interface(whole.league), "dqn") <= expected[-1].keys()
     whole.stop()
     resumed.stop()
 

@@ -41,7 +41,7 @@ from league.config import LeagueConfig
 from league.interface import Interface
 from league.seeds import derive
 from league.settings import Storage
-from league.training_config import OffPolicyConfig
+from league.training_config import OffPolicyConfig, TrainingSettings
 from training.algorithms import phases
 from training.algorithms.setup import begin_anew, configure
 from training.curves import EXPLORATION
@@ -117,11 +117,12 @@ class OffPolicy(Algorithm):
         return written
 
     def restore_from_path(self, path: str | Path, *args: Any, **kwargs: Any) -> None:
-        """Take over a checkpoint. Without buffers in it, or with ones of another capacity, they begin empty."""
+        """Take over a checkpoint. Raises ConfigError where its buffers are of another capacity; see `replay_is_lost`
+        for when they begin empty."""
         super().restore_from_path(path, *args, **kwargs)
-        for key, replay in self.replays.items():
-            if (kept := Path(path) / REPLAY / key).is_dir() and self.settings.replay_in_checkpoint:
-                replay.load(kept)
+        if not replay_is_lost(self.settings, Path(path)):
+            for key, replay in self.replays.items():
+                replay.load(Path(path) / REPLAY / key)
 
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         return super().get_state(*args, **kwargs) | {COUNTERS: {"steps": self.steps}}
@@ -209,6 +210,14 @@ def off_policy_config(
     configure(config, league, interface, storage, modules=modules, runner=runner, learner=learner)
     config.training(lr=league.training.lr, gamma=league.training.gamma)
     return config
+
+
+def replay_is_lost(settings: TrainingSettings, checkpoint: Path) -> bool:
+    """Whether training that goes on from a checkpoint begins with empty buffers, by configuration or because there are
+    none in it."""
+    if not isinstance(settings, OffPolicyConfig):
+        return False
+    return not settings.replay_in_checkpoint or not (checkpoint / REPLAY).is_dir()
 
 
 def _play(runner: ReplayRunner, actions: int, exploration: float) -> tuple[int, dict[str, Block]]:

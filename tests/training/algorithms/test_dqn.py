@@ -157,6 +157,19 @@ def test_a_buffer_that_is_left_out_begins_empty(tmp_path: Path) -> None:
         restored.stop()
 
 
+def test_a_buffer_of_another_capacity_is_refused(tmp_path: Path) -> None:
+    league = by_values("discrete")
+    trained(league, 1, lambda algorithm, _: algorithm.save_to_path(str(tmp_path / "checkpoint")))
+    restored = built(league.with_training(replay_capacity=5000))
+    try:
+        with pytest.raises(
+            ConfigError, match=r"training\.replay_capacity: the checkpoint's buffer has 100000, got 5000"
+        ):
+            restored.restore_from_path(str(tmp_path / "checkpoint"))
+    finally:
+        restored.stop()
+
+
 def test_exploration_and_priorities_follow_their_schedules() -> None:
     league = by_values("discrete", steps=4096, priorities={"beta": 0.4}, exploration={"steps": 2048, "final": 0.1})
 

@@ -1,0 +1,145 @@
+"""Leduc hold'em as PettingZoo plays it (RLCard's rules), small enough for an exact best response.
+
+RLCard's game is not that of the literature: blinds of 1 and 2 chips, drawn at random, the small one acting first;
+raises of 2 chips, then of 4, twice a round at most; folding is always legal; payoffs count in big blinds. A policy sees
+its card, the public one, and both players' chips, but not in which order they were bet. The best response remembers
+all.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.policies.policy import Policy
+
+CALL, RAISE, FOLD, CHECK = range(4)
+RANKS, COPIES, BIG_BLIND, MOST_RAISES = 3, 2, 2, 2
+HIDDEN = None
+"""The public card before the second round."""
+
+Acting = Callable[[NDArray, NDArray], NDArray]
+"""Observation (36,) and mask (4,) → probabilities (4,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hand:
+    """What both players see. Player 0 has the small blind. bets: chips of this round; chips: of all."""
+
+    chips: tuple[int, int] = (1, 2)
+    bets: tuple[int, int] = (1, 2)
+    turn: int = 0
+    raises: int = 0
+    settled: int = 0
+    """Players in a row who did not raise; the round ends with two."""
+    round: int = 0
+    public: int | None = HIDDEN
+    folded: int | None = None
+
+    @property
+    def awaits_card(self) -> bool:
+        """Whether the public card is to be dealt."""
+        return self.round == 1 and self.public is HIDDEN and self.folded is None
+
+    @property
+    def is_over(self) -> bool:
+        return self.folded is not None or self.round == 2
+
+    def legal(self) -> NDArray:
+        """(4,) of 0 and 1."""
+        owes = self.bets[self.turn] < max(self.bets)
+        return np.array([owes, self.raises < MOST_RAISES, True, not owes], dtype=np.int8)
+
+    def after(self, action: int) -> "Hand":
+        """The hand when the player whose turn it is has acted."""
+        if action == FOLD:
+            return replace(self, folded=self.turn)
+        paid = 0 if action == CHECK else max(self.bets) - self.bets[self.turn]
+        if action == RAISE:
+            paid += BIG_BLIND * (1 + self.round)
+        hand = replace(
+            self,
+            chips=_plus(self.chips, self.turn, paid),
+            bets=_plus(self.bets, self.turn, paid),
+            turn=1 - self.turn,
+            raises=self.raises + (action == RAISE),
+            settled=1 if action == RAISE else self.settled + 1,
+        )
+        if hand.settled < 2:
+            return hand
+        return replace(hand, bets=(0, 0), raises=0, settled=0, round=self.round + 1)
+
+    def observation(self, rank: int) -> NDArray:
+        """What the player whose turn it is sees, holding `rank`."""
+        seen = np.zeros(36, np.float32)
+        seen[rank] = 1
+        if self.public is not HIDDEN:
+            seen[3 + self.public] = 1
+        seen[6 + self.chips[self.turn]] = seen[21 + self.chips[1 - self.turn]] = 1
+        return seen
+
+    def payoff(self, player: int, ranks: tuple[int, int]) -> float:
+        """Of a hand that is over. ranks: what the players hold."""
+        if self.folded is not None:
+            won = -1 if self.folded == player else 1
+        else:
+            # A pair with the public card wins, else the higher card.
+            strengths = [rank + RANKS * (rank == self.public) for rank in ranks]
+            won = int(np.sign(strengths[player] - strengths[1 - player]))
+        return won * (self.chips[1 - player] if won > 0 else self.chips[player]) / BIG_BLIND if won else 0.0
+
+
+def best_response(acting: Acting) -> float:
+    """What an opponent wins at most per hand against a policy, in big blinds; both have each blind equally often."""
+    known = cache(lambda hand, rank: acting(hand.observation(rank), hand.legal()))
+    return float(np.mean([_dealt(known, player) for player in (0, 1)]))
+
+
+def uniform(_: NDArray, mask: NDArray) -> NDArray:
+    """All legal actions alike."""
+    return mask / mask.sum()
+
+
+def greedy(policy: Policy) -> Acting:
+    """A policy as matches play it."""
+
+    def acting(observation: NDArray, mask: NDArray) -> NDArray:
+        seen = {"observation": observation[np.newaxis], "action_mask": mask[np.newaxis]}
+        return np.eye(4)[int(policy.act(seen).actions[0])]
+
+    return acting
+
+
+def _dealt(known: Callable[[Hand, int], NDArray], player: int) -> float:
+    """The best response's value in the role of `player`: for each card of its own, the opponent's by their chances."""
+    value = 0.0
+    for own in range(RANKS):
+        chances = np.array([COPIES - (other == own) for other in range(RANKS)]) / (RANKS * COPIES - 1)
+        value += _value(known, Hand(), player, own, chances) / RANKS
+    return value
+
+
+def _value(known: Callable[[Hand, int], NDArray], hand: Hand, player: int, own: int, reach: NDArray) -> float:
+    """Of a hand for the best response, which holds `own`. reach (3,): the probability of each of the opponent's cards,
+    and of its having acted as it did with that one."""
+    if hand.is_over:
+        ranks = [(own, other) if player == 0 else (other, own) for other in range(RANKS)]
+        return sum(p * hand.payoff(player, pair) for p, pair in zip(reach, ranks, strict=True) if p)
+    if hand.awaits_card:
+        left = RANKS * COPIES - 2
+        value = 0.0
+        for public in range(RANKS):
+            chances = np.array([COPIES - (public == own) - (public == other) for other in range(RANKS)]) / left
+            value += _value(known, replace(hand, public=public), player, own, reach * chances.clip(min=0))
+        return value
+    actions = np.flatnonzero(hand.legal()).tolist()
+    if hand.turn == player:
+        return max(_value(known, hand.after(action), player, own, reach) for action in actions)
+    plays = np.stack([known(hand, other) for other in range(RANKS)])
+    return sum(_value(known, hand.after(action), player, own, reach * plays[:, action]) for action in actions)
+
+
+def _plus(pair: tuple[int, int], place: int, amount: int) -> tuple[int, int]:
+    return (pair[0] + amount, pair[1]) if place == 0 else (pair[0], pair[1] + amount)
