@@ -15,6 +15,7 @@
 | `gpu/memory_gb`, `gpu/utilization` | where there is one: most that the learner held, percent of time busy |
 """
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -91,13 +92,15 @@ def curves(result: Mapping[str, Any], interface: Interface) -> dict[str, float]:
         found[f"{policy}/return"] = play.get(EPISODE_MODULE_RETURN_MEAN, {}).get(policy)
         found[f"{policy}/length"] = play.get(EPISODE_MODULE_LEN_MEAN, {}).get(policy)
         found[f"{policy}/entropy"] = play.get(policy, {}).get(ENTROPY)
+    for agent in interface.agents:
+        found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
+        found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
+    # What was once logged stays in RLlib's answer, as NaN: no episode ended in this update.
+    found = {name: value for name, value in found.items() if value is not None and not math.isnan(value)}
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
         found |= {f"{key}/{name}": learned.get(metric) for name, metric in LEARNED.items()}
         found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY, *ACTORS)}
-    for agent in interface.agents:
-        found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
-        found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
     return {name: float(value) for name, value in found.items() if value is not None}
 
 
