@@ -29,7 +29,7 @@ def test_only_league_and_environment_are_required() -> None:
         ({"environment": {}}, "environment.entry_point: missing, it is required"),
         ({"gate": {"alpha": 2}}, "gate.alpha: input should be less than 0.5, got 2"),
         ({"gate": {"elo0": 10, "elo1": 5}}, "gate: elo1 must be greater than elo0 (10)"),
-        ({"training": {"algorithm": "dqm"}}, "training.algorithm: expected one of ppo, dqn, got 'dqm'"),
+        ({"training": {"algorithm": "dqm"}}, "training.algorithm: expected one of ppo, dqn, maddpg, got 'dqm'"),
         ({"training": {"lr": "fast"}}, "training.lr: input should be a valid number"),
         ({"training": {"lrr": 1}}, "training.lrr: unknown key, did you mean 'lr'?"),
         ({"training": {"algorithm": "dqn", "epochs": 4}}, "training.epochs: unknown key, "),
