@@ -10,6 +10,7 @@ ORDER = (
     "sampling",
     "replay",
     "learning",
+    "maddpg",
     "parity",
     "serving",
     "formats",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit, ndtr
 
+from evaluation.one_thread import one_thread
 from league.results.records import BlockResult
 from league.seeds import generator
 
@@ -65,6 +66,11 @@ def choose(points: Floats, games: Floats, number: int, comparisons: int = 2) -> 
     points[i, j]: what i has scored against j in games[i, j] games, (n, n) each.
     comparisons: how many games a match counts for.
     """
+    with one_thread():
+        return _chosen(points, games, number, comparisons)
+
+
+def _chosen(points: Floats, games: Floats, number: int, comparisons: int) -> list[Pairing]:
     strength, precision = posterior(points, games)
     first, second = np.triu_indices(len(games), 1)
     gap = strength[first] - strength[second]

@@ -31,6 +31,7 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import expit, ndtri
 
+from evaluation.one_thread import one_thread
 from league.results.records import BlockResult
 
 Floats = NDArray[np.float64]
@@ -92,15 +93,23 @@ def rate(
     ratings = dict.fromkeys(names, Rating(None, None, None)) | {anchor: Rating(0.0, 0.0, 0.0)}
     size, base = int(rated.sum()), int(index[number[anchor]])
     if size > 1:
-        fitted, tail = bradley_terry(*table.sums(), table.pairs, size, base)[0], (1 - confidence) / 2
-        if resamples * len(table.number) > MOST_CELLS:
-            half = float(ndtri(1 - tail)) * table.deviation(fitted, base)
-            low, high = fitted - half, fitted + half
-        else:
-            low, high = np.quantile(table.resampled(fitted, base, resamples, seed), (tail, 1 - tail), axis=0)
+        with one_thread():
+            fitted, low, high = _fitted(table, size, base, resamples, (1 - confidence) / 2, seed)
         for name in itertools.compress(names, rated):
             ratings[name] = Rating(*(float(ELO * x[index[number[name]]]) for x in (fitted, low, high)))
     return ratings
+
+
+def _fitted(
+    table: _Table, size: int, base: int, resamples: int, tail: float, seed: int
+) -> tuple[Floats, Floats, Floats]:
+    """Log odds (size,) with the bounds of their intervals."""
+    fitted = bradley_terry(*table.sums(), table.pairs, size, base)[0]
+    if resamples * len(table.number) > MOST_CELLS:
+        half = float(ndtri(1 - tail)) * table.deviation(fitted, base)
+        return fitted, fitted - half, fitted + half
+    low, high = np.quantile(table.resampled(fitted, base, resamples, seed), (tail, 1 - tail), axis=0)
+    return fitted, low, high
 
 
 @dataclass(frozen=True, slots=True)

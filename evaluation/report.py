@@ -118,7 +118,7 @@ class EvaluationReport(Document):
     schedule: the id of its schedule; of an adaptive tournament, what the ids of its rounds begin with.
     kind: `round_robin`, `gauntlet`, `adaptive` or `cross_play`.
     by_side: who stands where on each side; empty where sides are alike, or there is one.
-    population: None unless everybody has met everybody, as in a round robin.
+    population: of a round robin in which everybody has met everybody, else None.
     cross_play: None in a tournament; where it is given, there are neither standings nor payoffs.
     forfeits: who forfeited how many games; nobody else is named.
     """

@@ -192,7 +192,8 @@ def _report(
         by_side=by_side(sides, matches) if rated_by_side else {},
         kind=kind,
         stopped_by=stopped_by,
-        population=population(order, matches) if tournament else None,
+        # Where others are picked by their ratings, some pairs meet once or twice, which says nothing of their payoffs.
+        population=population(order, matches) if kind == "round_robin" else None,
         cross_play=None if tournament else cross_play_table(course.contestants, matches),
         forfeits={ref: lost for ref in course.contestants if (lost := forfeits(matches, ref))},
     )

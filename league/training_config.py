@@ -263,10 +263,47 @@ class QMIXConfig(QLearningConfig):
         return self
 
 
+class MADDPGConfig(OffPolicyConfig):
+    """Actors with critics that see all agents (Lowe et al., 2017, arXiv 1706.02275), with the settings of the authors'
+    implementation (openai/maddpg), which counts steps of an environment of three agents."""
+
+    algorithm: Literal["maddpg"]
+    lr: float = Field(default=0.01, gt=0)
+    gamma: float = Field(default=0.95, ge=0, le=1)
+    grad_clip: float = Field(default=0.5, gt=0)
+    hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1)
+    """Widths of the hidden layers, of actors and critics."""
+    replay_capacity: int = Field(default=1_000_000, ge=1)
+    learning_starts: int = Field(default=25_600, ge=1)
+    batch_size: int = Field(default=1024, ge=1)
+    """Transitions of each policy's step, which draws its own."""
+    update_every: int = Field(default=300, ge=1)
+    updates: int = Field(default=1, ge=1)
+    target_every: int = Field(default=1, ge=1)
+    target_rate: float = Field(default=0.01, gt=0, le=1)
+    exploration: ExplorationConfig = ExplorationConfig(initial=0.3, final=0.1, steps=1_000_000)
+    """Deviation of the noise on the actions of a Box, whose bounds are -1 and 1 for it. Choices are drawn at random by
+    their logits, and take none."""
+    critic: Literal["centralised", "own"] = "centralised"
+    """What critics see: all agents' observations and actions, or their own agent's alone, which is DDPG."""
+    temperature: float = Field(default=1.0, gt=0)
+    """Of the Gumbel-softmax that gradients pass through to choices."""
+    regularization: float = Field(default=0.001, ge=0)
+    """How much the squares of the actors' answers, before masks and bounds, add to their loss."""
+    theta: float | None = Field(default=None, gt=0, le=1)
+    """Let the noise be an Ornstein-Uhlenbeck process that returns to 0 at this rate (0.15 in the DDPG paper); null for
+    independent noise."""
+
+
 # Each algorithm: a class above, and a member of the three below.
 
-AnyTraining = PPOConfig | DQNConfig | QMIXConfig
-ALGORITHMS: dict[str, type[TrainingSettings]] = {"ppo": PPOConfig, "dqn": DQNConfig, "qmix": QMIXConfig}
+AnyTraining = PPOConfig | DQNConfig | QMIXConfig | MADDPGConfig
+ALGORITHMS: dict[str, type[TrainingSettings]] = {
+    "ppo": PPOConfig,
+    "dqn": DQNConfig,
+    "qmix": QMIXConfig,
+    "maddpg": MADDPGConfig,
+}
 
 
 def _algorithm(settings: Any) -> str:
@@ -276,7 +313,10 @@ def _algorithm(settings: Any) -> str:
 
 
 TrainingConfig = Annotated[
-    Annotated[PPOConfig, Tag("ppo")] | Annotated[DQNConfig, Tag("dqn")] | Annotated[QMIXConfig, Tag("qmix")],
+    Annotated[PPOConfig, Tag("ppo")]
+    | Annotated[DQNConfig, Tag("dqn")]
+    | Annotated[QMIXConfig, Tag("qmix")]
+    | Annotated[MADDPGConfig, Tag("maddpg")],
     Discriminator(_algorithm),
 ]
 """The settings of one algorithm, told apart by `algorithm`."""

@@ -8,12 +8,14 @@
 | `<policy>/entropy` | of the distributions that were played from, in nats |
 | `<policy>/policy_loss`, `value_loss`, `kl`, `clip_fraction`, `explained_variance`, `gradient_norm` | of its learning |
 | `<policy>/loss`, `value`, `error` | off-policy: loss, values of actions, TD errors; centralised ones under `joint` |
+| `<policy>/policy_loss`, `critic_gradient_norm` | of actors with critics; loss, value and error are the critic's |
 | `exploration` | off-policy: how much is explored |
 | `agents/<agent>/return`, `agents/<agent>/length` | of one agent |
 | `time/sampling`, `time/learning`, `time/weights`, `time/checkpoint` | seconds of wall time in the report |
 | `gpu/memory_gb`, `gpu/utilization` | where there is one: most that the learner held, percent of time busy |
 """
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -55,6 +57,9 @@ LEARNED = {
 }
 
 OFF_POLICY = ("loss", "value", "error", "gradient_norm")
+ACTORS = ("policy_loss", "critic_gradient_norm")
+"""Of actors with critics: `loss`, `value` and `error` are then the critic's, `gradient_norm` the actor's."""
+LEARNED_BY = {"ppo": tuple(LEARNED), "maddpg": (*OFF_POLICY, *ACTORS)}
 EXPLORATION = "exploration"
 """Logged by off-policy algorithms at the top of RLlib's result."""
 
@@ -67,7 +72,7 @@ def time_each_update(algorithm: Algorithm) -> None:
 
 def names(interface: Interface, algorithm: str = "ppo") -> set[str]:
     """The curves that training has of what was learned."""
-    of_policy = {RETURN, "length", "entropy", *(LEARNED if algorithm == "ppo" else OFF_POLICY)}
+    of_policy = {RETURN, "length", "entropy", *LEARNED_BY.get(algorithm, OFF_POLICY)}
     return (
         {RETURN, "length"}
         | {f"{policy}/{name}" for policy in interface.policy_ids for name in of_policy}
@@ -87,13 +92,15 @@ def curves(result: Mapping[str, Any], interface: Interface) -> dict[str, float]:
         found[f"{policy}/return"] = play.get(EPISODE_MODULE_RETURN_MEAN, {}).get(policy)
         found[f"{policy}/length"] = play.get(EPISODE_MODULE_LEN_MEAN, {}).get(policy)
         found[f"{policy}/entropy"] = play.get(policy, {}).get(ENTROPY)
-    for key in (*interface.policy_ids, JOINT):
-        learned = result.get(LEARNER_RESULTS, {}).get(key, {})
-        found |= {f"{key}/{name}": learned.get(metric) for name, metric in LEARNED.items()}
-        found |= {f"{key}/{name}": learned.get(name) for name in OFF_POLICY}
     for agent in interface.agents:
         found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
         found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
+    # What was once logged stays in RLlib's answer, as NaN: no episode ended in this update.
+    found = {name: value for name, value in found.items() if value is not None and not math.isnan(value)}
+    for key in (*interface.policy_ids, JOINT):
+        learned = result.get(LEARNER_RESULTS, {}).get(key, {})
+        found |= {f"{key}/{name}": learned.get(metric) for name, metric in LEARNED.items()}
+        found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY, *ACTORS)}
     return {name: float(value) for name, value in found.items() if value is not None}
 
 

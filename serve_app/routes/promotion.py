@@ -123,7 +123,8 @@ def parse(kind: type[B], body: bytes) -> B:
         first = error.errors()[0]
         loc = first["loc"][1:] if issubclass(kind, RootModel) else first["loc"]  # without which of several it is
         where = ".".join(str(part) for part in loc) or "the body"
-        raise InvalidInput(f"{where}: {first['msg']}") from None
+        # What a validator of ours says comes with pydantic's word for it.
+        raise InvalidInput(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
 
 
 def _document(event: AliasEvent) -> dict[str, Any]:

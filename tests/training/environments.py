@@ -169,3 +169,52 @@ class Masked(ParallelEnv):
 
 def masked() -> ParallelEnv:
     return Masked()
+
+
+class Summing(ParallelEnv):
+    """Each of two agents sees a number of its own, and both are paid by how close the sum of what they do comes to
+    that of what they see; after ROUNDS tasks all are truncated. Best return: 0; random play: about -1.9 a round.
+
+    ends: the round after which player_1 terminates, alone; None for never.
+    """
+
+    def __init__(self, ends: int | None = None) -> None:
+        self.possible_agents = ["player_0", "player_1"]
+        self._ends = ends
+
+    def observation_space(self, agent: str) -> gymnasium.Space:
+        return spaces.Box(-1, 1, (1,), np.float32)
+
+    def action_space(self, agent: str) -> gymnasium.Space:
+        return spaces.Box(-2, 2, (1,), np.float32)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents = self.possible_agents[:]
+        self._rng = np.random.default_rng(seed)
+        self._round = 0
+        self._tell()
+        return dict(self._seen), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        missed = sum(float(action[0]) for action in actions.values()) - sum(
+            float(self._seen[agent][0]) for agent in actions
+        )
+        agents, self._round = self.agents, self._round + 1
+        over = self._round == ROUNDS
+        terminated = {agent: agent == "player_1" and self._round == self._ends for agent in agents}
+        self._tell()
+        self.agents = [] if over else [agent for agent in agents if not terminated[agent]]
+        return (
+            {agent: self._seen[agent] for agent in agents},
+            dict.fromkeys(agents, -(missed**2)),
+            terminated,
+            {agent: over and not terminated[agent] for agent in agents},
+            {agent: {} for agent in agents},
+        )
+
+    def _tell(self) -> None:
+        self._seen = {agent: self._rng.uniform(-1, 1, 1).astype(np.float32) for agent in self.possible_agents}
+
+
+def summing(ends: int | None = None) -> ParallelEnv:
+    return Summing(ends)

@@ -78,3 +78,27 @@ def by_values(name: str, kwargs: dict[str, Any] | None = None, policies: Any = N
             "training": settings | training,
         }
     )
+
+
+def maddpg(name: str, kwargs: dict[str, Any], policies: Any, **training: Any) -> LeagueConfig:
+    """One of `tests.training.environments`, with settings that solve it in a few thousand actions."""
+    settings = {
+        "algorithm": "maddpg",
+        "runners": 0,
+        "copies": 16,
+        "hidden": [32],
+        "seed": 5,
+        "replay_capacity": 20_000,
+        "learning_starts": 256,
+        "batch_size": 256,
+        "update_every": 32,
+        "exploration": {"initial": 0.5, "final": 0.1, "steps": 20_000},
+    }
+    return LeagueConfig.from_mapping(
+        {
+            "league": name,
+            "environment": {"entry_point": f"{ENVIRONMENTS}:{name}", "kwargs": kwargs},
+            "policies": policies,
+            "training": settings | training,
+        }
+    )

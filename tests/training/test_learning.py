@@ -48,3 +48,11 @@ def test_pistonball_trains_by_the_settings_that_ship() -> None:
     """Whether it learns takes longer to see than a test may: that is the benchmark's."""
     learned = trained("pistonball", 320, episodes=1, train_batch_size=320, copies=1, epochs=1)
     assert learned.curve[-1].steps >= 320
+
+
+def test_the_adversary_of_simple_adversary_soon_follows_the_good_side() -> None:
+    """It has all to win by that; what the good side gains by deceiving it shows later."""
+    settings = {"learning_starts": 2560, "update_every": 100, "batch_size": 256}
+    learned = trained("simple_adversary", 120_000, episodes=200, **settings)
+    adversary, random = (returns.reshape(3, -1)[0].mean() for returns in (learned.greedy, learned.random))
+    assert adversary - random > 3

@@ -206,6 +206,8 @@ class OwnTransitions:
 class JointTransitions:
     """All agents' transitions of one step of a copy as one row. All that are there must act at once."""
 
+    keeps_states = True
+
     def __init__(self, interface: Interface, agents: Sequence[str], copies: int, initial: Initial = NO_MEMORY) -> None:
         self._own = OwnTransitions(interface, agents, copies, initial)
         self._copies = copies
@@ -263,7 +265,8 @@ class JointTransitions:
                 whole = np.zeros((len(copies), n, *column.shape[1:]), column.dtype)
                 whole[places] = column
                 rows["/".join(filter(None, (head, policy, rest)))] = whole
-        rows |= self._with_states(copies, rows, turn)
+        if self.keeps_states:
+            rows |= self._with_states(copies, rows, turn)
         return Block(rows, self._stream_offset + copies, firsts)
 
     def _with_states(self, copies: NDArray, rows: Rows, turn: Turn) -> Rows:
@@ -279,6 +282,12 @@ class JointTransitions:
             if self._states is None:
                 self._states = np.zeros((self._copies, len(state)), np.float32)
             self._states[copy] = state
+
+
+class JointWithoutStates(JointTransitions):
+    """Without the columns `state` and `next_state`: what agents see and do is enough."""
+
+    keeps_states = False
 
 
 def state_size(environment: EnvironmentConfig, interface: Interface) -> int:

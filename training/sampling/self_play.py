@@ -16,6 +16,7 @@ from league.training_config import TrainingSettings
 from training.modules.acting import ACTED
 from training.sampling.distributions import distribution
 from training.sampling.memories import Memories, State
+from training.sampling.noise import OrnsteinUhlenbeck
 from training.sampling.openings import Openings, RandomMover
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import PlayMetrics
@@ -68,6 +69,8 @@ class SelfPlay:
         self._initial_states = {policy: state for policy, state in initial_states.items() if state}
         self._seats = Seats(interface, settings.opponents, stepping.agents)
         self._opponents = Opponents(settings.opponents, interface, storage)
+        self.noises: dict[str, OrnsteinUhlenbeck] = {}
+        """policy id → what its actions explore by, instead of independent draws."""
         self._openings = Openings(settings.opening_plies, self._policies, stepping.copies)
         self.metrics = PlayMetrics(stepping.agents, self._policies, self._distributions, stepping.copies)
 
@@ -85,6 +88,7 @@ class SelfPlay:
         for copy in range(self._stepping.copies):
             self.metrics.forget(copy)
             self._opponents.forget(copy)
+            self._still(copy)
         self._read(self._stepping.start(self._next_episode))
 
     def record_by(self, recorder: Recorder) -> None:
@@ -141,6 +145,11 @@ class SelfPlay:
         for memories in self._memories.values():
             memories.forget(copy)
         self._opponents.forget(copy)
+        self._still(copy)
+
+    def _still(self, copy: int) -> None:
+        for noise in self.noises.values():
+            noise.forget(copy)
 
     def _act(self, policy: str, batch: Batch, ask: Ask, answer: Answer | None, explore: bool) -> NDArray:
         drawing = self._distributions[policy]
@@ -149,12 +158,20 @@ class SelfPlay:
             log_p = drawing.log_p(dist_inputs, raw)
         else:
             dist_inputs = answer.dist_inputs
-            raw, log_p = drawing.sample(dist_inputs, self._rng) if explore else drawing.mode(dist_inputs)
+            raw, log_p = self._drawn(policy, batch, dist_inputs) if explore else drawing.mode(dist_inputs)
             if answer.state is not None:
                 self._memories[policy].keep(batch, _with_action(answer.state, raw))
         self.recorder.act(policy, raw, log_p, dist_inputs, ask.state)
         self.metrics.add_play(policy, dist_inputs)
         return to_environment(raw, self._actions[policy])
+
+    def _drawn(self, policy: str, batch: Batch, dist_inputs: NDArray) -> tuple[NDArray, NDArray]:
+        """Raw actions to explore by, and their log-probabilities if they were drawn independently."""
+        drawing = self._distributions[policy]
+        if policy not in self.noises:
+            return drawing.sample(dist_inputs, self._rng)
+        raw = self.noises[policy].draw(batch.copies, batch.agents, dist_inputs, self._rng)
+        return raw, drawing.log_p(dist_inputs, raw)
 
     def _random(self, policy: str, batch: Batch) -> tuple[NDArray, NDArray]:
         """Random legal raw actions, and the inputs that stand for them."""

@@ -56,7 +56,7 @@ def test_a_key_expires(registry: Registry) -> None:
 def test_what_cannot_be_a_key_is_refused(registry: Registry) -> None:
     with pytest.raises(InvalidReference, match="'A B'"):
         registry.create_key("A B", ["act"])
-    with pytest.raises(InvalidInput, match="'root' is unknown: expected some of act, read, promote"):
+    with pytest.raises(InvalidInput, match="'root' is unknown: expected some of act, read, evaluate, promote"):
         registry.create_key("bot", ["act", "root"])
     with pytest.raises(InvalidInput, match="needs a scope"):
         registry.create_key("bot", [])

@@ -1,0 +1,313 @@
+"""MADDPG against independent DDPG in simple_adversary: who deceives better, and how fast is it learned?
+
+Parts:
+
+- `speed`: environment steps per second with learning on, divided by phase, and of sampling alone against the bare
+  environment.
+- `cross_play`: both are trained as long, each seed in a process of its own on one core, two at a time; then every
+  adversary plays every good side, greedily, from the same starts. A seed that has finished is not trained again: its
+  policies stay in `--directory`. All seeds are printed, none is left out. Returns are per agent and episode.
+"""
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpe2 import simple_adversary_v3
+from numpy.typing import NDArray
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
+from scipy import stats
+
+from benchmarks.learned import local_ray, one_thread
+from benchmarks.sampling import in_parallel
+from league.config import LeagueConfig
+from league.environments.building import interface
+from training.algorithms.dispatch import algorithm_config
+from training.algorithms.maddpg import MADDPG
+from training.curves import PHASES, amounts
+from training.sampling.actor_runner import ActorRunner
+from training.trial import build
+
+CONFIG = Path(__file__).parent.parent / "configs" / "simple_adversary.yaml"
+CRITICS = {"MADDPG": "centralised", "DDPG": "own"}
+ADVERSARY, GOOD = "adversary", "good_0"
+"""Policies of the two sides; the two good agents are paid alike."""
+AGENTS = 3
+BAND = "MAPPO of MARLlib after 20M steps: good agent +8.0 … +10.6, adversary −14.9 … −17.1"
+POINTS = 10
+"""Of the curve that is printed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What was asked for. directory: where trained policies stay."""
+
+    minutes: float
+    seeds: int
+    episodes: int
+    directory: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One training."""
+
+    critic: str
+    seed: int
+    minutes: float
+    directory: Path
+
+    @property
+    def file(self) -> Path:
+        return self.directory / f"{self.critic}-{self.seed}-{self.minutes:g}min.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """weights: policy id → name → array. summary: what `train` measured."""
+
+    weights: dict[str, dict[str, NDArray]]
+    summary: dict[str, Any]
+
+    @classmethod
+    def load(cls, file: Path) -> "Trained":
+        weights: dict[str, dict[str, NDArray]] = {}
+        with np.load(file, allow_pickle=False) as kept:
+            for key in kept.files:
+                if key != "summary":
+                    policy, _, name = key.partition("/")
+                    weights.setdefault(policy, {})[name] = kept[key]
+            return cls(weights, json.loads(str(kept["summary"])))
+
+
+def league_of(critic: str, **settings: Any) -> LeagueConfig:
+    """The shipped configuration, sampling in the learner's process."""
+    return LeagueConfig.load(CONFIG).with_training(critic=critic, runners=0, **settings)
+
+
+def train(job: Job) -> None:
+    """Learn by the clock on this process's one core, and keep the actors."""
+    if job.file.exists():
+        return
+    one_thread()
+    league = league_of(job.critic, seed=job.seed)
+    with local_ray(cpus=1):
+        algorithm = build(league, interface(league))
+        assert isinstance(algorithm, MADDPG)
+        algorithm.begin_anew(0)
+        curve, phases = learned(algorithm, 60 * job.minutes)
+        weights = {
+            f"{policy}/{name}": array
+            for policy, module in algorithm.learner_group._learner.module.items()
+            for name, array in module.get_state().items()
+        }
+        algorithm.stop()
+    summary = {"curve": curve, "phases": phases, "steps": curve[-1]["steps"], "seconds": curve[-1]["seconds"]}
+    job.directory.mkdir(parents=True, exist_ok=True)
+    draft = job.file.with_suffix(".part.npz")
+    np.savez(draft, summary=np.array(json.dumps(summary)), **weights)
+    draft.rename(job.file)
+
+
+def learned(algorithm: MADDPG, seconds: float) -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Train for so long. Returns POINTS of the curve, each with the mean returns since the one before, and the seconds
+    of each phase."""
+    curve: list[dict[str, float]] = []
+    phases = dict.fromkeys(PHASES, 0.0)
+    returns: dict[str, list[float]] = {ADVERSARY: [], GOOD: []}
+    began = time.perf_counter()
+    while (spent := time.perf_counter() - began) < seconds or not curve:
+        result = algorithm.train()
+        taken = amounts(result)
+        phases = {phase: value + taken[phase] for phase, value in phases.items()}
+        means = result[ENV_RUNNER_RESULTS].get(EPISODE_MODULE_RETURN_MEAN, {})
+        for policy, values in returns.items():
+            values.append(float(means.get(policy, np.nan)))
+        spent = time.perf_counter() - began
+        if spent >= seconds * (len(curve) + 1) / POINTS:
+            point = {policy: float(np.nanmean(values)) for policy, values in returns.items()}
+            curve.append(point | {"steps": algorithm.steps, "seconds": spent})
+            returns = {policy: [] for policy in returns}
+    return curve, phases
+
+
+def cross_play(options: Options) -> bool:
+    """Four cells: the adversaries of each against the good sides of each."""
+    jobs = {
+        name: [Job(critic, seed, options.minutes, options.directory) for seed in range(options.seeds)]
+        for name, critic in CRITICS.items()
+    }
+    # Side by side, a seed of each, so that both have as much of the machine.
+    queue = [job for pair in zip(*jobs.values(), strict=True) for job in pair]
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
+        list(pool.map(train, queue))
+    trained = {name: [Trained.load(job.file) for job in own] for name, own in jobs.items()}
+    for name, seeds in trained.items():
+        for seed, each in enumerate(seeds):
+            print_seed(name, seed, each)
+    with local_ray(cpus=1):
+        one_thread()
+        cells, random = matrix(trained, options.episodes)
+    print(f"\nall at random: good agent {random[1]:.2f}, adversary {random[0]:.2f}. {BAND}")
+    return told_cells(cells)
+
+
+Cells = dict[tuple[str, str], NDArray]
+"""(whose adversary, whose good side) → mean returns of adversary and good agent, (adversary seeds, good seeds, 2)."""
+
+
+def matrix(trained: dict[str, list[Trained]], episodes: int) -> tuple[Cells, tuple[float, float]]:
+    """Every adversary against every good side, each pair in as many episodes from the same starts; and what comes of
+    random play."""
+    league = league_of("centralised", seed=10_000)
+    described = interface(league)
+    runner = ActorRunner(config=algorithm_config(league, described), worker_index=0)
+    random = means(runner.sample(num_episodes=10 * episodes, random_actions=True))
+    cells: Cells = {}
+    for own, adversaries in trained.items():
+        for other, goods in trained.items():
+            pairs = [[played(runner, left, right, episodes) for right in goods] for left in adversaries]
+            cells[own, other] = np.array(pairs)
+    runner.stop()
+    return cells, random
+
+
+def played(runner: ActorRunner, adversary: Trained, good: Trained, episodes: int) -> tuple[float, float]:
+    """Mean returns of the adversary and of a good agent, which act greedily."""
+    for policy, module in runner.module.items():
+        module.set_state((adversary if policy == ADVERSARY else good).weights[policy])
+    runner.begin_anew(0)
+    return means(runner.sample(num_episodes=episodes, explore=False))
+
+
+def means(chunks: Sequence[SingleAgentEpisode]) -> tuple[float, float]:
+    """Mean returns of the adversary and of a good agent in whole episodes."""
+    whole = [chunk for chunk in chunks if chunk.is_done and chunk.t_started == 0]
+    adversary, good = (
+        float(np.mean([chunk.get_return() for chunk in whole if chunk.module_id == policy]))
+        for policy in (ADVERSARY, GOOD)
+    )
+    return adversary, good
+
+
+def print_seed(name: str, seed: int, trained: Trained) -> None:
+    summary = trained.summary
+    rate = summary["steps"] / AGENTS / summary["seconds"]
+    print(
+        f"{name}, seed {seed}: {summary['steps'] // AGENTS:,} environment steps in {summary['seconds']:,.0f} s,"
+        f" {rate:,.0f}/s; returns in training of adversary and good agent:"
+    )
+    print("  " + "  ".join(f"{point[ADVERSARY]:.1f}/{point[GOOD]:+.1f}" for point in summary["curve"]))
+
+
+def told_cells(cells: Cells) -> bool:
+    """Print the cells, and by how much MADDPG's good side is better. A seed counts once: its mean over the others."""
+    print(f"\n{'adversary of':>14} {'good side of':>14} {'good agent':>28} {'adversary':>28}   (95 % over seeds)")
+    for (own, other), cell in cells.items():
+        good, adversary = cell[:, :, 1].mean(axis=0), cell[:, :, 0].mean(axis=1)
+        print(f"{own:>14} {other:>14} {shown(good):>28} {shown(adversary):>28}")
+        print(f"{'':>30} of each good side: {', '.join(f'{value:.2f}' for value in good)}")
+    met = True
+    for own in CRITICS:
+        ours, theirs = (cells[own, other][:, :, 1].mean(axis=0) for other in CRITICS)
+        low, high = difference(ours, theirs)
+        met &= low > 0
+        print(
+            f"MADDPG's good side against the adversaries of {own}: better by {ours.mean() - theirs.mean():.2f},"
+            f" 95 % interval {low:.2f} … {high:.2f} (target: above 0)"
+        )
+    print(f"MADDPG's good side better against both: {'met' if met else 'MISSED'}", flush=True)
+    return met
+
+
+def shown(values: NDArray) -> str:
+    """A mean with its t-interval."""
+    if len(values) < 2:
+        return f"{values.mean():.2f}"
+    half = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
+    return f"{values.mean():.2f} ({values.mean() - half:.2f} … {values.mean() + half:.2f})"
+
+
+def difference(first: NDArray, second: NDArray) -> tuple[float, float]:
+    """Welch's 95 % interval of the difference of two means; of single values, none to speak of."""
+    if len(first) < 2:
+        return float("-inf"), float("inf")
+    interval = stats.ttest_ind(first, second, equal_var=False).confidence_interval(0.95)
+    return float(interval.low), float(interval.high)
+
+
+def speed(options: Options) -> bool:
+    """One core: learning on, by phase; then a runner alone against the stock environment."""
+    seconds = min(60.0, 60 * options.minutes)
+    one_thread()
+    with local_ray(cpus=1):
+        for name, critic in CRITICS.items():
+            league = league_of(critic, learning_starts=1024)
+            algorithm = build(league, interface(league))
+            assert isinstance(algorithm, MADDPG)
+            algorithm.begin_anew(0)
+            curve, phases = learned(algorithm, seconds)
+            algorithm.stop()
+            split = ", ".join(f"{phase.removeprefix('time/')} {value / seconds:.0%}" for phase, value in phases.items())
+            print(f"{name}: {curve[-1]['steps'] / AGENTS / curve[-1]['seconds']:,.0f} environment steps/s; {split}")
+        league = league_of("centralised")
+        runner = ActorRunner(config=algorithm_config(league, interface(league)), worker_index=0)
+        rates: dict[str, list[float]] = {"sampling": [], "stock": []}
+        for _ in range(5):
+            rates["sampling"].append(sampled(runner, seconds / 10))
+            rates["stock"].append(in_parallel(simple_adversary_v3, seconds / 10))
+        runner.stop()
+    ours, stock = (float(np.median(values)) for values in rates.values())
+    met = ours >= 0.75 * stock
+    print(f"sampling alone {ours:,.0f}, the stock environment {stock:,.0f} environment steps/s: {ours / stock:.2f}×")
+    print(f"sampling against the bare environment: target 0.75×: {'met' if met else 'MISSED'}", flush=True)
+    return met
+
+
+def sampled(runner: ActorRunner, seconds: float) -> float:
+    """Environment steps per second of play with exploration, transitions for replay included."""
+    steps, began = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - began) < seconds:
+        steps += runner.transitions(AGENTS * 1000, exploration=0.1)[0] // AGENTS
+    return steps / elapsed
+
+
+PARTS: dict[str, Callable[[Options], bool]] = {part.__name__: part for part in (speed, cross_play)}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the parts that were asked for; 1 if a target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
+    parser.add_argument("--minutes", type=float, default=20.0, help="of each training (20)")
+    parser.add_argument("--seeds", type=int, default=5, help="of each of the two (5)")
+    parser.add_argument("--episodes", type=int, default=400, help="of each pair in cross-play (400)")
+    parser.add_argument("--directory", type=Path, default=Path("build/benchmarks/maddpg"), help="of trained policies")
+    parser.add_argument("--quick", action="store_true", help="two seeds of half a minute, for a look")
+    given = parser.parse_args(arguments)
+    if unknown := [part for part in given.parts if part not in PARTS]:
+        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
+    if given.quick:
+        given.minutes, given.seeds, given.episodes = 0.5, 2, 50
+    options = Options(given.minutes, given.seeds, given.episodes, given.directory)
+    missed = []
+    for name in given.parts or PARTS:
+        print(f"\n-- {name} --", flush=True)
+        if not PARTS[name](options):
+            missed.append(name)
+    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
+    return bool(missed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
