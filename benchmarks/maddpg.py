@@ -4,9 +4,10 @@ Parts:
 
 - `speed`: environment steps per second with learning on, divided by phase, and of sampling alone against the bare
   environment.
-- `cross_play`: both are trained as long, each seed in a process of its own on one core, two at a time; then every
-  adversary plays every good side, greedily, from the same starts. A seed that has finished is not trained again: its
-  policies stay in `--directory`. All seeds are printed, none is left out. Returns are per agent and episode.
+- `cross_play`: both are trained as long, by the processor's time, so that other work on the machine takes nothing from
+  either; each seed in a process of its own on one core, two at a time. Then every adversary plays every good side,
+  greedily, from the same starts. A seed that has finished is not trained again: its policies stay in `--directory`. All
+  seeds are printed, none is left out. Returns are per agent and episode.
 """
 
 import argparse
@@ -95,7 +96,7 @@ def league_of(critic: str, **settings: Any) -> LeagueConfig:
 
 
 def train(job: Job) -> None:
-    """Learn by the clock on this process's one core, and keep the actors."""
+    """Learn for so many minutes of this process's one core, and keep the actors."""
     if job.file.exists():
         return
     one_thread()
@@ -104,7 +105,7 @@ def train(job: Job) -> None:
         algorithm = build(league, interface(league))
         assert isinstance(algorithm, MADDPG)
         algorithm.begin_anew(0)
-        curve, phases = learned(algorithm, 60 * job.minutes)
+        curve, phases = learned(algorithm, 60 * job.minutes, clock=time.process_time)
         weights = {
             f"{policy}/{name}": array
             for policy, module in algorithm.learner_group._learner.module.items()
@@ -118,21 +119,23 @@ def train(job: Job) -> None:
     draft.rename(job.file)
 
 
-def learned(algorithm: MADDPG, seconds: float) -> tuple[list[dict[str, float]], dict[str, float]]:
-    """Train for so long. Returns POINTS of the curve, each with the mean returns since the one before, and the seconds
-    of each phase."""
+def learned(
+    algorithm: MADDPG, seconds: float, clock: Callable[[], float] = time.perf_counter
+) -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Train for so long, by the clock. Returns POINTS of the curve, each with the mean returns since the one before,
+    and the seconds of each phase."""
     curve: list[dict[str, float]] = []
     phases = dict.fromkeys(PHASES, 0.0)
     returns: dict[str, list[float]] = {ADVERSARY: [], GOOD: []}
-    began = time.perf_counter()
-    while (spent := time.perf_counter() - began) < seconds or not curve:
+    began = clock()
+    while (spent := clock() - began) < seconds or not curve:
         result = algorithm.train()
         taken = amounts(result)
         phases = {phase: value + taken[phase] for phase, value in phases.items()}
         means = result[ENV_RUNNER_RESULTS].get(EPISODE_MODULE_RETURN_MEAN, {})
         for policy, values in returns.items():
             values.append(float(means.get(policy, np.nan)))
-        spent = time.perf_counter() - began
+        spent = clock() - began
         if spent >= seconds * (len(curve) + 1) / POINTS:
             point = {policy: float(np.nanmean(values)) for policy, values in returns.items()}
             curve.append(point | {"steps": algorithm.steps, "seconds": spent})
@@ -204,8 +207,8 @@ def print_seed(name: str, seed: int, trained: Trained) -> None:
     summary = trained.summary
     rate = summary["steps"] / AGENTS / summary["seconds"]
     print(
-        f"{name}, seed {seed}: {summary['steps'] // AGENTS:,} environment steps in {summary['seconds']:,.0f} s,"
-        f" {rate:,.0f}/s; returns in training of adversary and good agent:"
+        f"{name}, seed {seed}: {summary['steps'] // AGENTS:,} environment steps in {summary['seconds']:,.0f} s"
+        f" of a core, {rate:,.0f}/s; returns in training of adversary and good agent:"
     )
     print("  " + "  ".join(f"{point[ADVERSARY]:.1f}/{point[GOOD]:+.1f}" for point in summary["curve"]))
 
