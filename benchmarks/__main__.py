@@ -23,6 +23,7 @@ ORDER = (
     "strength",
     "calibration",
     "evaluation",
+    "crowded_league",
 )
 
 
