@@ -5,7 +5,7 @@
              403
 
 Behind HAProxy a replica still has ports of its own, which whoever reaches them may call: so the check is in the
-replica. A deadline is for HTTP alone: gRPC has one of its own, and a stream lasts.
+replica. A deadline is for HTTP alone: gRPC has one of its own, and a stream, of events too, lasts.
 """
 
 from collections.abc import Awaitable, Iterable
@@ -21,6 +21,7 @@ from serve_app.bodies import IS_READ
 from serve_app.deadlines import Expired, within
 from serve_app.error_handlers import BodyTooSlow, ErrorHandlers
 from serve_app.keyring import Key, Keyring
+from serve_app.middleware import lasts
 from serve_app.permissions import Need
 from serve_app.settings import ServeSettings
 
@@ -66,14 +67,18 @@ class Doors:
 
         Raises Unauthenticated (also if the key is valid no longer), RateLimited or Overloaded.
         """
+        self.admit_still(key)
+        if key is not None:
+            _take(key)
+        self.backlog.admit()
+
+    def admit_still(self, key: Key | None) -> None:
+        """Let a stream go on that was opened with `key`. Raises Unauthenticated if that is valid no longer."""
         if key is None:
             if self.are_locked:
                 raise Unauthenticated("this stream needs an API key by now")
         elif not self._keyring.holds(key):
             raise Unauthenticated(f"the API key {key.name} was revoked, or has expired")
-        else:
-            _take(key)
-        self.backlog.admit()
 
     def lets_read_all(self, headers: Iterable[tuple[bytes, bytes]]) -> bool:
         """Whether a request that needs no key may be told of all leagues, by the key that it shows."""
@@ -147,8 +152,8 @@ class Guarded:
                 scope[KEY] = key
                 if self._log is not None:
                     scope[LINE]["key"] = key.name
-            if kind != "http":
-                await self._application(scope, receive, send)
+            if kind != "http" or lasts(_path(scope)):
+                await self._application(scope, receive, reply.send)
                 return
             timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
             await within(timeout, self._application(scope, receive, reply.send))
