@@ -9,8 +9,8 @@ from datetime import timedelta
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from league.registry import acknowledgements, aliases, evaluations, rows
-from league.registry.tables import READY, AliasEvent, Evaluation, TrafficEvent, Verdict, Version
+from league.registry import acknowledgements, aliases, evaluations, rows, runs
+from league.registry.tables import READY, AliasEvent, Evaluation, Snapshot, TrafficEvent, Verdict, Version
 
 OPEN = "open"
 
@@ -29,4 +29,7 @@ def take(session: Session, league: str, since: timedelta) -> rows.Pulse:
         verdicts={outcome or OPEN: count for outcome, count in session.execute(outcomes)},
         evaluation=session.scalar(select(func.max(Evaluation.id)).filter_by(league=league)),
         evaluations=evaluations.active(session, league),
+        run=next((row.id for row in runs.newest(session, league, before=None, limit=1)), None),
+        runs=runs.active(session, league),
+        computed_at=session.scalar(select(func.max(Snapshot.at)).filter_by(league=league)),
     )

@@ -100,4 +100,7 @@ def _pulse(pulse: Pulse) -> Document:
         "evaluations": [
             {"evaluation": row.id, "state": row.state, "progress": row.progress} for row in pulse.evaluations
         ],
+        "run": pulse.run,
+        "runs": [{"run": row.id, "state": row.state, "steps": row.steps} for row in pulse.runs],
+        "computed_at": pulse.computed_at and pulse.computed_at.isoformat(),
     }
