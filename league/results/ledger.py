@@ -1,10 +1,10 @@
 """The append-only store of what was played. It takes what its schedules ask for, and each match once."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any, TypeVarTuple
 
-from sqlalchemy import Select, Subquery, select, tuple_, union_all, update
+from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput, NotFound, UnknownMatch
@@ -23,6 +23,8 @@ from league.results.documents import (
 from league.results.records import BlockResult, Entry, Match, Schedule
 
 Columns = TypeVarTuple("Columns")
+STRIDE = 1000
+"""Matches that are read at a time by whoever goes through many."""
 
 
 class Ledger:
@@ -92,6 +94,18 @@ class Ledger:
             found = session.execute(query)
             return [schedules[of].match(position, load_games(moves)) for of, position, moves in found]
 
+    def walk(self, schedule: Schedule) -> Iterator[Match]:
+        """The matches of a schedule in its order, a few of them in memory at a time."""
+        last, table = -1, tables.Match
+        query = select(table.position, table.moves).filter_by(schedule=schedule.id).order_by(table.position)
+        while True:
+            with self._database.read() as session:
+                found = session.execute(query.where(table.position > last).limit(STRIDE)).all()
+            yield from (schedule.match(position, load_games(moves)) for position, moves in found)
+            if len(found) < STRIDE:
+                return
+            last = found[-1].position
+
     def match(self, match: str) -> Match:
         """One match by its id. Raises UnknownMatch."""
         name, position = _place(match)
@@ -135,6 +149,13 @@ class Ledger:
         """Which positions of a schedule were played."""
         with self._database.read() as session:
             return set(session.scalars(select(tables.Match.position).filter_by(schedule=schedule)))
+
+    def counts(self, league: str) -> dict[str, int]:
+        """schedule → how many of its matches were played, of all schedules of a league of which any were."""
+        match = tables.Match
+        query = select(match.schedule, func.count()).filter_by(league=league).group_by(match.schedule)
+        with self._database.read() as session:
+            return dict(session.execute(query).tuples().all())
 
     def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
         """The matches of a league without their moves, in schedule order; of one environment if given.

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from league.errors import InvalidInput, LedgerRefusal, NotFound, UnknownLeague
 from league.registry.registry import Registry
+from league.results import ledger as ledger_module
 from league.results.documents import dump_games, dump_schedule, load_games, load_schedule
 from league.results.ledger import Ledger
 from league.results.records import BlockResult, Entry, Forfeit, Game, Match, Schedule
@@ -192,6 +193,16 @@ def test_one_who_played_in_a_team_with_itself_is_listed_once(ledger: Ledger) -> 
         ledger.append(schedule.match(position, games))
     (found,) = ledger.page(LEAGUE, contestants=("tictactoe@2", "tictactoe@2"))
     assert (found.id, found.result.contestants) == ("team/2", ("tictactoe@2", "tictactoe@2"))
+
+
+def test_a_schedule_is_walked_through_a_few_matches_at_a_time(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ledger_module, "STRIDE", 3)
+    for schedule in (SCHEDULE, replace(SCHEDULE, id="another")):
+        ledger.open(schedule)
+    for played_already in ([], [0, 1, 3], [0, 1, 3, 4, 5, 6, 8]):
+        ledger.extend([played(SCHEDULE, position) for position in played_already])
+        assert list(ledger.walk(SCHEDULE)) == [played(SCHEDULE, position) for position in played_already]
+    assert ledger.counts(LEAGUE) == {SCHEDULE.id: 7}
 
 
 def test_one_match_is_found_without_its_moves(ledger: Ledger) -> None:
