@@ -13,6 +13,7 @@ ORDER = (
     "maddpg",
     "parity",
     "serving",
+    "pages",
     "formats",
     "promotions",
     "shadowing",
