@@ -85,7 +85,7 @@ def _timed(client: httpx.Client, path: str) -> float:
 
 
 def _paths(client: httpx.Client) -> Iterator[str]:
-    """Every call that a page makes, of lists the first page, the largest, and the last."""
+    """Every call that pages make: of lists a usual page and the largest, of matches one from far down, too."""
     yield "/v1/leagues"
     yield BELOW
     for part in ("payoff", "ratings", "versions", "traffic"):
