@@ -24,6 +24,7 @@ ORDER = (
     "strength",
     "calibration",
     "evaluation",
+    "crowded_league",
 )
 
 

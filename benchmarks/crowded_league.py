@@ -124,14 +124,14 @@ class _Crowd:
             self._registry, league, number, f"{LEAGUE}@{champion}" if champion else "script:random", alpha=0.05
         )
         drawn = list(self._drawn(self._ledger.schedule(verdict.schedule), CONFIG.gate.max_blocks))
-        self._write(drawn[: judge(gate_of(verdict), drawn, new).blocks], number)
+        self._write(drawn[: judge(gate_of(verdict), drawn, new).blocks], number, hour=1)
         conclude(self._registry, verdict)
         self._date(verdict.id, number)
         opponents = [f"{LEAGUE}@{n}" for n in range(max(1, number - NEIGHBOURS), number)]
         opponents += ["script:random", "script:one_ply"]
         left = self._matches * 0.96 * number / self._versions - self._written
         schedule = gauntlet(CONFIG, league.interface, [new], opponents, max(1, round(left / len(opponents))))
-        self._write(list(self._drawn(self._ledger.open(schedule), schedule.length)), number)
+        self._write(list(self._drawn(self._ledger.open(schedule), schedule.length)), number, hour=3)
 
     def _round_robin(self) -> None:
         """What is left of the matches, between the last versions."""
@@ -139,7 +139,7 @@ class _Crowd:
         pairs = len(last) * (len(last) - 1) // 2
         blocks = max(1, -(-(self._matches - self._written) // pairs))
         schedule = round_robin(CONFIG, self._registry.league(LEAGUE).interface, last, blocks)
-        self._write(list(self._drawn(self._ledger.open(schedule), schedule.length)), self._versions)
+        self._write(list(self._drawn(self._ledger.open(schedule), schedule.length)), self._versions, hour=5)
 
     def _drawn(self, schedule: Schedule, length: int) -> Iterator[Match]:
         chances = self._rng.random((length, 2))
@@ -148,13 +148,13 @@ class _Crowd:
             expected = 1 / (1 + 10 ** ((second - first) / 400))
             yield self._pool.match(schedule, position, tuple(float(chance < expected) for chance in chances[position]))
 
-    def _write(self, matches: Sequence[Match], night: int) -> None:
+    def _write(self, matches: Sequence[Match], night: int, hour: int) -> None:
         if not matches:
             return
         schedule = self._ledger.schedule(matches[0].schedule)
         for match in matches:
             admit(match, schedule)
-        began = self._evening(night) + timedelta(hours=1)
+        began = self._evening(night) + timedelta(hours=hour)
         rows = [row(match) | {"played_at": began + timedelta(seconds=number)} for number, match in enumerate(matches)]
         with self._registry.database.write() as session:
             self._written += insert(session, tables.Match, rows)
