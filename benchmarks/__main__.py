@@ -14,6 +14,7 @@ ORDER = (
     "maddpg",
     "parity",
     "serving",
+    "pages",
     "formats",
     "promotions",
     "shadowing",
