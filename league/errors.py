@@ -315,3 +315,9 @@ class StorageError(LeagueError):
     """The database or the artefact store cannot be read or written."""
 
     code = "storage_error"
+
+
+BY_CODE: dict[str, type[LeagueError]] = {
+    error.code: error for error in list(vars().values()) if isinstance(error, type) and issubclass(error, LeagueError)
+}
+"""What a code that came from another process stands for."""

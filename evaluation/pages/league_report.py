@@ -26,7 +26,7 @@ from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.registry.rows import AliasEvent, LeagueRow, VerdictRow, VersionRow
 from league.results.ledger import Ledger
-from league.results.records import Match, Schedule, Scoring
+from league.results.records import Match, Scoring
 
 MOST_CONTESTANTS = 40
 """In the payoff table, the best ones: a table of more is read by nobody."""
@@ -194,12 +194,12 @@ class _Played:
         self._distinct: Counter[str] = Counter()
         for schedule in schedules.values():
             for match in ledger.matches(league=league.slug, schedule=schedule.id):
-                self._take(match, schedule)
+                self._take(match)
         self.distinct_games = len(self._seen)
         self.standings = tuple(replace(each, distinct_games=self._distinct[each.ref]) for each in self.standings)
 
-    def _take(self, match: Match, schedule: Schedule) -> None:
-        self.surprises.see(match, schedule.opening_plies)
+    def _take(self, match: Match) -> None:
+        self.surprises.see(match)
         self.games += len(match.games)
         for game in match.games:
             if (key := identity(match, game)) not in self._seen:
