@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import secrets
 import subprocess
-import sys
 import threading
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 
+from evaluation.children import start
 from league.errors import LeagueError
 from league.registry.registry import Registry
 
@@ -122,15 +121,4 @@ class Runners:
             if claimed is None:
                 return
             order = Order(claimed.id, claimed.league, name, self._workers, self._address)
-            self._runners.append(_Runner(order, _process(order)))
-
-
-def _process(order: Order) -> subprocess.Popen[bytes]:
-    """A process that finds the modules that this one finds. Its standard input is open as long as this one lives."""
-    paths = os.pathsep.join(path for path in sys.path if path)
-    return subprocess.Popen(
-        [sys.executable, "-m", "evaluation.job", json.dumps(asdict(order))],
-        stdin=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": paths},
-        start_new_session=True,  # Ctrl-C is for the server, which ends it
-    )
+            self._runners.append(_Runner(order, start("evaluation.job", json.dumps(asdict(order)))))
