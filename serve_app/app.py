@@ -30,6 +30,7 @@ from serve_app.access_log import AccessLog
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.doors import Doors, Guarded
 from serve_app.error_handlers import ErrorHandlers
+from serve_app.events import Events
 from serve_app.exposure import serves_other_machines
 from serve_app.inference_protocol.catalogue import Catalogue
 from serve_app.inference_protocol.grpc_handlers import offer
@@ -46,6 +47,7 @@ from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute, Shortcut
 from serve_app.routes.docs import DocsRoutes
 from serve_app.routes.evaluations import EvaluationRoutes
+from serve_app.routes.events import EventRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.metrics import MetricsRoute
@@ -109,7 +111,7 @@ class PolicyServer:
     def __serve_build_asgi_app__(self) -> Starlette:
         application = self._server.application()
         shorten(application)
-        http_protocol.install()
+        http_protocol.install(self._server.events.end)
         websocket_protocol.install(self._server.settings.max_body)
         offer(self._server.inference_service)
         gc.freeze()  # what is loaded by now stays: looking through it again and again would stop the event loop
@@ -159,13 +161,19 @@ class Server:
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
         self.evaluations = EvaluationRoutes(self.models, settings, studio)
+        self.events = Events(self.models, settings)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
             self.inference, self.catalogue, self.watcher, self.doors, settings, machine, self.metrics.failed
         )
 
     def _in_flight(self) -> dict[str, int]:
-        return {"action": self.action.in_flight, "infer": self.inference.in_flight, "stream": self.stream.open}
+        return {
+            "action": self.action.in_flight,
+            "infer": self.inference.in_flight,
+            "stream": self.stream.open,
+            "events": self.events.open,
+        }
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
@@ -173,6 +181,7 @@ class Server:
         promotion = PromotionRoutes(self.models, self.settings)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
+        events = EventRoutes(self.events, self.doors)
         docs = DocsRoutes(self.live, self.doors, self.settings)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
@@ -191,6 +200,8 @@ class Server:
                 Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.one),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
+                Route("/v1/leagues/{league}/evaluations/{evaluation}/events", events.evaluation),
+                Route("/v1/leagues/{league}/events", events.league),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),
@@ -214,6 +225,7 @@ class Server:
                 await running.enter_async_context(self.key_watcher.watching())
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
+                await running.enter_async_context(self.events.watching())
                 yield
         finally:
             self.shadow.close()

@@ -20,6 +20,7 @@ from league.registry import (
     leagues,
     nights,
     publishing,
+    pulse,
     reports,
     runs,
     shadows,
@@ -43,6 +44,7 @@ from league.registry.rows import (
     LeagueRow,
     NightRow,
     Portion,
+    Pulse,
     RunPoint,
     RunRow,
     RunState,
@@ -96,6 +98,14 @@ class Registry:
         """One league. Raises UnknownLeague."""
         with self.database.read() as session:
             return leagues.get(session, slug)
+
+    def pulse(self, league: str, since: timedelta = timedelta(seconds=15)) -> Pulse:
+        """Where a league stands: another, if anything of it is. Raises UnknownLeague.
+
+        since: for how long a replica that serves it may have been silent.
+        """
+        with self.database.read() as session:
+            return pulse.take(session, league, since)
 
     # Versions
 

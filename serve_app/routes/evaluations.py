@@ -68,7 +68,7 @@ class EvaluationRoutes:
 
         row = await self._models.ask(ask)
         self._studio.look()
-        return JSONResponse(_whole(row), 202, {"location": f"{request.url.path}/{row.id}"})
+        return JSONResponse(evaluation_document(row), 202, {"location": f"{request.url.path}/{row.id}"})
 
     async def every(self, request: Request) -> JSONResponse:
         """A page of a league's evaluations, without their results. Raises UnknownLeague or InvalidInput."""
@@ -82,17 +82,19 @@ class EvaluationRoutes:
 
     async def one(self, request: Request) -> JSONResponse:
         """One evaluation: how far it is, and what it has brought. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = _named(request)
-        return JSONResponse(_whole(await self._models.ask(lambda registry: registry.evaluation(league, number))))
+        league, number = named(request)
+        return JSONResponse(
+            evaluation_document(await self._models.ask(lambda registry: registry.evaluation(league, number)))
+        )
 
     async def stop(self, request: Request) -> JSONResponse:
         """Ask for its end; what has ended stays as it is. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = _named(request)
+        league, number = named(request)
         key: Key = request.scope[KEY]
         row = await self._models.ask(lambda registry: registry.stop_evaluation(league, number, actor=key.name))
         if self._studio is not None:
             self._studio.look()
-        return JSONResponse(_whole(row))
+        return JSONResponse(evaluation_document(row))
 
 
 def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
@@ -108,7 +110,8 @@ def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
     return document
 
 
-def _named(request: Request) -> tuple[str, int]:
+def named(request: Request) -> tuple[str, int]:
+    """The league and the number of an evaluation that a path names. Raises InvalidReference or UnknownEvaluation."""
     league, number = check_slug("league", request.path_params["league"]), request.path_params["evaluation"]
     if not (number.isascii() and number.isdigit() and len(number) <= 10 and int(number) <= LARGEST):
         raise UnknownEvaluation(f"league {league} has no evaluation {number[:32]!r}: it is a number")
@@ -142,5 +145,6 @@ def _document(row: EvaluationRow) -> dict[str, Any]:
     } | {name: instant and instant.isoformat() for name, instant in instants.items()}
 
 
-def _whole(row: EvaluationRow) -> dict[str, Any]:
+def evaluation_document(row: EvaluationRow) -> dict[str, Any]:
+    """An evaluation as JSON, with its result."""
     return _document(row) | {"result": row.result}
