@@ -134,6 +134,15 @@ class _Stage:
             _end(self._process)
 
     def _play(self, line: str) -> Answer:
+        is_old = self._process is not None
+        try:
+            return self._try(line)
+        except WorkerLost:
+            if not is_old:
+                raise
+            return self._try(line)  # it may have died of something before, or of somebody
+
+    def _try(self, line: str) -> Answer:
         process, began = self._running(), time.monotonic()
         limit = self._seconds + self._grace
         overdue = threading.Timer(limit, process.kill)
@@ -150,7 +159,7 @@ class _Stage:
             overdue.cancel()
 
     def _running(self) -> subprocess.Popen[bytes]:
-        if self._process is None or self._process.poll() is not None:
+        if self._process is None:
             given = {"league": self._league, "seconds": self._seconds}
             self._process = start("evaluation.stage", json.dumps(given), answers=True)
             if self._is_closed:

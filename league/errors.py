@@ -18,6 +18,7 @@ LeagueError
 │   ├── UnknownAlias
 │   ├── UnknownPolicy
 │   ├── UnknownEvaluation
+│   ├── UnknownMatch
 │   ├── UnknownRun
 │   └── UnknownKey
 ├── Conflict                  the world has moved on
@@ -156,6 +157,12 @@ class UnknownEvaluation(NotFound):
     """The league has no evaluation of that number."""
 
     code = "unknown_evaluation"
+
+
+class UnknownMatch(NotFound):
+    """The league has no match, or no game of it, of that name."""
+
+    code = "unknown_match"
 
 
 class UnknownRun(NotFound):
