@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 
-from evaluation.children import start
+from evaluation import children
 from league.errors import LeagueError
 from league.registry.registry import Registry
 
@@ -107,10 +107,7 @@ class Runners:
         return asked is not None and datetime.now(UTC) - asked > GRACE
 
     def _bury(self, runner: _Runner) -> None:
-        code = runner.process.wait()
-        if runner.process.stdin is not None:
-            runner.process.stdin.close()
-        if code:
+        if code := children.bury(runner.process):
             logger.error("the process of evaluation %d ended with code %d", runner.order.evaluation, code)
         self._registry.release_evaluation(runner.order.evaluation, runner.order.runner)
 
@@ -121,4 +118,4 @@ class Runners:
             if claimed is None:
                 return
             order = Order(claimed.id, claimed.league, name, self._workers, self._address)
-            self._runners.append(_Runner(order, start("evaluation.job", json.dumps(asdict(order)))))
+            self._runners.append(_Runner(order, children.start("evaluation.job", json.dumps(asdict(order)))))

@@ -21,6 +21,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
 
+from evaluation.children import SOON, step_aside
 from evaluation.deadline import Deadline, Expired, watched
 from evaluation.film import film, render_modes
 from evaluation.player import Player
@@ -38,8 +39,6 @@ from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.settings import Storage
 
-ASIDE = 5
-"""The niceness of this process: replicas go first, and evaluations (evaluation/job.py) last."""
 JSON, GIF = "application/json", "image/gif"
 
 Answer = tuple[str, bytes]
@@ -155,7 +154,7 @@ def _json(document: Document) -> Answer:
 def main() -> None:
     """Play for the process that holds the other ends of the pipes."""
     given = json.loads(sys.argv[1])
-    os.nice(ASIDE)
+    step_aside(SOON)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what environments print goes elsewhere
     with closing(Registry.open(Storage.from_environment(), create=False)) as registry:

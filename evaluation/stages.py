@@ -16,10 +16,9 @@ import threading
 import time
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 
-from evaluation.children import start
+from evaluation import children
 from league.errors import BY_CODE, GameHung, NotReady, Overloaded, WorkerLost
 from league.games import Order
 
@@ -161,7 +160,7 @@ class _Stage:
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             given = {"league": self._league, "seconds": self._seconds}
-            self._process = start("evaluation.stage", json.dumps(given), answers=True)
+            self._process = children.start("evaluation.stage", json.dumps(given), answers=True)
             if self._is_closed:
                 _end(self._process)
         return self._process
@@ -184,11 +183,7 @@ def _talk(process: subprocess.Popen[bytes], line: str) -> Answer:
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
-    process.wait()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            with suppress(OSError):  # what was not written any more
-                pipe.close()
+    children.bury(process)
 
 
 def _size(answer: Future[Answer]) -> int:

@@ -1,5 +1,5 @@
 """The studio: a Serve deployment for what needs an environment. The service calls it by handle; it plays evaluations,
-and games for people.
+and games for people, and keeps what pages show of leagues up to date.
 
 deploy.yaml names it by import string, and the service's replicas never load it. It holds nothing that is missed: what
 evaluations were asked, and how far they are, is in the registry, and a person's game is in what that person sends. So
@@ -16,6 +16,7 @@ class Studio:
     def __init__(self, workers: int, at_once: int) -> None:
         import ray
 
+        from evaluation.keeper import Keeper
         from evaluation.runners import Runners
         from evaluation.stages import Stages
         from league.registry.registry import Registry
@@ -24,12 +25,15 @@ class Studio:
         registry = Registry.open(Storage.from_environment(), create=False)
         address = ray.get_runtime_context().gcs_address
         self._runners = Runners(registry, workers=workers, at_once=at_once, address=address)
+        self._keeper = Keeper(registry)
         self._runners.start()
+        self._keeper.start()
         self._stages = Stages()
 
     def __del__(self) -> None:
         self._stages.close()
         self._runners.close()
+        self._keeper.close()
 
     async def look(self) -> None:
         """There is an evaluation to play, or to stop. It would be found a moment later anyway."""
@@ -49,9 +53,9 @@ class Studio:
             return {"code": error.code, "message": str(error)}
 
     def check_health(self) -> None:
-        """Ray Serve replaces a studio that no longer looks after evaluations."""
-        if not self._runners.are_watched:
-            raise RuntimeError("nobody looks after evaluations")
+        """Ray Serve replaces a studio that no longer looks after evaluations or snapshots."""
+        if not (self._runners.are_watched and self._keeper.is_watching):
+            raise RuntimeError("nobody looks after evaluations, or after snapshots")
 
 
 def deployment(workers: int, at_once: int) -> Any:

@@ -561,6 +561,11 @@ class Registry:
         with self.database.read() as session:
             return snapshots.marks(session)
 
+    def stale_snapshots(self) -> list[str]:
+        """The leagues whose snapshots are not up to date, those that have waited longest first."""
+        with self.database.read() as session:
+            return snapshots.stale(session)
+
     # Training runs
 
     def begin_run(

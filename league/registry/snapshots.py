@@ -18,6 +18,10 @@ from league.registry.database import upsert
 from league.registry.tables import READY, AliasEvent, League, Match, Schedule, Snapshot, Verdict, Version
 from league.registry.verdicts import VOID
 
+SUMMARY = "summary"
+"""The part that has a league's newest mark when all parts are up to date."""
+FORMAT = 1
+"""Of the documents: with another one all are computed anew."""
 _COUNTS: dict[str, Executable] = {
     "matches": select(Match.league, func.count()).group_by(Match.league),
     "purged schedules": select(Schedule.league, func.count())
@@ -69,9 +73,18 @@ def marks(session: Session) -> dict[str, str]:
             counts[league].append(f"{name}: {' '.join(map(str, values))}")
     registered = session.execute(select(League.slug, League.config, League.interface).order_by(League.slug))
     return {
-        league: "; ".join([digest({"config": config, "interface": interface})[:12], *counts[league]])
+        league: "; ".join([str(FORMAT), digest({"config": config, "interface": interface})[:12], *counts[league]])
         for league, config, interface in registered
     }
+
+
+def stale(session: Session) -> list[str]:
+    """The leagues whose snapshots are not up to date: those without any first, then the oldest ones."""
+    found = session.execute(select(Snapshot.league, Snapshot.mark, Snapshot.at).filter_by(part=SUMMARY))
+    known = {league: (mark, at) for league, mark, at in found}
+    behind = [league for league, mark in marks(session).items() if league not in known or known[league][0] != mark]
+    never = datetime.min.replace(tzinfo=UTC)
+    return sorted(behind, key=lambda league: known[league][1] if league in known else never)
 
 
 def _row(snapshot: Snapshot) -> rows.SnapshotRow:
