@@ -2,8 +2,9 @@
 
     python -m evaluation.stage '{"league": "connect_four", "seconds": 60}'
 
-Orders come on standard input, a line of JSON each, and are answered on standard output one after another: a line of
-JSON, {"media_type", "size"} and then so many bytes, or {"code", "message"}. The process ends when its input does.
+It says {} on standard output when it is ready. Orders come on standard input, a line of JSON each, and are answered one
+after another: a line of JSON, {"media_type", "size"} and then so many bytes, or {"code", "message"}. The process ends
+when its input does.
 
 Why a process: an environment is somebody else's code. It may hang, crash the interpreter, or draw with a library that
 takes the main thread for granted; and only the main thread can be interrupted by a deadline.
@@ -158,6 +159,8 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what environments print goes elsewhere
     with closing(Registry.open(Storage.from_environment(), create=False)) as registry:
+        answers.write(b"{}\n")
+        answers.flush()
         attend(Stage(given["league"], registry), sys.stdin.buffer, answers, given["seconds"])
 
 

@@ -15,17 +15,23 @@ import subprocess
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 from evaluation import children
 from league.errors import BY_CODE, GameHung, NotReady, Overloaded, WorkerLost
 from league.games import Order
 
+T = TypeVar("T")
+
 SECONDS = 60.0
 """What one order may take: a film of hundreds of frames takes half of it."""
-GRACE = 10.0
-"""Seconds more, after which a process that has not given up by itself is ended; it may have had to start, too."""
+GRACE = 5.0
+"""Seconds more, after which a process that has not given up by itself is ended."""
+START = 60.0
+"""Seconds in which a process must be ready."""
 MOST_STAGES = 4
 """Leagues at a time; that of which nobody has asked anything for longest makes way for another."""
 MOST_WAITING = 16
@@ -142,28 +148,36 @@ class _Stage:
             return self._try(line)  # it may have died of something before, or of somebody
 
     def _try(self, line: str) -> Answer:
-        process, began = self._running(), time.monotonic()
-        limit = self._seconds + self._grace
-        overdue = threading.Timer(limit, process.kill)
-        overdue.start()
-        try:
-            return _talk(process, line)
-        except (OSError, ValueError) as error:
-            _end(process)
-            self._process = None
-            if time.monotonic() - began >= limit:
-                raise GameHung(f"a game of {self._league} hung: its process was ended after {limit:g} s") from error
-            raise WorkerLost(f"the process that plays games of {self._league} died: its log says why") from error
-        finally:
-            overdue.cancel()
-
-    def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             given = {"league": self._league, "seconds": self._seconds}
             self._process = children.start("evaluation.stage", json.dumps(given), answers=True)
             if self._is_closed:
-                _end(self._process)
-        return self._process
+                self._process.kill()
+            self._within(START, self._process, _greeted)
+        return self._within(self._seconds + self._grace, self._process, lambda process: _talk(process, line))
+
+    def _within(
+        self, seconds: float, process: subprocess.Popen[bytes], talk: Callable[[subprocess.Popen[bytes]], T]
+    ) -> T:
+        """What comes of a talk with a process, which is ended if that takes longer."""
+        began, overdue = time.monotonic(), threading.Timer(seconds, process.kill)
+        overdue.start()
+        try:
+            return talk(process)
+        except (OSError, ValueError) as error:
+            _end(process)
+            self._process = None
+            if time.monotonic() - began >= seconds:
+                raise GameHung(f"a game of {self._league} hung: its process was ended after {seconds:g} s") from error
+            raise WorkerLost(f"the process that plays games of {self._league} died: its log says why") from error
+        finally:
+            overdue.cancel()
+
+
+def _greeted(process: subprocess.Popen[bytes]) -> None:
+    """Raises ValueError if the process has died instead of saying that it is ready."""
+    assert process.stdout is not None
+    json.loads(process.stdout.readline())
 
 
 def _talk(process: subprocess.Popen[bytes], line: str) -> Answer:

@@ -158,12 +158,12 @@ def test_an_order_that_takes_long_is_asked_for_again(registry: Registry) -> None
 
 
 def test_one_that_hangs_is_given_up_and_others_are_played_meanwhile(registry: Registry) -> None:
-    with at_work(seconds=3.0) as working:
+    with at_work(seconds=4.0) as working:
 
         async def both() -> None:
             hung = asyncio.create_task(working.ask(order(sitting(0, opponent="script:random"), "hanging"), LONG))
             await working.ask(order(sitting(0)), LONG)
-            with pytest.raises(GameHung, match="a game of hanging was not at its end after 3 s"):
+            with pytest.raises(GameHung, match="a game of hanging was not at its end after 4 s"):
                 await hung
             with pytest.raises(NotReady):  # it is not kept that it hung
                 await working.ask(order(sitting(0, opponent="script:random"), "hanging"), 0.01)
@@ -172,8 +172,8 @@ def test_one_that_hangs_is_given_up_and_others_are_played_meanwhile(registry: Re
 
 
 def test_native_code_that_never_comes_back_costs_the_process(registry: Registry) -> None:
-    with at_work(seconds=2.0, grace=2.0) as working:
-        with pytest.raises(GameHung, match="its process was ended after 4 s"):
+    with at_work(seconds=4.0, grace=2.0) as working:
+        with pytest.raises(GameHung, match="its process was ended after 6 s"):
             ask(working, sitting(0, opponent="script:random"), "deaf")
         assert told(ask(working, Table(), "deaf"))["playable"]
 
@@ -208,7 +208,7 @@ def test_a_league_that_gets_another_environment_is_played_in_that_one(registry: 
 
 
 def test_leagues_make_way_for_others_but_not_in_the_middle_of_a_game(registry: Registry) -> None:
-    with at_work(most=1, seconds=2.0) as working:
+    with at_work(most=1, seconds=4.0) as working:
 
         async def ask_several() -> None:
             hung = asyncio.create_task(working.ask(order(sitting(0, opponent="script:random"), "hanging"), LONG))
