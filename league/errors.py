@@ -18,8 +18,9 @@ LeagueError
 │   ├── UnknownAlias
 │   ├── UnknownPolicy
 │   ├── UnknownEvaluation
-│   ├── UnknownMatch
 │   ├── UnknownRun
+│   ├── UnknownVerdict
+│   ├── UnknownMatch
 │   └── UnknownKey
 ├── Conflict                  the world has moved on
 │   ├── AliasMoved              a compare-and-set lost
@@ -159,16 +160,22 @@ class UnknownEvaluation(NotFound):
     code = "unknown_evaluation"
 
 
-class UnknownMatch(NotFound):
-    """The league has no match, or no game of it, of that name."""
-
-    code = "unknown_match"
-
-
 class UnknownRun(NotFound):
     """The league has no training run of that name."""
 
     code = "unknown_run"
+
+
+class UnknownVerdict(NotFound):
+    """There is no verdict of that id."""
+
+    code = "unknown_verdict"
+
+
+class UnknownMatch(NotFound):
+    """The ledger has no match of that id, or the match no such game."""
+
+    code = "unknown_match"
 
 
 class UnknownKey(NotFound):

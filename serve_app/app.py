@@ -50,11 +50,16 @@ from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventRoutes
 from serve_app.routes.games import GameRoutes
 from serve_app.routes.health import HealthRoutes
+from serve_app.routes.history import HistoryRoutes
 from serve_app.routes.leagues import LeagueRoutes
+from serve_app.routes.matches import MatchRoutes
 from serve_app.routes.metrics import MetricsRoute
 from serve_app.routes.promotion import PromotionRoutes
+from serve_app.routes.runs import RunRoutes
+from serve_app.routes.standings import StandingsRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
+from serve_app.routes.verdicts import VerdictRoutes
 from serve_app.settings import ServeSettings
 from serve_app.shadow import Shadow
 from serve_app.streams import StreamParts
@@ -181,6 +186,11 @@ class Server:
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
         leagues = LeagueRoutes(self.models)
+        standings = StandingsRoutes(self.models)
+        verdicts = VerdictRoutes(self.models)
+        matches = MatchRoutes(self.models)
+        runs = RunRoutes(self.models)
+        history = HistoryRoutes(self.models)
         promotion = PromotionRoutes(self.models, self.settings)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
@@ -195,6 +205,16 @@ class Server:
                 Route("/v1/leagues", leagues.leagues),
                 Route("/v1/leagues/{league}", leagues.league),
                 Route("/v1/leagues/{league}/versions", leagues.versions),
+                Route("/v1/leagues/{league}/standings", standings.standings),
+                Route("/v1/leagues/{league}/payoff", standings.payoff),
+                Route("/v1/leagues/{league}/ratings", standings.ratings),
+                Route("/v1/leagues/{league}/verdicts", verdicts.every),
+                Route("/v1/leagues/{league}/verdicts/{verdict}", verdicts.one),
+                Route("/v1/leagues/{league}/matches", matches.every),
+                Route("/v1/leagues/{league}/matches/{schedule}/{position}", matches.one),
+                Route("/v1/leagues/{league}/runs", runs.every),
+                Route("/v1/leagues/{league}/runs/{run}", runs.one),
+                Route("/v1/leagues/{league}/aliases/{alias}/history", history.history),
                 Route("/v1/leagues/{league}/aliases/{alias}", promotion.move, methods=["POST"]),
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
                 Route("/v1/leagues/{league}/traffic", traffic.show),

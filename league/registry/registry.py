@@ -392,20 +392,20 @@ class Registry:
             return verdicts.start(session, league, candidate, champion, schedule, settings)
 
     def close_verdict(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
-        """Record how a verdict came out; twice is once. Raises NotFound, or Conflict if it is another."""
+        """Record how a verdict came out; twice is once. Raises UnknownVerdict, or Conflict if it is another."""
         with self.database.write() as session:
             verdicts.close(session, verdict, outcome, evidence)
 
     def void_verdict(self, verdict: str, note: str) -> VerdictRow:
-        """End a verdict for a reason beside its games, or take back one that has fallen. Raises NotFound or Conflict.
+        """End a verdict for a reason beside its games, or take back one that has fallen.
 
-        Its alpha is spent. A promotion that it led to stays.
+        Its alpha is spent. A promotion that it led to stays. Raises UnknownVerdict or Conflict.
         """
         with self.database.write() as session:
             return verdicts.void(session, verdict, note)
 
     def verdict(self, verdict: str) -> VerdictRow:
-        """A verdict by its id. Raises NotFound."""
+        """A verdict by its id. Raises UnknownVerdict."""
         with self.database.read() as session:
             return verdicts.one(session, verdict)
 
@@ -421,6 +421,11 @@ class Registry:
         """
         with self.database.read() as session:
             return verdicts.newest(session, league, before, limit)
+
+    def verdict_reasons(self, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
+        """verdict → its outcome and the reason for that, as last computed, of those for which that was."""
+        with self.database.read() as session:
+            return snapshots.reasons(session, league, verdicts)
 
     def last_verdicts(self) -> dict[str, VerdictRow]:
         """league → the verdict that was closed last, of the leagues that have one."""

@@ -9,26 +9,25 @@ Nothing of a game is kept for whoever plays it: seed and actions are the game, a
 """
 
 from collections.abc import Callable
-from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import Response
 
-from league.errors import InvalidInput, NoStudio, NotFound, UnknownMatch
+from league.errors import NoStudio, UnknownMatch
 from league.games import Film, Order, Play, Recording, Sitting, Table
 from league.policies.pinning import check_eligible, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
+from serve_app import queries
 from serve_app.bodies import read_body
 from serve_app.models import Models
 from serve_app.routes.promotion import parse
 from serve_app.settings import ServeSettings
 from serve_app.studio import Answer, Studio
 
-LARGEST = 2**31 - 1
-NUMBER = 10
-"""Digits of a position, a game, or a step."""
+DIGITS = 10
+"""No number of a game has as many."""
 
 
 class GameRoutes:
@@ -42,8 +41,9 @@ class GameRoutes:
     async def recording(self, request: Request) -> Response:
         """Steps of a recorded game. Raises UnknownLeague, UnknownMatch, InvalidInput, and what the studio does."""
         match, game = _named(request)
-        query = {name: _number(request, name, least) for name, least in (("from", 0), ("to", 0), ("every", 1))}
-        asked = Recording(match=match, game=game, first=query["from"] or 0, end=query["to"], every=query["every"] or 1)
+        first, end = (queries.number(request, name, smallest=0) for name in ("from", "to"))
+        every = queries.number(request, "every")
+        asked = Recording(match=match, game=game, first=first or 0, end=end, every=every or 1)
         return _response(await self._of_match(request, match, game, asked))
 
     async def film(self, request: Request) -> Response:
@@ -74,10 +74,7 @@ class GameRoutes:
 
     async def _of_match(self, request: Request, match: str, game: int, asked: Recording | Film) -> Answer:
         def check(registry: Registry, league: str) -> Recording | Film:
-            try:
-                record = Ledger(registry).match(match)
-            except NotFound as error:
-                raise UnknownMatch(f"league {league} has no match {match}: {error}") from None
+            record = Ledger(registry).match(match)
             if record.league != league or game >= len(record.games):
                 raise UnknownMatch(f"league {league} has no game {game} of match {match}")
             return asked
@@ -107,22 +104,8 @@ def _response(answer: Answer, headers: dict[str, str] | None = None) -> Response
 
 def _named(request: Request) -> tuple[str, int]:
     """The match and the game that a path names. Raises UnknownMatch."""
-    parts: dict[str, Any] = request.path_params
-    match = f"{parts['schedule']}/{parts['position']}"
-    if not (_is_number(parts["position"]) and _is_number(parts["game"])):
-        raise UnknownMatch(f"there is no game {parts['game'][:32]!r} of match {match[:256]!r}: they are numbers")
-    return match, int(parts["game"])
-
-
-def _number(request: Request, name: str, least: int) -> int | None:
-    """A number of the query. Raises InvalidInput."""
-    text = request.query_params.get(name)
-    if text is None:
-        return None
-    if not (_is_number(text) and int(text) >= least):
-        raise InvalidInput(f"{name} must be a number from {least} to {LARGEST}, got {text[:32]!r}")
-    return int(text)
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) <= NUMBER and int(text) <= LARGEST
+    schedule, position, game = (queries.named(request, key, UnknownMatch) for key in ("schedule", "position", "game"))
+    match = f"{schedule}/{position}"
+    if not (game.isascii() and game.isdigit() and len(game) < DIGITS):
+        raise UnknownMatch(f"match {match} has no game {game[:32]!r}: it is a number")
+    return match, int(game)

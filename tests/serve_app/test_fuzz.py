@@ -33,6 +33,7 @@ from serve_app.openapi.document import document
 from serve_app.stream_framing import FRAMING, REQUEST, Framing, read_head
 from tests.serve_app.conftest import QUICK, replica
 from tests.serve_app.inference_protocol.leagues import every_kind
+from tests.serve_app.results import PENDING, SCHEDULE, WON, record
 
 load_all_checks()
 CONFORMS = CHECKS.get_by_names(
@@ -53,13 +54,19 @@ REAL = {
     "alias": ["champion", "candidate"],
     "version": ["1", "2", "champion"],
     "evaluation": [1, 2, 3],
+    "verdict": [WON, PENDING],
+    "schedule": [SCHEDULE.id],
+    "position": [0, 5],
+    "run": ["first"],
 }
 
 
 @pytest.fixture(scope="module")
 def storage_to_fuzz(tmp_path_factory: pytest.TempPathFactory) -> Storage:
     storage = Storage.at(tmp_path_factory.mktemp("fuzz"))
-    every_kind(storage).close()
+    registry = every_kind(storage)
+    record(registry)
+    registry.close()
     return storage
 
 
