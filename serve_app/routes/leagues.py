@@ -13,6 +13,7 @@ from starlette.responses import Response
 from league.refs import CHAMPION, check_slug
 from league.registry.registry import Registry
 from league.registry.rows import Acknowledgement, VersionRow
+from league.registry.snapshots import SUMMARY
 from serve_app import queries
 from serve_app.lookups import looked_up
 from serve_app.models import Models
@@ -21,7 +22,6 @@ from serve_app.routes.traffic import setting_document
 from serve_app.routes.verdicts import brief
 from serve_app.settings import ACKNOWLEDGED_WITHIN
 
-SUMMARY = "summary"
 NONE_YET = Requests()
 
 

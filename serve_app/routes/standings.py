@@ -56,16 +56,17 @@ class StandingsRoutes:
 
 def _standings(registry: Registry, league: str, side: str | None, offset: int, limit: int) -> dict[str, Any]:
     document, computed_at = _part(registry, league, "standings")
-    document = document or {"sides": list(registry.league(league).interface.sides), "standings": [], "by_side": {}}
-    if side is not None and side not in document["sides"]:
-        raise InvalidInput(f"side must be one of {', '.join(document['sides'])}, got {side!r}")
-    # Where sides are alike, nobody is ranked on each.
-    every = document["standings"] if side is None else document["by_side"].get(side, [])
+    document = document or {"standings": [], "by_side": {}}
+    sides = list(document["by_side"])
+    if side is not None and side not in sides:
+        known = f"side must be one of {', '.join(sides)}" if sides else f"no side of {league} has standings of its own"
+        raise InvalidInput(f"{known}, got {side!r}")
+    every = document["standings"] if side is None else document["by_side"][side]
     page = [{"rank": offset + place} | standing for place, standing in enumerate(every[offset : offset + limit], 1)]
     return {
         "league": league,
         "computed_at": computed_at,
-        "sides": document["sides"],
+        "sides": sides,
         "side": side,
         "standings": page,
         "total": len(every),

@@ -57,13 +57,14 @@ def brief(row: VerdictRow) -> dict[str, Any]:
         "opponent": row.champion,
         "outcome": row.outcome or OPEN,
         "promoted": bool((row.evidence or {}).get("promoted")),
+        "opened_at": row.opened_at.isoformat(),
         "closed_at": row.closed_at and row.closed_at.isoformat(),
     }
 
 
 def _listed(row: VerdictRow) -> dict[str, Any]:
     evidence = row.evidence or {}
-    return brief(row) | {"opened_at": row.opened_at.isoformat()} | {name: evidence.get(name) for name in SHOWN}
+    return brief(row) | {name: evidence.get(name) for name in SHOWN}
 
 
 def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:

@@ -194,6 +194,22 @@ def test_a_replica_that_stops_ends_its_streams(registry: Registry) -> None:
             httpx.get(f"{server.url}{LEAGUE}")
 
 
+def test_a_replica_that_stops_begins_no_stream(server: Listening) -> None:
+    server.server.events.end()
+    reply = httpx.get(f"{server.url}{LEAGUE}")
+    assert (reply.status_code, reply.json()["code"]) == (503, "not_ready")
+
+
+def test_a_registry_that_does_not_answer_is_not_waited_for(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = threading.Event()
+    monkeypatch.setattr(Registry, "pulse", lambda *_, **__: answer.wait(20))
+    with listening(registry.storage, SOON.model_copy(update={"timeout": 0.05})) as server:
+        reply = httpx.get(f"{server.url}{LEAGUE}")
+        answer.set()
+        assert (reply.status_code, reply.json()["code"]) == (504, "deadline_exceeded")
+        assert server.server.events.open == 0
+
+
 def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "SILENCE", 0.05)
     _, token = registry.create_key("page", ["read"])

@@ -2,15 +2,19 @@
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
 from starlette.testclient import TestClient
 
+from evaluation.snapshots import refresh
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.openapi.document import document
+from tests.evaluation import examples
+from tests.evaluation.pages import leagues
 from tests.serve_app.conftest import QUICK, replica
 from tests.serve_app.leagues import everything, promote
 from tests.serve_app.results import LOST, PENDING, RANKED, SCHEDULE, WON, record
@@ -98,7 +102,9 @@ def test_standings_on_one_side(reader: TestClient) -> None:
 def test_where_nothing_was_computed_there_is_nothing(reader: TestClient) -> None:
     memory = "/v1/leagues/memory"
     standings = get(reader, f"{memory}/standings", "Standings")
-    assert (standings["computed_at"], standings["standings"], standings["sides"]) == (None, [], ["agent_shared"])
+    assert (standings["computed_at"], standings["standings"], standings["sides"]) == (None, [], [])
+    refused = reader.get(f"{memory}/standings", params={"side": "agent_shared"})
+    assert "no side of memory has standings of its own" in refused.json()["message"]
     assert get(reader, f"{memory}/payoff", "PayoffTable")["payoff"] is None
     assert get(reader, f"{memory}/ratings", "Ratings")["versions"] == []
     for name, schema in (("verdicts", "Verdicts"), ("matches", "Matches"), ("runs", "Runs")):
@@ -279,3 +285,27 @@ def test_what_is_another_leagues_is_not_shown(reader: TestClient, path: str) -> 
     """A key may be for one league alone."""
     reply = reader.get(f"/v1/leagues/memory/{path}")
     assert reply.status_code == 404, reply.text
+
+
+def test_what_a_night_brings_and_the_studio_computes_of_it_is_as_described(tmp_path: Path) -> None:
+    with leagues.of_a_night(tmp_path / "home") as registry:
+        refresh(registry, examples.LEAGUE)
+        verdicts = [row.id for row in registry.verdicts(examples.LEAGUE)]
+        storage = registry.storage
+    league = f"/v1/leagues/{examples.LEAGUE}"
+    with replica(storage) as night:
+        assert get(night, league, "League")["up_to_date"]
+        assert get(night, f"{league}/standings", "Standings")["total"] > 2
+        assert get(night, f"{league}/payoff", "PayoffTable")["payoff"]["contestants"]
+        assert get(night, f"{league}/ratings", "Ratings")["versions"]
+        assert any(event["verdict"] for event in get(night, f"{league}/aliases/champion/history", "History")["history"])
+        (listed,) = pages(night, f"{league}/verdicts", "Verdicts", "verdicts")
+        assert [each["verdict"] for each in listed] == verdicts[::-1]
+        for each in listed:
+            verdict = get(night, f"{league}/verdicts/{each['verdict']}", "Verdict")
+            assert verdict["curve"]
+            assert verdict["reason"] == each["reason"]
+            assert {name: verdict[name] for name in each} == each
+        match = get(night, f"{league}/matches", "Matches", limit=1)["matches"][0]
+        games = get(night, f"{league}/matches/{match['match']}", "Match")["games"]
+        assert [list(game["sides"].values()) for game in games] == [match["contestants"], match["contestants"][::-1]]
