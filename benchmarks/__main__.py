@@ -9,6 +9,7 @@ ORDER = (
     "stepping",
     "sampling",
     "replay",
+    "phases",
     "learning",
     "maddpg",
     "parity",
