@@ -25,7 +25,7 @@ from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput
 from league.games import Sitting
 from league.interface import Interface
-from league.policies.onnx import OnnxPolicy
+from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.results.scoring import scores
 from league.spaces import ACTION_MASK, DictSpace, Discrete, Space
@@ -172,7 +172,16 @@ class _Person:
             named = ", ".join(map(str, legal[:MOST_NAMED])) + ", …" * (len(legal) > MOST_NAMED)
             raise IllegalAction(f"actions: {choice}, number {number + 1} of them, is illegal there; legal are {named}")
         actions = np.array([choice], dtype=self._space.dtype)
-        return Actions(actions) if advice is None else replace(advice, actions=actions)
+        return (
+            Actions(actions) if advice is None else replace(advice, actions=actions, state=self._after(advice, choice))
+        )
+
+    def _after(self, advice: Actions, choice: int) -> dict[str, NDArray] | None:
+        """What the adviser remembers: what it saw, and, if it remembers its last action, what was chosen instead."""
+        if advice.state is None or LAST_ACTION not in advice.state:
+            return advice.state
+        last = np.full_like(advice.state[LAST_ACTION], choice - self._space.start + 1)
+        return {**advice.state, LAST_ACTION: last}
 
     def _legal(self, mask: NDArray | None) -> tuple[int, ...]:
         if mask is None:
