@@ -435,6 +435,7 @@ def patiently(ask: Callable[[], httpx.Response]) -> httpx.Response:
     until(lambda: replies.append(ask()) or replies[-1].status_code != 503)
     assert all(reply.json()["code"] in ("not_ready", "no_studio") for reply in replies[:-1])
     assert all("retry-after" in reply.headers for reply in replies[:-1])
+    assert replies[-1].status_code == 200, replies[-1].text
     return replies[-1]
 
 
