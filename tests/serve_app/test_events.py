@@ -225,6 +225,15 @@ def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.Monk
             assert stranger.reply.status_code == 401
 
 
+def test_a_stream_without_a_key_ends_when_there_is_one(
+    server: Listening, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "SILENCE", 0.05)
+    with listener(server) as heard:
+        registry.create_key("first", ["read"])
+        until(lambda: heard.is_over)
+
+
 def test_a_database_that_is_gone_for_a_while_ends_no_stream(
     server: Listening, registry: Registry, caplog: pytest.LogCaptureFixture
 ) -> None:
