@@ -49,6 +49,7 @@ from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.metrics import MetricsRoute
+from serve_app.routes.pages import PageRoutes
 from serve_app.routes.promotion import PromotionRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
@@ -191,6 +192,7 @@ class Server:
                 Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.one),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
+                *PageRoutes().routes(),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),
