@@ -8,6 +8,8 @@ import { Dialog, Form, Notifications, sentence } from "./parts.js";
 import { followLinks, matched, useAddress } from "./router.js";
 
 const THEMES = ["system", "light", "dark"];
+/** Of the circle, what is dark. */
+const SHAPES = { system: "M8 1.5a6.5 6.5 0 0 1 0 13z", light: "", dark: "M8 1.5a6.5 6.5 0 0 1 0 13a6.5 6.5 0 0 1 0-13z" };
 const ROUTES = [["/", "leagues"], ["/leagues", "leagues"]];
 
 function App() {
@@ -60,10 +62,11 @@ function KeyDialog({ why, close }) {
   <//>`;
 }
 
+/** Which colours: the system's, light, dark, and round again. */
 function Theme() {
   const [theme, setTheme] = useState(() => document.documentElement.dataset.theme ?? "system");
-  const choose = (event) => {
-    const chosen = event.target.value;
+  const turn = () => {
+    const chosen = THEMES[(THEMES.indexOf(theme) + 1) % THEMES.length];
     setTheme(chosen);
     if (chosen === "system") {
       delete document.documentElement.dataset.theme;
@@ -74,9 +77,8 @@ function Theme() {
     }
     dispatchEvent(new Event("league:theme"));
   };
-  return html`<label class="theme"><span class="unseen">Colours</span>
-    <select value=${theme} onChange=${choose}>${THEMES.map((name) => html`<option value=${name}>${name[0].toUpperCase() + name.slice(1)}</option>`)}</select>
-  </label>`;
+  return html`<button type="button" class="quiet theme" onClick=${turn} title="Colours: ${theme}" aria-label="Colours: ${theme}">
+    <svg viewBox="0 0 16 16" width="16" height="16" aria-hidden="true"><circle cx="8" cy="8" r="6.5" /><path d=${SHAPES[theme]} /></svg></button>`;
 }
 
 followLinks();

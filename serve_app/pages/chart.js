@@ -4,6 +4,8 @@ import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { short } from "./words.js";
 
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3], [4, 2], [12, 4]];
+/** With the six colours these tell 36 lines apart. */
+const dashOf = (number) => DASHES[(number + Math.floor(number / 6)) % 6];
 const FONT = "12px system-ui, sans-serif";
 
 /**
@@ -44,7 +46,7 @@ export function Chart({ label, x, lines, levels = [], spans, stars, xName, yName
   return html`<figure class="chart">
     <div class="plot" style=${{ minHeight: `${height}px` }} ref=${place} role="img" aria-label=${label}></div>
     <figcaption><ul class="legend">${lines.map((line, number) => html`<li>
-      <svg viewBox="0 0 26 8" width="26" height="8" aria-hidden="true"><line class="line c${number % 6}" x1="0" x2="26" y1="4" y2="4" stroke-dasharray=${DASHES[number % 6].join(" ")} /></svg>
+      <svg viewBox="0 0 26 8" width="26" height="8" aria-hidden="true"><line class="line c${number % 6}" x1="0" x2="26" y1="4" y2="4" stroke-dasharray=${dashOf(number).join(" ")} /></svg>
       ${line.name} <span class="value">${words(line.values[at ?? last(line.values)])}</span></li>`)}
       <li class="soft place">${at != null && `${xName} ${short(x[at])}`}</li></ul></figcaption>
   </figure>`;
@@ -112,7 +114,7 @@ function optionsOf({ look, latest, xName, yName, height, words, width, moved }) 
       stroke: look[`c${number % 6}`],
       width: line.faint ? 1 : 1.75,
       alpha: line.faint ? 0.6 : 1,
-      dash: DASHES[number % 6],
+      dash: dashOf(number),
       spanGaps: true,
       points: { show: line.dots ?? line.values.length < 2, size: 7, fill: look.paper },
     }))],

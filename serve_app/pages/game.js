@@ -23,17 +23,17 @@ export function Game({ league, schedule, position, game }) {
   </section>`;
 }
 
-/** The steps of a game as far as they were fetched, in pages: [show, fault, wants(place)]. */
+/** The steps of a game as far as they were fetched, in pages: [show, fault, wants(step)]. */
 function useSteps(path) {
   const [show, setShow] = useState(null);
   const [fault, setFault] = useState(null);
   const asked = useRef(new Set());
-  const wants = (place = 0) => {
-    const from = place - (place % PAGE);
+  const wants = (step = 0) => {
+    const from = step - (step % PAGE);
     if (asked.current.has(from)) return;
     asked.current.add(from);
     ask(query(path, { from: String(from), to: from + PAGE })).then(
-      (found) => { setFault(null); setShow((was) => ({ ...found, steps: { ...was?.steps, ...byPlace(found, from) } })); },
+      (found) => { setFault(null); setShow((was) => ({ ...found, steps: { ...was?.steps, ...byNumber(found.steps) } })); },
       (error) => { asked.current.delete(from); setFault(error); },
     );
   };
@@ -41,12 +41,11 @@ function useSteps(path) {
   return [show, fault, wants];
 }
 
-/** Place → step: steps are numbered as they were played, and of long games not all are kept. */
-const byPlace = ({ steps }, from) => Object.fromEntries(steps.map((step, at) => [from + at, step]));
+const byNumber = (steps) => Object.fromEntries(steps.map((step) => [step.step, step]));
 
 function Player({ show, wants }) {
   const { fragment } = useAddress();
-  const last = placesOf(show) - 1;
+  const last = show.length;
   const [at, setAt] = useState(() => Math.min(last, Math.max(0, Number(fragment) || 0)));
   const [isPlaying, setIsPlaying] = useState(false);
   const [speed, setSpeed] = useState(1);
@@ -74,11 +73,11 @@ function Player({ show, wants }) {
         <label class="inline">Speed <select value=${speed} onChange=${(event) => setSpeed(Number(event.target.value))}>${SPEEDS.map((each) => html`<option value=${each}>${each} ×</option>`)}</select></label>
       </div>
       <label class="seek"><span class="unseen">Step</span>
-        <input type="range" min="0" max=${last} value=${at} aria-valuetext="step ${step?.step ?? at}: ${did(step)}" onInput=${(event) => move(Number(event.target.value))} />
-        <output>${step?.step ?? "…"} of ${show.length}</output></label>
+        <input type="range" min="0" max=${last} value=${at} aria-valuetext="step ${at}: ${did(step)}" onInput=${(event) => move(Number(event.target.value))} />
+        <output>${at} of ${last}</output></label>
     </div>
     <div class="told" aria-live=${isPlaying ? "off" : "polite"}>
-      <h3>${step ? (step.step === 0 ? "Start" : `Step ${step.step}`) : "Loading …"}${at === last ? " · end" : ""}</h3>
+      <h3>${step ? (at === 0 ? "Start" : `Step ${at}`) : "Loading …"}${at === last ? " · end" : ""}</h3>
       <${Moves} of=${step} />
       <${Cast} of=${show} isOver=${at === last} />
       <p class="soft small keys"><kbd>Space</kbd> plays, <kbd>←</kbd> <kbd>→</kbd> step, <kbd>Home</kbd> <kbd>End</kbd>, <kbd>+</kbd> <kbd>−</kbd> speed.</p>
@@ -90,8 +89,6 @@ function Icon({ of }) {
   return html`<svg viewBox="0 0 14 14" width="14" height="14" aria-hidden="true"><path d=${of} /></svg>`;
 }
 
-const placesOf = (show) => Math.max(1, Math.floor(show.length / (show.every || 1)) + 1 + (show.length % (show.every || 1) ? 1 : 0));
-
 function faster(speed, by) {
   return SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, SPEEDS.indexOf(speed) + by))];
 }
@@ -99,9 +96,9 @@ function faster(speed, by) {
 function Cast({ of: { cast, returns, forfeits }, isOver }) {
   const agents = Object.entries(cast);
   if (agents.length > 8) return html`<p class="soft">${several(agents.length, "agent")}: ${[...new Set(Object.values(cast))].join(", ")}.</p>`;
-  const forfeited = Array.isArray(forfeits) ? forfeits.map((each) => each.ref ?? each) : Object.keys(forfeits ?? {});
   return html`<${Facts} of=${agents.map(([agent, ref]) => [agent, html`<span class="ref">${ref}</span>
-    ${isOver && html` <small>return ${number(returns?.[agent], 2)}${forfeited.includes(ref) ? ", by forfeit" : ""}</small>`}`, "name"])} />`;
+      ${isOver && html`<small>return ${number(returns[agent])}</small>`}`, "name"])} />
+    ${isOver && forfeits.map((each) => html`<p>${each.ref} forfeited the game as ${each.agent}: ${each.reason}.</p>`)}`;
 }
 
 /** Keys of the page, but for what is typed into a field. */

@@ -43,7 +43,7 @@ function Then({ league, alias }) {
   const isInstant = instant && !Number.isNaN(instant.getTime());
   const path = isInstant ? query(of(league, "aliases", alias, "history"), { at: instant.toISOString() }) : null;
   const found = useData(path);
-  const event = found.data && (found.data.history ?? found.data.events ?? [])[0];
+  const event = found.data && found.data.history[0];
   return html`<form class="then" onSubmit=${(submitted) => submitted.preventDefault()}>
     <label class="inline">Who was ${alias} at <input type="datetime-local" value=${asked} onInput=${(typed) => setAsked(typed.target.value)} />?</label>
     <p role="status">${found.fault ? found.fault.message : found.data && (event

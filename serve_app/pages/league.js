@@ -1,6 +1,6 @@
 // A league: what is always said of it, and below that one of its pages.
 
-import { html, useState } from "./vendor/preact-htm.js";
+import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { of } from "./api.js";
 import { Marks, useData, useEvents } from "./data.js";
 import { Evaluation } from "./evaluation.js";
@@ -74,15 +74,24 @@ function Known({ league, route, names }) {
       ${about.data && html`<${Flags} of=${about.data} />`}
       ${about.data && html`<${Promotions} league=${league} champion=${about.data.champion} />`}
     </div>
-    <${Await} of=${about}>${about.data && html`<${Summary} of=${about.data} />`}<//>
-    <nav class="tabs" aria-label="Pages of ${league}"><ul>${TABS.map(([name, path]) => html`
-      <li><a href=${path ? at(league, path) : at(league)} aria-current=${path === route.tab ? (route.page === tabPage(path) ? "page" : "true") : null}>${name}</a></li>`)}
-    </ul></nav>
+    <${Await} of=${about}>${about.data && html`<${Summary} of=${about.data} isFirst=${route.tab === ""} />`}<//>
+    <${Tabs} league=${league} route=${route} />
     ${about.data && html`<${Page} key=${JSON.stringify(names)} ...${names} about=${about.data} />`}
   <//>`;
 }
 
-const tabPage = (tab) => TABS.find(([, path]) => path === tab)[2];
+function Tabs({ league, route }) {
+  const nav = useRef();
+  useEffect(() => {
+    // On a phone they do not all fit: the present one is to be seen.
+    const shown = nav.current.querySelector("[aria-current]");
+    nav.current.scrollLeft = shown.offsetLeft - (nav.current.clientWidth - shown.clientWidth) / 2;
+  }, [route.tab]);
+  return html`<nav class="tabs" ref=${nav} aria-label="Pages of ${league}"><ul>${TABS.map(([name, path, page]) => {
+    const current = page === route.page ? "page" : "true"; // this page, or one below it
+    return html`<li><a href=${path ? at(league, path) : at(league)} aria-current=${path === route.tab ? current : null}>${name}</a></li>`;
+  })}</ul></nav>`;
+}
 
 /** What is tried on real requests just now. */
 function Flags({ of: { league, traffic } }) {
@@ -91,7 +100,7 @@ function Flags({ of: { league, traffic } }) {
     <${Badge} tone="accent">${what} ${String(traffic[what].version)}<//></a>`)}</p>`;
 }
 
-function Summary({ of: about }) {
+function Summary({ of: about, isFirst }) {
   const { league, summary } = about;
   const faults = about.faults ?? [];
   return html`
@@ -102,7 +111,7 @@ function Summary({ of: about }) {
       ["Different ones", count(summary?.distinct_games)],
       about.requests_per_second != null && ["Requests/s", rate(about.requests_per_second)],
       ["Standings of", html`<${When} at=${about.computed_at} />`],
-    ]} />
+    ]} cls=${isFirst ? "" : "aside"} />
     ${faults.length > 0 && html`<div class="notice bad" role="alert"><p><strong>A replica does not serve what it should.</strong></p>
       <ul>${faults.map((fault) => html`<li>${fault}</li>`)}</ul></div>`}`;
 }

@@ -26,15 +26,13 @@ export function Match({ league, schedule, position }) {
 
 function Games({ league, of: match, schedule, position }) {
   const sides = Object.keys(match.games[0]?.sides ?? {});
-  return html`<${Table} caption="Games" head=${[["Game"], ...sides.map((side) => [side]), ["Scores"], ["Returns"], ["Steps", "number"], ["Forfeited by"]]} cls="full">
+  return html`<${Table} caption="Games" head=${[["Game"], ...sides.map((side) => [side]), ["Scores"], ["Returns"], ["Actions", "number"], ["Forfeited by"]]} cls="full">
     ${match.games.map((game) => html`<tr key=${game.game}>
       <th scope="row"><a href=${at(league, "matches", schedule, position, game.game)}>Watch ${game.game}</a></th>
       ${sides.map((side) => html`<td><span class="ref">${tail(game.sides[side])}</span></td>`)}
-      <td class="nowrap">${numbers(game.scores)}</td><td class="nowrap">${numbers(game.returns)}</td><td class="number">${count(game.steps)}</td>
-      <td>${forfeits(game.forfeits) || html`<span class="soft">–</span>`}</td></tr>`)}
+      <td class="nowrap">${numbers(game.scores)}</td><td class="nowrap">${numbers(game.returns)}</td><td class="number">${count(game.actions)}</td>
+      <td class="words">${game.forfeits.map((each) => `${tail(each.ref)}: ${each.reason}`).join("; ") || html`<span class="soft">–</span>`}</td></tr>`)}
   <//>`;
 }
 
-const numbers = (values) => (Array.isArray(values) ? values : Object.values(values ?? {})).map((value) => number(value, 1)).join(" : ") || "–";
-
-const forfeits = (value) => (Array.isArray(value) ? value : Object.keys(value ?? {})).map((each) => tail(each.ref ?? each)).join(", ");
+const numbers = (values) => values?.map((value) => number(value, 1)).join(" : ") || "–";

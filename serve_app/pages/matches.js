@@ -31,7 +31,7 @@ function Row({ league, of: match }) {
     <th scope="row"><a href=${at(league, "matches", match.schedule, match.position)} aria-label="Match ${match.position} of ${match.schedule}">#${match.position}</a></th>
     <td>${match.contestants.map((ref, place) => html`${place > 0 && html`<span class="soft"> · </span>`}<span class="ref">${tail(ref)}</span>`)}</td>
     <td class="nowrap">${match.scores.map((score) => number(score, 1)).join(" : ")}</td>
-    <td class="number">${count(typeof match.games === "number" ? match.games : match.games.length)}</td>
+    <td class="number">${count(match.games)}</td>
     <td>${match.kind}</td>
     <td class="nowrap"><${When} at=${match.played_at} /></td>
   </tr>`;

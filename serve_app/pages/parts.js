@@ -6,10 +6,10 @@ import { useTicks } from "./data.js";
 
 export const league = (name, ...parts) => ["/leagues", name, ...parts].map((part, at) => (at ? encodeURIComponent(part) : part)).join("/");
 
-/** The page's title, for the tab and for who listens. */
-export function useTitle(...parts) {
-  const title = [...parts.filter(Boolean), "Policy League"].join(" · ");
-  useEffect(() => { document.title = title; }, [title]);
+/** The page's title, for the tab and for who listens; without a `name` it stays. */
+export function useTitle(name, ...parts) {
+  const title = name && [name, ...parts, "Policy League"].join(" · ");
+  useEffect(() => { if (title) document.title = title; }, [title]);
 }
 
 /** What is shown while data comes, or instead of it. */
@@ -79,9 +79,9 @@ export function More({ of }) {
   return of.more && html`<p class="more"><button type="button" onClick=${of.more}>Show more</button></p>`;
 }
 
-export function Facts({ of }) {
-  return html`<dl class="facts">${of.filter(Boolean).map(([name, value, cls]) =>
-    html`<div class=${cls ?? ""}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl>`;
+export function Facts({ of, cls = "" }) {
+  return html`<dl class="facts ${cls}">${of.filter(Boolean).map(([name, value, kind]) =>
+    html`<div class=${kind ?? ""}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl>`;
 }
 
 /** A modal dialog; `onClose` when it was closed in any way. */

@@ -45,7 +45,7 @@ export function Promote({ league, champion, version = null, onClose }) {
 
 function RollBack({ league, champion, onClose }) {
   const history = useData(of(league, "aliases", "champion", "history") + "?limit=1", useMark("event"));
-  const last = history.data && events(history.data)[0];
+  const last = history.data && history.data.history[0];
   const submit = async (fields) => {
     const event = await ask(of(league, "rollback"), { method: "POST", body: { reason: fields.get("reason") } });
     notify(`${league}@${event.version} is the champion again.`);
@@ -63,8 +63,6 @@ function RollBack({ league, champion, onClose }) {
     <//>
   <//>`;
 }
-
-const events = (page) => page.history ?? page.events;
 
 function Reason() {
   return html`<label class="field">Reason

@@ -36,7 +36,7 @@ function Board({ league, rows, champion, computed }) {
     ["Score", "number"], hasReturn && ["Mean return", "number"], ["Games", "number"]].filter(Boolean);
   return html`<${Table} caption="Standings" head=${head} cls="full standings">
     ${rows.map((row, place) => html`<tr key=${row.ref} class=${row.ref === `${league}@${champion}` ? "leads" : ""}>
-      <td class="number soft">${place + 1}</td>
+      <td class="number soft">${row.rank ?? place + 1}</td>
       <th scope="row"><${Ref} of=${row.ref} champion=${champion} /></th>
       <td class="number strong">${signed(row.rating)}</td>
       <td class="nowrap soft">${interval(row.interval)}</td>
