@@ -192,12 +192,12 @@ class Server:
                 Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.one),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
-                *PageRoutes().routes(),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
+                *PageRoutes().routes(),
             ],
             middleware=[
                 Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log),
