@@ -17,7 +17,7 @@ from tests.evaluation.pages.leagues import HOSTILE, of_a_night
 CONFIGS = Path(__file__).parents[2] / "configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
 RUN = "ppo-17"
-KEYS = {"everything": ["act", "read", "evaluate", "promote"], HOSTILE: ["evaluate", "read"], "reader": ["read"]}
+KEYS = {"everything": ["act", "read", "evaluate", "promote"], "evaluator": ["evaluate", "read"], "reader": ["read"]}
 
 
 @contextmanager
