@@ -1,4 +1,5 @@
-"""The studio: a Serve deployment for what needs an environment. The service calls it by handle; it plays evaluations.
+"""The studio: a Serve deployment for what needs an environment. The service calls it by handle; it plays evaluations
+and keeps what pages show of leagues up to date.
 
 deploy.yaml names it by import string, and the service's replicas never load it. It holds nothing: what was asked, and
 how far it is, is in the registry, so that it may die and be started again at any time.
@@ -13,6 +14,7 @@ class Studio:
     def __init__(self, workers: int, at_once: int) -> None:
         import ray
 
+        from evaluation.keeper import Keeper
         from evaluation.runners import Runners
         from league.registry.registry import Registry
         from league.settings import Storage
@@ -20,19 +22,22 @@ class Studio:
         registry = Registry.open(Storage.from_environment(), create=False)
         address = ray.get_runtime_context().gcs_address
         self._runners = Runners(registry, workers=workers, at_once=at_once, address=address)
+        self._keeper = Keeper(registry)
         self._runners.start()
+        self._keeper.start()
 
     def __del__(self) -> None:
         self._runners.close()
+        self._keeper.close()
 
     async def look(self) -> None:
         """There is an evaluation to play, or to stop. It would be found a moment later anyway."""
         self._runners.look()
 
     def check_health(self) -> None:
-        """Ray Serve replaces a studio that no longer looks after evaluations."""
-        if not self._runners.are_watched:
-            raise RuntimeError("nobody looks after evaluations")
+        """Ray Serve replaces a studio that no longer looks after evaluations or snapshots."""
+        if not (self._runners.are_watched and self._keeper.is_watching):
+            raise RuntimeError("nobody looks after evaluations, or after snapshots")
 
 
 def deployment(workers: int, at_once: int) -> Any:

@@ -18,6 +18,7 @@ LeagueError
 │   ├── UnknownAlias
 │   ├── UnknownPolicy
 │   ├── UnknownEvaluation
+│   ├── UnknownRun
 │   └── UnknownKey
 ├── Conflict                  the world has moved on
 │   ├── AliasMoved              a compare-and-set lost
@@ -155,6 +156,12 @@ class UnknownEvaluation(NotFound):
     """The league has no evaluation of that number."""
 
     code = "unknown_evaluation"
+
+
+class UnknownRun(NotFound):
+    """The league has no training run of that name."""
+
+    code = "unknown_run"
 
 
 class UnknownKey(NotFound):

@@ -5,10 +5,10 @@ else is ever changed.
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select, tuple_
 from sqlalchemy.orm import Session
 
-from league.errors import Conflict, NotFound
+from league.errors import Conflict, InvalidInput, NotFound
 from league.registry import leagues, rows, versions
 from league.registry.database import insert
 from league.registry.tables import AliasEvent, Verdict
@@ -81,6 +81,29 @@ def every(session: Session, league: str) -> list[rows.VerdictRow]:
     leagues.require(session, league)
     query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at, Verdict.id)
     return [_row(verdict) for verdict in session.scalars(query)]
+
+
+def newest(session: Session, league: str, before: str | None, limit: int) -> list[rows.VerdictRow]:
+    """Those of a league, newest first, at most `limit`, of those opened before `before`.
+
+    Raises UnknownLeague, or InvalidInput if `before` is none of them.
+    """
+    leagues.require(session, league)
+    query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at.desc(), Verdict.id.desc()).limit(limit)
+    if before is not None:
+        last = session.get(Verdict, before)
+        if last is None or last.league != league:
+            raise InvalidInput(f"before: league {league} has no verdict {before!r}")
+        query = query.where(tuple_(Verdict.opened_at, Verdict.id) < (last.opened_at, last.id))
+    return [_row(verdict) for verdict in session.scalars(query)]
+
+
+def last_closed(session: Session) -> dict[str, rows.VerdictRow]:
+    """league → the verdict that was closed last, of the leagues that have one."""
+    closed = select(Verdict).where(Verdict.closed_at.is_not(None)).order_by(Verdict.closed_at, Verdict.id)
+    latest = select(Verdict.league, func.max(Verdict.closed_at).label("at")).group_by(Verdict.league).subquery()
+    of_latest = (Verdict.league == latest.c.league) & (Verdict.closed_at == latest.c.at)
+    return {verdict.league: _row(verdict) for verdict in session.scalars(closed.join(latest, of_latest))}
 
 
 def _row(verdict: Verdict) -> rows.VerdictRow:
