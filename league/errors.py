@@ -19,6 +19,8 @@ LeagueError
 │   ├── UnknownPolicy
 │   ├── UnknownEvaluation
 │   ├── UnknownRun
+│   ├── UnknownVerdict
+│   ├── UnknownMatch
 │   └── UnknownKey
 ├── Conflict                  the world has moved on
 │   ├── AliasMoved              a compare-and-set lost
@@ -162,6 +164,18 @@ class UnknownRun(NotFound):
     """The league has no training run of that name."""
 
     code = "unknown_run"
+
+
+class UnknownVerdict(NotFound):
+    """There is no verdict of that id."""
+
+    code = "unknown_verdict"
+
+
+class UnknownMatch(NotFound):
+    """The ledger has no match of that id."""
+
+    code = "unknown_match"
 
 
 class UnknownKey(NotFound):

@@ -47,6 +47,12 @@ class UnsupportedMediaType(InvalidInput):
     code = "unsupported_media_type"
 
 
+class CrossSite(Forbidden):
+    """A request that a page of another site made."""
+
+    code = "cross_site"
+
+
 class BodyTooSlow(LeagueError):
     """A body that has not arrived in time."""
 

@@ -25,6 +25,8 @@ class ServeSettings(BaseModel):
     """Requests for actions that a replica has begun and not yet answered; beyond them it answers 429."""
     max_streams: int = Field(default=1024, ge=1)
     """Streams open in a replica; one more is refused with 429."""
+    max_listeners: int = Field(default=200, ge=1)
+    """Streams of events open in a replica; one more is refused with 429."""
     max_batch: int = Field(default=1024, ge=1)
     """Most observations in one request."""
     timeout: float = Field(default=4.5, gt=0)
@@ -53,6 +55,8 @@ class ServeSettings(BaseModel):
     within a second, as promised, if poll ≤ 0.5."""
     poll_slowest: float = Field(default=5.0, gt=0)
     """The longest pause between looks while the database fails; pauses double up to it. At least `poll`."""
+    poll_events: float = Field(default=0.5, gt=0)
+    """Between two looks at what streams of events tell of; nobody looks while none is open."""
     heartbeat: float = Field(default=4.0, gt=0)
     """Between two acknowledgements of the same. At most a third of ACKNOWLEDGED_WITHIN: two may get lost."""
     retry: float = Field(default=3.0, gt=0)

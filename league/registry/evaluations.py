@@ -78,6 +78,12 @@ def newest(session: Session, league: str, before: int | None, limit: int) -> lis
     return [row(evaluation) for evaluation in session.scalars(query)]
 
 
+def active(session: Session, league: str) -> tuple[EvaluationRow, ...]:
+    """Those of a league that are queued or running, oldest first."""
+    query = select(Evaluation).where(Evaluation.state.in_((QUEUED, RUNNING)), Evaluation.league == league)
+    return tuple(row(evaluation) for evaluation in session.scalars(query.order_by(Evaluation.id)))
+
+
 def counts(session: Session) -> dict[str, dict[str, int]]:
     """league → how many are queued and running, of the leagues that have any."""
     query = select(Evaluation.league, Evaluation.state, func.count()).where(Evaluation.state.in_((QUEUED, RUNNING)))

@@ -20,6 +20,7 @@ from league.registry import (
     leagues,
     nights,
     publishing,
+    pulse,
     reports,
     runs,
     shadows,
@@ -43,6 +44,7 @@ from league.registry.rows import (
     LeagueRow,
     NightRow,
     Portion,
+    Pulse,
     RunPoint,
     RunRow,
     RunState,
@@ -96,6 +98,14 @@ class Registry:
         """One league. Raises UnknownLeague."""
         with self.database.read() as session:
             return leagues.get(session, slug)
+
+    def pulse(self, league: str, since: timedelta = timedelta(seconds=15)) -> Pulse:
+        """Where a league stands: another, if anything of it is. Raises UnknownLeague.
+
+        since: for how long a replica that serves it may have been silent.
+        """
+        with self.database.read() as session:
+            return pulse.take(session, league, since)
 
     # Versions
 
@@ -382,20 +392,20 @@ class Registry:
             return verdicts.start(session, league, candidate, champion, schedule, settings)
 
     def close_verdict(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
-        """Record how a verdict came out; twice is once. Raises NotFound, or Conflict if it is another."""
+        """Record how a verdict came out; twice is once. Raises UnknownVerdict, or Conflict if it is another."""
         with self.database.write() as session:
             verdicts.close(session, verdict, outcome, evidence)
 
     def void_verdict(self, verdict: str, note: str) -> VerdictRow:
-        """End a verdict for a reason beside its games, or take back one that has fallen. Raises NotFound or Conflict.
+        """End a verdict for a reason beside its games, or take back one that has fallen.
 
-        Its alpha is spent. A promotion that it led to stays.
+        Its alpha is spent. A promotion that it led to stays. Raises UnknownVerdict or Conflict.
         """
         with self.database.write() as session:
             return verdicts.void(session, verdict, note)
 
     def verdict(self, verdict: str) -> VerdictRow:
-        """A verdict by its id. Raises NotFound."""
+        """A verdict by its id. Raises UnknownVerdict."""
         with self.database.read() as session:
             return verdicts.one(session, verdict)
 
@@ -411,6 +421,11 @@ class Registry:
         """
         with self.database.read() as session:
             return verdicts.newest(session, league, before, limit)
+
+    def verdict_reasons(self, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
+        """verdict → its outcome and the reason for that, as last computed, of those for which that was."""
+        with self.database.read() as session:
+            return snapshots.reasons(session, league, verdicts)
 
     def last_verdicts(self) -> dict[str, VerdictRow]:
         """league → the verdict that was closed last, of the leagues that have one."""

@@ -279,3 +279,31 @@ class RunPoint:
     steps: int
     curves: dict[str, float]
     at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """Where a league stands, in a few numbers: one of them is another whenever something of the league is."""
+
+    league: str
+    aliases: dict[str, int]
+    event: int | None
+    """The newest movement of an alias."""
+    version: int | None
+    """The newest."""
+    traffic: int | None
+    """The setting of canary and shadow."""
+    serving: dict[int, int]
+    """version → how many replicas it is the champion of."""
+    verdicts: dict[str, int]
+    """outcome, or `open` → how many."""
+    evaluation: int | None
+    """The newest."""
+    evaluations: tuple[EvaluationRow, ...]
+    """Those that are queued or running."""
+    run: str | None
+    """The newest training run."""
+    runs: tuple[RunRow, ...]
+    """Those that nobody has ended."""
+    computed_at: datetime | None
+    """When the newest of its snapshots was computed."""

@@ -93,6 +93,12 @@ def newest(session: Session, league: str, before: str | None, limit: int) -> lis
     return [_row(row) for row in session.scalars(query)]
 
 
+def active(session: Session, league: str) -> tuple[rows.RunRow, ...]:
+    """Those of a league that nobody has ended, oldest first."""
+    query = select(Run).filter_by(league=league, state=RUNNING).order_by(Run.began_at, Run.id)
+    return tuple(_row(row) for row in session.scalars(query))
+
+
 def counts(session: Session) -> dict[str, int]:
     """league → runs that are on, of the leagues that have any."""
     alive = (Run.state == RUNNING) & (Run.heartbeat_at >= datetime.now(UTC) - SILENT)

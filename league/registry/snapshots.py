@@ -4,7 +4,7 @@ A league's mark is another as soon as anything is that its standings, ratings or
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -49,6 +49,14 @@ def of_part(session: Session, part: str) -> dict[str, rows.SnapshotRow]:
     """league → the same part, of all leagues that have it."""
     found = session.scalars(select(Snapshot).filter_by(part=part).order_by(Snapshot.league))
     return {snapshot.league: _row(snapshot) for snapshot in found}
+
+
+def reasons(session: Session, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
+    """verdict → outcome and reason in its judgement, of those that have one. The rest, which is long, is not read."""
+    parts = {f"verdict/{verdict}": verdict for verdict in verdicts}
+    told = (Snapshot.document[name].as_string() for name in ("outcome", "reason"))
+    found = session.execute(select(Snapshot.part, *told).where(Snapshot.league == league, Snapshot.part.in_(parts)))
+    return {parts[part]: (outcome, reason) for part, outcome, reason in found}
 
 
 def computed_from(session: Session, league: str) -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import func, select, tuple_
 from sqlalchemy.orm import Session
 
-from league.errors import Conflict, InvalidInput, NotFound
+from league.errors import Conflict, InvalidInput, UnknownVerdict
 from league.registry import leagues, rows, versions
 from league.registry.database import insert
 from league.registry.tables import AliasEvent, Verdict
@@ -31,10 +31,10 @@ def start(
 
 
 def close(session: Session, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
-    """Record how it came out; twice is once. Raises NotFound, or Conflict if it came out otherwise before."""
+    """Record how it came out; twice is once. Raises UnknownVerdict, or Conflict if it came out otherwise before."""
     row = session.get(Verdict, verdict, with_for_update=True)
     if row is None:
-        raise NotFound(f"there is no verdict {verdict!r}")
+        raise UnknownVerdict(f"there is no verdict {verdict!r}")
     if row.outcome is not None:
         if row.outcome != outcome:
             raise Conflict(f"verdict {verdict} is {row.outcome!r} already, it cannot become {outcome!r}")
@@ -46,11 +46,11 @@ def void(session: Session, verdict: str, note: str) -> rows.VerdictRow:
     """End a verdict for a reason beside its games, or take back one that has fallen; twice is once.
 
     What it has shown stays in its evidence, and its alpha is spent. A promotion that it led to is not undone.
-    Raises NotFound, or Conflict for one whose promotion is just being applied.
+    Raises UnknownVerdict, or Conflict for one whose promotion is just being applied.
     """
     row = session.get(Verdict, verdict, with_for_update=True)
     if row is None:
-        raise NotFound(f"there is no verdict {verdict!r}")
+        raise UnknownVerdict(f"there is no verdict {verdict!r}")
     if row.outcome is None:
         leagues.lock(session, row.league)
         if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
@@ -69,10 +69,10 @@ def require_open(session: Session, verdict: str) -> None:
 
 
 def one(session: Session, verdict: str) -> rows.VerdictRow:
-    """A verdict by its id. Raises NotFound."""
+    """A verdict by its id. Raises UnknownVerdict."""
     row = session.get(Verdict, verdict)
     if row is None:
-        raise NotFound(f"there is no verdict {verdict!r}")
+        raise UnknownVerdict(f"there is no verdict {verdict!r}")
     return _row(row)
 
 

@@ -7,7 +7,7 @@ from typing import Any, TypeVarTuple
 from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
-from league.errors import InvalidInput, NotFound
+from league.errors import InvalidInput, NotFound, UnknownMatch
 from league.registry import leagues, tables
 from league.registry.database import insert
 from league.registry.registry import Registry
@@ -107,14 +107,13 @@ class Ledger:
             last = found[-1].position
 
     def match(self, match: str) -> Match:
-        """One match by its id. Raises NotFound."""
+        """One match by its id. Raises UnknownMatch."""
         name, position = _place(match)
         with self._database.read() as session:
-            schedule = _schedule(session, name)
             moves = session.scalar(select(tables.Match.moves).filter_by(schedule=name, position=position))
             if moves is None:
                 raise _no_match(match)
-            return schedule.match(position, load_games(moves))
+            return _schedule(session, name).match(position, load_games(moves))
 
     def page(
         self, league: str, *, contestants: tuple[str, str] | None = None, before: str | None = None, limit: int = 20
@@ -137,7 +136,7 @@ class Ledger:
             return _entries(session, union_all(*(select(part.subquery()) for part in parts)).subquery(), limit)
 
     def entry(self, match: str) -> Entry:
-        """A match by its id, without its moves. Raises NotFound."""
+        """A match by its id, without its moves. Raises UnknownMatch."""
         schedule, position = _place(match)
         with self._database.read() as session:
             one = select(*_LISTED).filter_by(schedule=schedule, position=position)
@@ -216,9 +215,9 @@ def _place(match: str) -> tuple[str, int]:
     return schedule, int(position) if position.isdecimal() and len(position) < 10 else -1
 
 
-def _no_match(match: str) -> NotFound:
+def _no_match(match: str) -> UnknownMatch:
     schedule, _, position = match.rpartition("/")
-    return NotFound(f"schedule {schedule} has no match {position!r}")
+    return UnknownMatch(f"schedule {schedule} has no match {position!r}")
 
 
 def _when_played(session: Session, league: str, match: str) -> tuple[Any, ...]:

@@ -39,6 +39,7 @@ from tests.league.policies.graphs import masked_mlp
 from tests.serve_app.leagues import everything, promote, publish
 from tests.serve_app.scaling import scale
 from tests.serve_app.test_action import BOARD
+from tests.serve_app.test_events import listener
 
 ACTION = "/v1/policies/board/action"
 EVALUATIONS = "/v1/leagues/tictactoe/evaluations"
@@ -275,9 +276,25 @@ def test_promotions_end_no_stream(url: str, served: Registry) -> None:
             assert (pinned.version, following.version) == (1, version)
 
 
+def test_streams_of_events_come_through_and_outlast_every_limit(url: str, served: Registry) -> None:
+    """HAProxy cuts a reply on which nothing comes for 5 s."""
+    with listener(url) as heard:
+        until(lambda: heard.lines.count(": nothing new") >= 4)
+        promote(served, "board", 2)
+        until(lambda: heard.last["aliases"] == {"champion": 2})
+        until(lambda: heard.last["serving"] == {"2": 2})
+        assert not heard.is_over
+    promote(served, "board", 1)
+    until(lambda: serving(served, 1) >= 2)
+
+
 def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> None:
-    """The observations are ones, and the third action is 1: whoever forgot what was before would answer 0."""
+    """The observations are ones, and the third action is 1: whoever forgot what was before would answer 0.
+
+    Streams of events at that replica end, the others go on.
+    """
     with Client(url) as client, ExitStack() as until_done:
+        listeners = [until_done.enter_context(listener(url)) for _ in range(6)]
         streams = [until_done.enter_context(client.stream("memory")) for _ in range(6)]
         for _ in range(2):
             assert [stream.act([1.0]) for stream in streams] == [0] * 6
@@ -288,6 +305,8 @@ def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> N
         assert codes
         assert set(codes) == {1012}
         assert [stream.act([1.0]) for stream in streams] == [1] * 6
+        until(lambda: any(each.is_over for each in listeners))
+        assert not all(each.is_over for each in listeners)
         scale(processes(served.storage, "PolicyServer"), processes(served.storage, "raylet")[0], 2)
     until(lambda: serving(served, 1) >= 2)
 

@@ -91,3 +91,11 @@ def test_a_mark_stays_while_nothing_follows(registry: Registry) -> None:
     ledger.open(replace(SCHEDULE, id="not played"))
     registry.create_key("bot", ["read"])
     assert registry.marks() == before
+
+
+def test_of_judgements_that_were_computed_the_reasons_are_read_alone(registry: Registry) -> None:
+    judgement = {"outcome": "reject", "reason": "It is not the stronger one.", "curve": [[1, 0.5]] * 400}
+    registry.put_snapshots(LEAGUE, {"verdict/a": judgement, "verdict/b": judgement, "summary": {}}, mark="a")
+    assert registry.verdict_reasons(LEAGUE, ["a", "c"]) == {"a": ("reject", "It is not the stronger one.")}
+    assert registry.verdict_reasons("chess", ["a"]) == {}
+    assert registry.verdict_reasons(LEAGUE, []) == {}
