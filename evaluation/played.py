@@ -14,7 +14,7 @@ from evaluation.standings import by_side, ranked
 from league.registry.registry import Registry
 from league.registry.rows import LeagueRow
 from league.results.ledger import Ledger
-from league.results.records import Match, Schedule
+from league.results.records import Match
 
 MOST_CONTESTANTS = 40
 """In the payoff table, the best ones: a table of more is read by nobody."""
@@ -50,7 +50,7 @@ class Played:
         self._distinct: Counter[str] = Counter()
         for schedule in schedules.values():
             for match in ledger.walk(schedule):
-                self._take(match, schedule)
+                self._take(match)
         self.distinct_games = len(self._seen)
         self.standings = tuple(replace(each, distinct_games=self._distinct[each.ref]) for each in standings)
 
@@ -68,9 +68,9 @@ class Played:
         """The games that were least expected, greatest surprise first."""
         return self._surprises.greatest() if self._surprises else []
 
-    def _take(self, match: Match, schedule: Schedule) -> None:
+    def _take(self, match: Match) -> None:
         if self._surprises is not None:
-            self._surprises.see(match, schedule.opening_plies)
+            self._surprises.see(match)
         self.blocks += 1
         self.games += len(match.games)
         for game in match.games:

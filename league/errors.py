@@ -173,7 +173,7 @@ class UnknownVerdict(NotFound):
 
 
 class UnknownMatch(NotFound):
-    """The ledger has no match of that id."""
+    """The ledger has no match of that id, or the match no such game."""
 
     code = "unknown_match"
 
@@ -336,3 +336,9 @@ class StorageError(LeagueError):
     """The database or the artefact store cannot be read or written."""
 
     code = "storage_error"
+
+
+BY_CODE: dict[str, type[LeagueError]] = {
+    error.code: error for error in list(vars().values()) if isinstance(error, type) and issubclass(error, LeagueError)
+}
+"""What a code that came from another process stands for."""

@@ -48,6 +48,7 @@ from serve_app.routes.action import ActionRoute, Shortcut
 from serve_app.routes.docs import DocsRoutes
 from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventRoutes
+from serve_app.routes.games import GameRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.history import HistoryRoutes
 from serve_app.routes.leagues import LeagueRoutes
@@ -68,6 +69,7 @@ from serve_app.traffic import Traffic
 from serve_app.versions import Versions
 
 LOOPBACK = "127.0.0.1"
+GAME = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
 SWITCH = 0.0005
 """Seconds after which a thread that looks at the database, or computes a shadow, gives way to the event loop. Python's
 default of 5 ms would be the time that the slowest requests wait."""
@@ -111,7 +113,7 @@ class PolicyServer:
             replica,
             machine=_node_address(),
             is_exposed=serves_other_machines(),
-            studio=studio and StudioHandle(studio),
+            studio=studio and StudioHandle(studio, settings.timeout),
         )
 
     def __serve_build_asgi_app__(self) -> Starlette:
@@ -167,6 +169,7 @@ class Server:
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
         self.evaluations = EvaluationRoutes(self.models, settings, studio)
+        self.games = GameRoutes(self.models, settings, studio)
         self.events = Events(self.models, settings)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
@@ -223,6 +226,10 @@ class Server:
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}/events", events.evaluation),
                 Route("/v1/leagues/{league}/events", events.league),
+                Route(GAME, self.games.recording),
+                Route(f"{GAME}/film.gif", self.games.film),
+                Route("/v1/leagues/{league}/playable", self.games.table),
+                Route("/v1/leagues/{league}/play", self.games.play, methods=["POST"]),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),

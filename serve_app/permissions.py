@@ -1,6 +1,6 @@
 """What a request needs: a scope, and the league that it is about. Pure.
 
-act      POST …/action, …/infer; a stream
+act      POST …/action, …/infer, …/play; a stream
 read     GET (HEAD) of anything else; the index of models
 evaluate POST and DELETE of evaluations, even where no other request needs a key
 promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
@@ -60,7 +60,7 @@ def _scope(kind: str, method: str, path: str) -> str:
         return "read"
     is_action = path.startswith("/v1/policies/") and path.endswith("/action")
     is_inference = path.startswith("/v2/models/") and path.endswith("/infer")
-    if is_action or is_inference:
+    if is_action or is_inference or (method == "POST" and _is_below_league(path, ("play",))):
         return "act"
     is_evaluation = method in ("POST", "DELETE") and _is_below_league(path, ("evaluations",))
     return "evaluate" if is_evaluation else "promote"

@@ -429,6 +429,49 @@ def test_a_night_that_finds_another_at_work_says_so_and_the_next_one_promotes(
     assert served.aliases("tictactoe")["champion"] == 2
 
 
+def patiently(ask: Callable[[], httpx.Response]) -> httpx.Response:
+    """What is answered in the end to a request that may take longer than one waits."""
+    replies: list[httpx.Response] = []
+    until(lambda: replies.append(ask()) or replies[-1].status_code != 503)
+    assert all(reply.json()["code"] in ("not_ready", "no_studio") for reply in replies[:-1])
+    assert all("retry-after" in reply.headers for reply in replies[:-1])
+    return replies[-1]
+
+
+def test_a_recorded_game_is_shown_and_filmed_by_the_studio(url: str, served: Registry) -> None:
+    evaluate(examples.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
+    match = Ledger(served).matches(league=examples.LEAGUE)[-1]
+    game = f"/v1/leagues/tictactoe/matches/{match.id}/games/1"
+    with httpx.Client(base_url=url) as client:
+        document = patiently(lambda: client.get(game)).json()
+        actions = [move["action"] for step in document["steps"] for move in step["moves"]]
+        assert actions == [*match.games[1].opening, *match.games[1].actions]
+        assert patiently(lambda: client.get(f"{game}/film.gif")).content[:6] == b"GIF89a"
+
+
+def test_a_game_goes_on_whatever_dies_in_its_midst(url: str, served: Registry) -> None:
+    body: dict[str, Any] = {"opponent": "tictactoe@2", "agent": "player_1", "chances": True, "actions": []}
+    with httpx.Client(base_url=url, timeout=30) as client:
+
+        def move() -> dict[str, Any]:
+            return dict(patiently(lambda: client.post("/v1/leagues/tictactoe/play", json=body)).json())
+
+        body["actions"].append(move()["legal"][0])
+        (stage,) = processes(served.storage, "evaluation.stage")
+        os.kill(stage, signal.SIGKILL)
+        until(lambda: stage not in processes(served.storage, "evaluation.stage"))
+        body["actions"].append(move()["legal"][0])
+        (studio,) = processes(served.storage, ":Studio")
+        os.kill(studio, signal.SIGKILL)
+        document = move()
+        assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
+        until(lambda: studio not in processes(served.storage, ":Studio"))
+        assert len(processes(served.storage, "evaluation.stage")) == 1, "the one of the studio that died is gone"
+        refused = client.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
+        assert (refused.status_code, refused.json()["code"]) == (422, "illegal_action")
+        assert "Traceback" not in refused.text
+
+
 def test_a_server_that_was_killed_can_be_started_again(storage: Storage) -> None:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
     with running(storage, port=port, replicas=1) as url:
