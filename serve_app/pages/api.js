@@ -1,6 +1,7 @@
 // The server's JSON, with the key that a person entered. The key is kept in this tab's session, and in no other place.
 
 const TRIES = 4;
+const STUDIO = 60000; // what the studio has begun goes on: it is asked again until it is done
 const LONGEST_WAIT = 5000;
 const SILENCE = 10000; // a stream sends a comment every two seconds
 
@@ -44,6 +45,7 @@ export async function ask(path, { method = "GET", body, signal, whole = false, r
   const headers = { accept: whole ? "*/*" : "application/json" };
   if (body !== undefined) headers["content-type"] = "application/json";
   if (!repeatable) headers["idempotency-key"] = unique();
+  const begun = Date.now();
   for (let attempt = 1; ; attempt += 1) {
     const used = key.get();
     try {
@@ -58,7 +60,8 @@ export async function ask(path, { method = "GET", body, signal, whole = false, r
         declined = true;
         throw fault;
       }
-      if (attempt === TRIES || !passes(fault, repeatable)) throw fault;
+      const isGoingOn = fault.code === "not_ready" && Date.now() - begun < STUDIO;
+      if (!isGoingOn && (attempt >= TRIES || !passes(fault, repeatable))) throw fault;
       await pause(Math.min(LONGEST_WAIT, fault.wait ?? 300 * 2 ** attempt), signal);
     }
   }

@@ -17,7 +17,7 @@ export function Game({ league, schedule, position, game }) {
   return html`<section aria-labelledby="heading">
     <p class="crumbs"><a href=${at(league, "matches", schedule, position)}>The match</a></p>
     <div class="head"><h2 id="heading">Game ${game}</h2>${show && !show.fault && html`<${Film} path=${path} name="${league}-${schedule}-${position}-${game}.gif" />`}</div>
-    <${Await} of=${{ data: show, fault, again: wants }}>${show && (show.fault
+    <${Await} of=${{ data: show, fault, again: wants }} words="The game is being played again …">${show && (show.fault
       ? html`<${Trouble} fault=${{ message: show.fault }} />`
       : html`<${Player} show=${show} wants=${wants} />`)}<//>
   </section>`;

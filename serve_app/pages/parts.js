@@ -13,10 +13,10 @@ export function useTitle(name, ...parts) {
 }
 
 /** What is shown while data comes, or instead of it. */
-export function Await({ of, children }) {
+export function Await({ of, words = "Loading …", children }) {
   if (of.data ?? of.items) return html`${of.fault && html`<${Trouble} fault=${of.fault} again=${of.again} stale />`}${children}`;
   if (of.fault) return html`<${Trouble} fault=${of.fault} again=${of.again} />`;
-  return html`<p class="loading soft" role="status">Loading …</p>`;
+  return html`<p class="loading soft" role="status">${words}</p>`;
 }
 
 export function Trouble({ fault, again, stale }) {

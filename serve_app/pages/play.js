@@ -4,7 +4,7 @@ import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { ask, of } from "./api.js";
 import { boardOf } from "./boards.js";
 import { useData } from "./data.js";
-import { Await, Badge, Empty, Trouble } from "./parts.js";
+import { Await, Badge, Empty, sentence, Trouble } from "./parts.js";
 import { go, useAddress } from "./router.js";
 import { Chances, did, Moves, Picture } from "./stage.js";
 import { number } from "./words.js";
@@ -16,10 +16,10 @@ export function Play({ league, about }) {
   const game = read(useAddress().fragment);
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Play</h2></div>
-    <${Await} of=${playable}>${playable.data && (playable.data.playable
-      ? game ? html`<${Table} key=${`${game.agent} ${game.seed}`} league=${league} about=${about} agents=${playable.data.agents} game=${game} />`
-        : html`<${Choose} league=${league} about=${about} agents=${playable.data.agents} />`
-      : html`<${Empty}>This league cannot be played here: ${playable.data.why}.<//>`)}<//>
+    <${Await} of=${playable} words="The studio lays the table …">${playable.data && (playable.data.playable
+      ? game ? html`<${Table} key=${`${game.agent} ${game.seed}`} league=${league} about=${about} seats=${playable.data.agents} game=${game} />`
+        : html`<${Choose} league=${league} about=${about} table=${playable.data} />`
+      : html`<${Empty}>This league cannot be played here: ${sentence(playable.data.why)}<//>`)}<//>
   </section>`;
 }
 
@@ -39,8 +39,7 @@ const write = (game) => `#${new URLSearchParams({ opponent: game.opponent, agent
 
 const anySeed = () => crypto.getRandomValues(new Uint32Array(1))[0] % SEEDS;
 
-function Choose({ league, about, agents }) {
-  const versions = useData(of(league, "versions"));
+function Choose({ league, about, table }) {
   const begin = (event) => {
     event.preventDefault();
     const fields = new FormData(event.target);
@@ -49,19 +48,17 @@ function Choose({ league, about, agents }) {
   };
   return html`<form class="narrow" onSubmit=${begin}>
     <p class="soft">You take one seat; a policy plays the others, as well as it can.</p>
-    <${Await} of=${versions}><label class="field">Against <select name="opponent">
+    <label class="field">Against <select name="opponent">
       ${about.champion != null && html`<option value="${league}@champion">${league}@champion (version ${about.champion})</option>`}
-      ${versions.data && [...versions.data.versions].reverse().map((each) => html`<option value="${league}@${each.version}">${league}@${each.version}</option>`)}
-      <option value="script:random">script:random</option>
-      ${boardOf(about.environment) && html`<option value="script:one_ply">script:one_ply</option>`}
-    </select></label><//>
-    <label class="field">Your seat <select name="agent">${agents.map(({ agent, side }) => html`<option value=${agent}>${agent}${side && side !== agent ? ` (${side})` : ""}</option>`)}</select></label>
+      ${table.opponents.map((ref) => html`<option value=${ref}>${ref}</option>`)}
+    </select></label>
+    <label class="field">Your seat <select name="agent">${table.agents.map(({ agent, side }) => html`<option value=${agent}>${agent}${side && side !== agent ? ` (${side})` : ""}</option>`)}</select></label>
     <label class="field">Seed <input name="seed" type="number" min="0" max=${SEEDS - 1} placeholder="any" /></label>
     <div class="buttons"><button type="submit" class="primary">Begin</button></div>
   </form>`;
 }
 
-function Table({ league, about, agents, game }) {
+function Table({ league, about, seats, game }) {
   const [wantsChances, setWantsChances] = useState(false);
   const [state, setState] = useState(null);
   const [fault, setFault] = useState(null);
@@ -82,11 +79,11 @@ function Table({ league, about, agents, game }) {
   const act = (action) => isTurn && state.legal.includes(action) && go(write({ ...game, actions: [...actions, action] }), { replace: true });
   const again = () => go(write({ ...game, seed: anySeed(), actions: [] }));
   const back = () => go(write({ ...game, actions: actions.slice(0, -1) }), { replace: true });
-  const seat = agents.find((each) => each.agent === agent);
+  const seat = seats.find((each) => each.agent === agent);
   return html`<div class="player">
     <div class="screen">
       ${state && html`<${Board} state=${state} about=${about} act=${act} isTurn=${isTurn} />`}
-      ${state && !state.over && html`<${Actions} seat=${seat} legal=${state.legal} act=${act} isTurn=${isTurn} />`}
+      ${state && seat && !state.over && html`<${Actions} seat=${seat} legal=${state.legal} act=${act} isTurn=${isTurn} />`}
       ${fault && html`<${Trouble} fault=${fault} again=${() => setRound(round + 1)} />`}
     </div>
     <div class="told">
@@ -120,7 +117,7 @@ function outcome({ score }) {
 function Board({ state, about, act, isTurn }) {
   const board = boardOf(about.environment);
   const last = state.steps.at(-1);
-  return html`<${Picture} src=${state.picture ?? last?.picture} words="The game after ${did(last)}">
+  return html`<${Picture} src=${state.picture} words="The game after ${did(last)}">
     ${board && state.picture && !state.over && html`<div class="places x${board.columns}" aria-hidden="true">${board.places.map((action) => html`
       <button type="button" tabindex="-1" key=${action} disabled=${!isTurn || !state.legal.includes(action)} onClick=${() => act(action)} data-action=${action}></button>`)}</div>`}
   <//>`;
@@ -128,7 +125,7 @@ function Board({ state, about, act, isTurn }) {
 
 /** Every action as a button; digits press the first ten. What is not legal now is not to be pressed. */
 function Actions({ seat, legal, act, isTurn }) {
-  const all = Array.from({ length: seat?.actions ?? Math.max(...legal) + 1 }, (_, action) => action);
+  const all = Array.from({ length: seat.actions }, (_, place) => seat.start + place);
   const latest = useRef(act);
   latest.current = act;
   useEffect(() => {
@@ -141,8 +138,8 @@ function Actions({ seat, legal, act, isTurn }) {
   }, []);
   return html`<div class="actions-grid x${all.length <= 10 ? all.length : "many"}" role="group" aria-label="Your actions">${all.map((action) => html`
     <button type="button" key=${action} aria-disabled=${!isTurn || !legal.includes(action)} class=${legal.includes(action) ? "" : "illegal"} onClick=${() => act(action)}>
-      ${seat?.names?.[action] ?? action}</button>`)}</div>
-    ${all.length <= 10 && html`<p class="soft small keys">Keys: <kbd>0</kbd> to <kbd>${all.length - 1}</kbd>. On a board, click where you play.</p>`}`;
+      ${action}</button>`)}</div>
+    ${all.length <= 10 && html`<p class="soft small keys">Keys: <kbd>${all[0]}</kbd> to <kbd>${all.at(-1)}</kbd>. On a board, click where you play.</p>`}`;
 }
 
 function Story({ steps, wantsChances }) {

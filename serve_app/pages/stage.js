@@ -3,6 +3,9 @@
 import { html } from "./vendor/preact-htm.js";
 import { percent, tail } from "./words.js";
 
+/** Who plays where you do. */
+const PERSON = "person";
+
 /** `words`: what the picture shows, for who does not see it. */
 export function Picture({ src, words, children }) {
   return html`<div class="picture">${src
@@ -21,7 +24,7 @@ export function did(step) {
 export function Moves({ of: step }) {
   if (!step?.moves.length) return html`<p class="soft">${did(step)}</p>`;
   return html`<ul class="moves">${step.moves.map((move) => html`<li key=${move.agent}>
-    <p><strong>${move.agent}</strong> <span class="soft ref">${move.ref && tail(move.ref)}</span> plays <strong>${String(move.action)}</strong>${step.opening && html`<span class="soft"> · random opening</span>`}</p>
+    <p><strong>${move.agent}</strong> <span class="soft ref">${move.ref === PERSON ? "you" : tail(move.ref)}</span> plays <strong>${String(move.action)}</strong>${step.opening && html`<span class="soft"> · random opening</span>`}</p>
     ${move.chances?.length > 0 && html`<${Chances} of=${move.chances} taken=${move.action} />`}</li>`)}</ul>`;
 }
 
