@@ -56,7 +56,7 @@ export async function ask(path, { method = "GET", body, signal, whole = false, r
       if (fault.status === 401) {
         if (key.get() !== used) continue; // another request has asked meanwhile
         if (declined && repeatable) throw fault;
-        if (await newKey(fault.message)) continue;
+        if (await newKey(used ? fault.message : "This needs an API key.")) continue;
         declined = true;
         throw fault;
       }

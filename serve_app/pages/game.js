@@ -1,7 +1,8 @@
 // A game of the ledger, played again: step by step, or by itself, at any speed.
 
-import { html, useEffect, useReducer, useRef, useState } from "./vendor/preact-htm.js";
+import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { ask, of, query } from "./api.js";
+import { useKeys } from "./keys.js";
 import { Await, Facts, league as at, notify, Trouble, useTitle } from "./parts.js";
 import { did, Moves, Picture } from "./stage.js";
 import { go, useAddress } from "./router.js";
@@ -59,8 +60,12 @@ function Player({ show, wants }) {
     const timer = setTimeout(() => setAt(at + 1), (last > 60 ? 250 : 800) / speed);
     return () => clearTimeout(timer);
   }, [isPlaying, at, speed, !!step]);
-  useKeys({ " ": toggle, k: toggle, ArrowLeft: () => move(at - 1), ArrowRight: () => move(at + 1), Home: () => move(0), End: () => move(last),
-    "+": () => setSpeed(faster(speed, 1)), "-": () => setSpeed(faster(speed, -1)) });
+  useKeys((pressed) => {
+    const act = { " ": toggle, ArrowLeft: () => move(at - 1), ArrowRight: () => move(at + 1), Home: () => move(0), End: () => move(last),
+      "+": () => setSpeed(faster(speed, 1)), "-": () => setSpeed(faster(speed, -1)) }[pressed];
+    act?.();
+    return !!act;
+  });
   return html`<div class="player">
     <div class="screen">
       <${Picture} src=${step?.picture} words=${did(step)} />
@@ -101,25 +106,9 @@ function Cast({ of: { cast, returns, forfeits }, isOver }) {
     ${isOver && forfeits.map((each) => html`<p>${each.ref} forfeited the game as ${each.agent}: ${each.reason}.</p>`)}`;
 }
 
-/** Keys of the page, but for what is typed into a field. */
-function useKeys(actions) {
-  const latest = useRef(actions);
-  latest.current = actions;
-  useEffect(() => {
-    const press = (event) => {
-      const isField = event.target.closest?.("input, select, textarea, dialog") || (event.key === " " && event.target.closest?.("button, a, summary"));
-      if (isField || event.metaKey || event.ctrlKey || event.altKey || !latest.current[event.key]) return;
-      event.preventDefault();
-      latest.current[event.key]();
-    };
-    addEventListener("keydown", press);
-    return () => removeEventListener("keydown", press);
-  }, []);
-}
-
 /** The game as a GIF: fetched with the key, then handed to the browser. */
 function Film({ path, name }) {
-  const [busy, setBusy] = useReducer((_, is) => is, false);
+  const [busy, setBusy] = useState(false);
   const fetchFilm = async () => {
     setBusy(true);
     try {

@@ -84,17 +84,20 @@ export function Facts({ of, cls = "" }) {
     html`<div class=${kind ?? ""}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl>`;
 }
 
+let dialogs = 0; // two may be open: a form's, and that for the key which it needs
+
 /** A modal dialog; `onClose` when it was closed in any way. */
 export function Dialog({ title, onClose, children }) {
   const dialog = useRef();
+  const [heading] = useState(() => `dialog-${(dialogs += 1)}`);
   useEffect(() => {
     const shown = dialog.current;
     shown.showModal();
     return () => shown.close(); // the focus goes back to where it was
   }, []);
-  return html`<dialog ref=${dialog} aria-labelledby="dialog-title" onClose=${onClose}
+  return html`<dialog ref=${dialog} aria-labelledby=${heading} onClose=${onClose}
       onClick=${(event) => event.target === dialog.current && onClose()}>
-    <div class="inside"><h2 id="dialog-title">${title}</h2>${children}</div>
+    <div class="inside"><h2 id=${heading}>${title}</h2>${children}</div>
   </dialog>`;
 }
 

@@ -1,9 +1,10 @@
 // A game against a policy. The address holds it whole: opponent, seat, seed and the actions so far; the server, nothing.
 
-import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
+import { html, useEffect, useState } from "./vendor/preact-htm.js";
 import { ask, of } from "./api.js";
 import { boardOf } from "./boards.js";
 import { useData } from "./data.js";
+import { useKeys } from "./keys.js";
 import { Await, Badge, Empty, sentence, Trouble } from "./parts.js";
 import { go, useAddress } from "./router.js";
 import { Chances, did, Moves, Picture } from "./stage.js";
@@ -76,7 +77,11 @@ function Table({ league, about, seats, game }) {
     return () => closed.abort();
   }, [told]);
   const isTurn = state && !state.over && !busy;
-  const act = (action) => isTurn && state.legal.includes(action) && go(write({ ...game, actions: [...actions, action] }), { replace: true });
+  const act = (action) => {
+    const isLegal = isTurn && state.legal.includes(action);
+    if (isLegal) go(write({ ...game, actions: [...actions, action] }), { replace: true });
+    return isLegal;
+  };
   const again = () => go(write({ ...game, seed: anySeed(), actions: [] }));
   const back = () => go(write({ ...game, actions: actions.slice(0, -1) }), { replace: true });
   const seat = seats.find((each) => each.agent === agent);
@@ -126,16 +131,7 @@ function Board({ state, about, act, isTurn }) {
 /** Every action as a button; digits press the first ten. What is not legal now is not to be pressed. */
 function Actions({ seat, legal, act, isTurn }) {
   const all = Array.from({ length: seat.actions }, (_, place) => seat.start + place);
-  const latest = useRef(act);
-  latest.current = act;
-  useEffect(() => {
-    const press = (event) => {
-      if (!/^\d$/.test(event.key) || event.target.closest?.("input, select, textarea, dialog") || event.metaKey || event.ctrlKey || event.altKey) return;
-      latest.current(Number(event.key));
-    };
-    addEventListener("keydown", press);
-    return () => removeEventListener("keydown", press);
-  }, []);
+  useKeys((pressed) => /^\d$/.test(pressed) && act(Number(pressed)));
   return html`<div class="actions-grid x${all.length <= 10 ? all.length : "many"}" role="group" aria-label="Your actions">${all.map((action) => html`
     <button type="button" key=${action} aria-disabled=${!isTurn || !legal.includes(action)} class=${legal.includes(action) ? "" : "illegal"} onClick=${() => act(action)}>
       ${action}</button>`)}</div>

@@ -34,7 +34,9 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         with pytest.MonkeyPatch.context() as environment:
             environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
             with running(registry.storage, replicas=1, insecure=True) as url:
-                until(lambda: leagues.are_computed(url), seconds=120)
+                until(lambda: leagues.are_computed(url), seconds=180)
+                for league in (leagues.LEAGUE, leagues.CONNECT_FOUR):
+                    leagues.answer("GET", f"{url}/v1/leagues/{league}/playable")  # the studio has started
                 yield Served(url, registry, keys)
 
 

@@ -4,15 +4,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import httpx
 
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
-from league.registry.rows import Portion, RunPoint
+from league.registry.rows import Portion, RunPoint, VerdictRow
 from tests.evaluation.examples import LEAGUE
 from tests.evaluation.pages.leagues import HOSTILE, of_a_night
+from tests.evaluation.waiting import until
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
@@ -38,6 +40,24 @@ def record(registry: Registry, steps: int) -> None:
     """The run gets further."""
     curves = {"player/return": steps / 40_000, "player/entropy": 2 - steps / 40_000, "time/sampling": 1.5}
     registry.record_point(LEAGUE, RUN, RunPoint(steps, curves, datetime.now(UTC)))
+
+
+def verdict_between_versions(registry: Registry) -> VerdictRow:
+    """A promotion of a version that beat another."""
+    closed = [each for each in registry.verdicts(LEAGUE) if each.outcome == "promote"]
+    return next(each for each in closed if not each.champion.startswith("script:"))
+
+
+def answer(method: str, url: str, body: Any = None) -> Any:
+    """What the studio says, which has it done before long."""
+    replies: list[httpx.Response] = []
+
+    def is_done() -> bool:
+        replies.append(httpx.request(method, url, json=body, timeout=60))
+        return replies[-1].status_code != 503
+
+    until(is_done, seconds=120)
+    return replies[-1].raise_for_status().json()
 
 
 def are_computed(url: str) -> bool:

@@ -200,7 +200,7 @@ def test_a_server_that_is_busy_for_a_moment_is_asked_again(tab: Tab) -> None:
         else:
             route.fulfill(status=status, json={"code": "not_ready", "message": "not yet"}, headers={"retry-after": "1"})
 
-    tab.page.route("**/standings*", busy)
+    tab.page.route("**/v1/**/standings*", busy)
     page = tab.open(L)
     leader(page, 3)
     expect(page.get_by_role("alert")).to_have_count(0)

@@ -7,9 +7,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from league.results.ledger import Ledger
 from tests.browser.conftest import Served, Tab
-from tests.browser.leagues import CONNECT_FOUR, EMPTY, RUN
+from tests.browser.leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
 from tests.evaluation.examples import LEAGUE
 
 L = f"/leagues/{LEAGUE}"
@@ -40,9 +39,8 @@ PAGES = {
 @pytest.fixture(scope="module")
 def names(served: Served) -> dict[str, str]:
     """What a path of a page may name."""
-    registry = served.registry
-    verdict = next(each for each in registry.verdicts(LEAGUE) if each.outcome == "promote")
-    return {"verdict": verdict.id, "schedule": Ledger(registry).schedules(LEAGUE)[0].id}
+    verdict = verdict_between_versions(served.registry)
+    return {"verdict": verdict.id, "schedule": verdict.schedule}
 
 
 @pytest.mark.parametrize(

@@ -3,23 +3,20 @@
 import re
 from pathlib import Path
 
-import httpx
 import pytest
 from PIL import Image
 from playwright.sync_api import Page, expect
 
-from league.results.ledger import Ledger
 from tests.browser.conftest import Served, Tab
-from tests.browser.leagues import CONNECT_FOUR
+from tests.browser.leagues import CONNECT_FOUR, answer, verdict_between_versions
 from tests.evaluation.examples import LEAGUE
 
 TURN = re.compile("Your turn")
 
 
 def game_of(served: Served) -> str:
-    """The page of a game of the ledger."""
-    schedule = Ledger(served.registry).schedules(LEAGUE)[0].id
-    return f"/leagues/{LEAGUE}/matches/{schedule}/0/0"
+    """The page of a game between two versions."""
+    return f"/leagues/{LEAGUE}/matches/{verdict_between_versions(served.registry).schedule}/0/0"
 
 
 def test_a_game_is_watched_step_by_step(tab: Tab, served: Served) -> None:
@@ -69,8 +66,7 @@ def found(served: Served, opponent: str, score: float) -> tuple[int, list[int]]:
         actions: list[int] = []
         while True:
             asked = {"opponent": opponent, "agent": "player_0", "seed": seed, "actions": actions}
-            reply = httpx.post(f"{served.url}/v1/leagues/{CONNECT_FOUR}/play", json=asked, timeout=60)
-            state = reply.raise_for_status().json()
+            state = answer("POST", f"{served.url}/v1/leagues/{CONNECT_FOUR}/play", asked)
             if state["over"]:
                 break
             actions.append(next(column for column in (3, 4, 2, 5, 1, 6, 0) if column in state["legal"]))
@@ -79,9 +75,9 @@ def found(served: Served, opponent: str, score: float) -> tuple[int, list[int]]:
     raise AssertionError(f"no game against {opponent} ends with {score}")
 
 
-def begin(page: Page, opponent: str, seed: int) -> None:
+def begin(page: Page, opponent: str, seat: str, seed: int) -> None:
     page.get_by_label("Against").select_option(opponent)
-    page.get_by_label("Your seat").select_option("player_0")
+    page.get_by_label("Your seat").select_option(seat)
     page.get_by_label("Seed").fill(str(seed))
     page.get_by_role("button", name="Begin").click()
 
@@ -94,7 +90,7 @@ def test_a_whole_game_of_connect_four_is_played_by_clicks(
 ) -> None:
     seed, actions = found(served, opponent, score)
     page = tab.open(f"/leagues/{CONNECT_FOUR}/play")
-    begin(page, opponent, seed)
+    begin(page, opponent, "player_0", seed)
     turn = page.locator(".turn")
     for played, action in enumerate(actions):
         expect(turn).to_have_text(TURN)
@@ -113,12 +109,13 @@ def test_a_whole_game_of_connect_four_is_played_by_clicks(
 
 def test_a_game_against_the_champion_by_keys_with_its_probabilities(tab: Tab) -> None:
     page = tab.open(f"/leagues/{LEAGUE}/play")
-    begin(page, f"{LEAGUE}@champion", 3)
+    begin(page, f"{LEAGUE}@champion", "player_1", 3)
     turn = page.locator(".turn")
     expect(turn).to_have_text(TURN)
     expect(page.locator(".told")).to_contain_text(f"{LEAGUE}@3")  # pinned: a promotion would not change the game
     page.get_by_label("Show the policy's probabilities").check()
     expect(page.get_by_role("list", name="Probabilities").first).to_contain_text("%")
+    expect(turn).to_have_text(TURN)
     legal = page.get_by_role("group", name="Your actions").locator("button[aria-disabled='false']").first
     page.keyboard.press(legal.inner_text().strip())
     expect(turn).to_have_text(re.compile("Your turn|You have|A draw"))
@@ -128,12 +125,12 @@ def test_a_game_against_the_champion_by_keys_with_its_probabilities(tab: Tab) ->
 
 
 def test_what_is_not_legal_is_not_played(tab: Tab) -> None:
-    page = tab.open(f"/leagues/{LEAGUE}/play#opponent=script:random&agent=player_0&seed=1&actions=")
+    page = tab.open(f"/leagues/{LEAGUE}/play#opponent=script:random&agent=player_1&seed=1&actions=4")
     expect(page.locator(".turn")).to_have_text(TURN)
     before = page.url
     page.get_by_role("group", name="Your actions").locator("button.illegal").first.click(force=True)
     assert page.url == before
-    page.goto(f"{tab.url}/leagues/{LEAGUE}/play#opponent=script:random&agent=player_0&seed=1&actions=99")
+    page.goto(f"{tab.url}/leagues/{LEAGUE}/play#opponent=script:random&agent=player_1&seed=1&actions=99")
     page.reload()
     expect(page.get_by_role("alert")).to_contain_text("99")
     tab.forgive(422)
