@@ -6,14 +6,15 @@ from pathlib import Path
 from shutil import which
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from league.registry.registry import Registry
 from serve_app.launch import running
 from tests.browser import leagues
-from tests.evaluation.waiting import until
 
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update"]
+PATIENCE = 20_000
+"""Milliseconds for whatever is to come: a machine may be busy."""
 EXPECTED = "Failed to load resource: the server responded with a status of "
 """What a browser says of every request that is refused, however well the page takes it."""
 
@@ -34,7 +35,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         with pytest.MonkeyPatch.context() as environment:
             environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
             with running(registry.storage, replicas=1, insecure=True) as url:
-                until(lambda: leagues.are_computed(url), seconds=180)
                 for league in (leagues.LEAGUE, leagues.CONNECT_FOUR):
                     leagues.answer("GET", f"{url}/v1/leagues/{league}/playable")  # the studio has started
                 yield Served(url, registry, keys)
@@ -73,7 +73,8 @@ class Tab:
 def tab(served: Served, browser: Browser, request: pytest.FixtureRequest) -> Iterator[Tab]:
     """A tab of its own session. Parametrised indirectly: options of its context."""
     context = browser.new_context(**{"viewport": {"width": 1180, "height": 800}} | getattr(request, "param", {}))
-    context.set_default_timeout(20_000)
+    context.set_default_timeout(PATIENCE)
+    expect.set_options(timeout=PATIENCE)
     tab = Tab(context.new_page(), served.url)
     tab.page.on("console", lambda said: tab.complaints.append(said.text) if said.type in ("error", "warning") else None)
     tab.page.on("pageerror", lambda error: tab.complaints.append(str(error)))

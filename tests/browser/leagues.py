@@ -8,6 +8,7 @@ from typing import Any
 
 import httpx
 
+from evaluation.snapshots import refresh
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
@@ -33,7 +34,14 @@ def of_every_page(home: Path) -> Iterator[Registry]:
         registry.begin_run(LEAGUE, RUN, algorithm="ppo", settings={"note": HOSTILE}, seed=17, target=40_000)
         for number in range(20):
             record(registry, 1000 * (number + 1))
+        compute(registry)
         yield registry
+
+
+def compute(registry: Registry) -> None:
+    """What a studio does before long: who stands where."""
+    for row in registry.leagues():
+        refresh(registry, row.slug)
 
 
 def record(registry: Registry, steps: int) -> None:
@@ -58,8 +66,3 @@ def answer(method: str, url: str, body: Any = None) -> Any:
 
     until(is_done, seconds=120)
     return replies[-1].raise_for_status().json()
-
-
-def are_computed(url: str) -> bool:
-    """Whether the studio has computed where everybody stands."""
-    return bool(httpx.get(f"{url}/v1/leagues/{LEAGUE}/standings", timeout=20).json()["standings"])

@@ -28,10 +28,9 @@ from league.registry.rows import Portion, RunPoint
 from league.results.ledger import Ledger
 from serve_app.launch import running
 from tests.browser.conftest import ARGUMENTS
-from tests.browser.leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, are_computed, verdict_between_versions
+from tests.browser.leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
 from tests.evaluation import examples
 from tests.evaluation.examples import LEAGUE
-from tests.evaluation.waiting import until
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 CONFIG = examples.config(play={"opening_plies": 2, "copies": 8})
@@ -93,6 +92,7 @@ def leagues(home: Path) -> Iterator[Registry]:
     evaluate(CONNECT_FOUR, ["script:one_ply", "script:random"], registry=registry, blocks=4)
     registry.set_traffic(LEAGUE, canary=Portion(2, 0.05), shadow=None, actor="release-bot", reason="try it")
     _train(registry, chance)
+    compute(registry)
     yield registry
     registry.close()
 
@@ -125,7 +125,8 @@ def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], di
     )
     page.goto(url + picture.path.format(**names))
     expect(page.locator("main")).to_contain_text(re.compile(picture.words), timeout=90_000)
-    page.wait_for_load_state("networkidle") if "/runs/" not in picture.path else None
+    for unfinished in (".loading", ".plot:not(:has(canvas))", ".screen:not(:has(img))"):
+        expect(page.locator(unfinished)).to_have_count(0, timeout=30_000)
     path = directory / f"{picture.name}.png"
     page.screenshot(path=path)
     page.close()
@@ -137,7 +138,6 @@ def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], di
 def main(directory: Path) -> None:
     """Take them all."""
     with TemporaryDirectory() as home, leagues(Path(home)) as registry, running(registry.storage, replicas=1) as url:
-        until(lambda: are_computed(url), seconds=180)
         for league in (LEAGUE, CONNECT_FOUR):
             answer("GET", f"{url}/v1/leagues/{league}/playable")
         names = {
