@@ -151,6 +151,7 @@ function drawLevels(plot, levels, look) {
     ctx.lineTo(bbox.left + bbox.width, y);
     ctx.stroke();
     ctx.font = `${12 * scale}px system-ui, sans-serif`;
+    ctx.textAlign = "left";
     ctx.fillText(name, bbox.left + 6 * scale, y + (value < 0 ? 14 : -6) * scale);
     ctx.restore();
   }

@@ -35,14 +35,14 @@ const TABS = [
 
 const BELOW = "/leagues/:league";
 const ROUTES = [
-  ...TABS.map(([name, path, page]) => [`${BELOW}/${path}`, { tab: path, page, name }]),
+  ...TABS.map(([name, path, page]) => [`${BELOW}/${path}`, { tab: path, page, name, needsRoom: page === Play }]),
   [`${BELOW}/verdicts/:verdict`, { tab: "verdicts", page: Verdict }],
   [`${BELOW}/evaluations/new`, { tab: "evaluations", page: NewEvaluation }],
   [`${BELOW}/evaluations/:evaluation`, { tab: "evaluations", page: Evaluation }],
   [`${BELOW}/runs/:run`, { tab: "runs", page: Run }],
   [`${BELOW}/matches`, { tab: "payoff", page: Matches }],
   [`${BELOW}/matches/:schedule/:position`, { tab: "payoff", page: Match }],
-  [`${BELOW}/matches/:schedule/:position/:game`, { tab: "payoff", page: Game }],
+  [`${BELOW}/matches/:schedule/:position/:game`, { tab: "payoff", page: Game, needsRoom: true }],
 ];
 
 export function League({ path }) {
@@ -74,7 +74,7 @@ function Known({ league, route, names }) {
       ${about.data && html`<${Flags} of=${about.data} />`}
       ${about.data && html`<${Promotions} league=${league} champion=${about.data.champion} />`}
     </div>
-    <${Await} of=${about}>${about.data && html`<${Summary} of=${about.data} isFirst=${route.tab === ""} />`}<//>
+    <${Await} of=${about}>${about.data && !route.needsRoom && html`<${Summary} of=${about.data} isFirst=${route.tab === ""} />`}<//>
     <${Tabs} league=${league} route=${route} />
     ${about.data && html`<${Page} key=${JSON.stringify(names)} ...${names} about=${about.data} />`}
   <//>`;

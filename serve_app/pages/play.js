@@ -87,12 +87,12 @@ function Table({ league, about, seats, game }) {
   const seat = seats.find((each) => each.agent === agent);
   return html`<div class="player">
     <div class="screen">
+      <p class="turn" role="status">${said(state, busy, fault, agent)}</p>
       ${state && html`<${Board} state=${state} about=${about} act=${act} isTurn=${isTurn} />`}
       ${state && seat && !state.over && html`<${Actions} seat=${seat} legal=${state.legal} act=${act} isTurn=${isTurn} />`}
       ${fault && html`<${Trouble} fault=${fault} again=${() => setRound(round + 1)} />`}
     </div>
     <div class="told">
-      <p class="turn" role="status">${said(state, busy, fault, agent)}</p>
       <p>You are <strong>${agent}</strong> against <strong class="ref">${opponent}</strong> <${Badge}>seed ${seed}<//></p>
       <label class="option"><input type="checkbox" checked=${wantsChances} onChange=${(event) => setWantsChances(event.target.checked)} /><span>Show the policy's probabilities</span></label>
       ${wantsChances && state?.chances?.length > 0 && !state.over && html`<h3>What it would play here</h3><${Chances} of=${state.chances} />`}

@@ -25,7 +25,6 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.registry.rows import Portion, RunPoint
-from league.results.ledger import Ledger
 from serve_app.launch import running
 from tests.browser.conftest import ARGUMENTS
 from tests.browser.leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
@@ -64,8 +63,8 @@ PICTURES = (
     Picture("verdict-dark", f"{L}/verdicts/{{verdict}}", "Blocks by result", is_dark=True),
     Picture("history", f"{L}/history", "promoted by the gate"),
     Picture("traffic", f"{L}/traffic", "answers"),
-    Picture("matches", f"{L}/matches", "#0"),
-    Picture("game", f"/leagues/{CONNECT_FOUR}/matches/{{schedule}}/0/0#9", "Step 9"),
+    Picture("matches", f"{L}/matches", r"#\d+"),
+    Picture("game", f"{L}/matches/{{verdict}}/0/0#5", "Step 5"),
     Picture("play", PLAYED, "Your turn"),
     Picture("play-dark", PLAYED, "Your turn", is_dark=True),
     Picture("play-phone", PLAYED, "Your turn", is_phone=True),
@@ -140,10 +139,7 @@ def main(directory: Path) -> None:
     with TemporaryDirectory() as home, leagues(Path(home)) as registry, running(registry.storage, replicas=1) as url:
         for league in (LEAGUE, CONNECT_FOUR):
             answer("GET", f"{url}/v1/leagues/{league}/playable")
-        names = {
-            "verdict": verdict_between_versions(registry).id,
-            "schedule": Ledger(registry).schedules(CONNECT_FOUR)[0].id,
-        }
+        names = {"verdict": verdict_between_versions(registry).id}
         with sync_playwright() as playwright:
             path = which("chromium") or playwright.chromium.executable_path
             browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
