@@ -9,10 +9,12 @@ ORDER = (
     "stepping",
     "sampling",
     "replay",
+    "phases",
     "learning",
     "maddpg",
     "parity",
     "serving",
+    "pages",
     "formats",
     "promotions",
     "shadowing",
@@ -23,6 +25,7 @@ ORDER = (
     "strength",
     "calibration",
     "evaluation",
+    "crowded_league",
 )
 
 

@@ -1,13 +1,9 @@
-"""MADDPG against independent DDPG in simple_adversary: who deceives better, and how fast is it learned?
+"""MADDPG against independent DDPG in simple_adversary: who deceives better?
 
-Parts:
-
-- `speed`: environment steps per second with learning on, divided by phase, and of sampling alone against the bare
-  environment.
-- `cross_play`: both are trained as long, by the processor's time, so that other work on the machine takes nothing from
-  either; each seed in a process of its own on one core, two at a time. Then every adversary plays every good side,
-  greedily, from the same starts. A seed that has finished is not trained again: its policies stay in `--directory`. All
-  seeds are printed, none is left out. Returns are per agent and episode.
+Both are trained as long, by the processor's time, so that other work on the machine takes nothing from either; each
+seed in a process of its own on one core, two at a time. Then every adversary plays every good side, greedily, from the
+same starts. A seed that has finished is not trained again: its policies stay in `--directory`. All seeds are printed,
+none is left out. Returns are per agent and episode.
 """
 
 import argparse
@@ -15,26 +11,23 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpe2 import simple_adversary_v3
 from numpy.typing import NDArray
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 from scipy import stats
 
 from benchmarks.learned import local_ray, one_thread
-from benchmarks.sampling import in_parallel
 from league.config import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.dispatch import algorithm_config
 from training.algorithms.maddpg import MADDPG
-from training.curves import PHASES, amounts
 from training.sampling.actor_runner import ActorRunner
 from training.trial import build
 
@@ -105,42 +98,36 @@ def train(job: Job) -> None:
         algorithm = build(league, interface(league))
         assert isinstance(algorithm, MADDPG)
         algorithm.begin_anew(0)
-        curve, phases = learned(algorithm, 60 * job.minutes, clock=time.process_time)
+        curve = learned(algorithm, 60 * job.minutes)
         weights = {
             f"{policy}/{name}": array
             for policy, module in algorithm.learner_group._learner.module.items()
             for name, array in module.get_state().items()
         }
         algorithm.stop()
-    summary = {"curve": curve, "phases": phases, "steps": curve[-1]["steps"], "seconds": curve[-1]["seconds"]}
+    summary = {"curve": curve, "steps": curve[-1]["steps"], "seconds": curve[-1]["seconds"]}
     job.directory.mkdir(parents=True, exist_ok=True)
     draft = job.file.with_suffix(".part.npz")
     np.savez(draft, summary=np.array(json.dumps(summary)), **weights)
     draft.rename(job.file)
 
 
-def learned(
-    algorithm: MADDPG, seconds: float, clock: Callable[[], float] = time.perf_counter
-) -> tuple[list[dict[str, float]], dict[str, float]]:
-    """Train for so long, by the clock. Returns POINTS of the curve, each with the mean returns since the one before,
-    and the seconds of each phase."""
+def learned(algorithm: MADDPG, seconds: float) -> list[dict[str, float]]:
+    """Train for so many seconds of the processor. Returns POINTS of the curve, each with the mean returns since the one
+    before."""
     curve: list[dict[str, float]] = []
-    phases = dict.fromkeys(PHASES, 0.0)
     returns: dict[str, list[float]] = {ADVERSARY: [], GOOD: []}
-    began = clock()
-    while (spent := clock() - began) < seconds or not curve:
-        result = algorithm.train()
-        taken = amounts(result)
-        phases = {phase: value + taken[phase] for phase, value in phases.items()}
-        means = result[ENV_RUNNER_RESULTS].get(EPISODE_MODULE_RETURN_MEAN, {})
+    began = time.process_time()
+    while (spent := time.process_time() - began) < seconds or not curve:
+        means = algorithm.train()[ENV_RUNNER_RESULTS].get(EPISODE_MODULE_RETURN_MEAN, {})
         for policy, values in returns.items():
             values.append(float(means.get(policy, np.nan)))
-        spent = clock() - began
+        spent = time.process_time() - began
         if spent >= seconds * (len(curve) + 1) / POINTS:
             point = {policy: float(np.nanmean(values)) for policy, values in returns.items()}
             curve.append(point | {"steps": algorithm.steps, "seconds": spent})
             returns = {policy: [] for policy in returns}
-    return curve, phases
+    return curve
 
 
 def cross_play(options: Options) -> bool:
@@ -249,67 +236,18 @@ def difference(first: NDArray, second: NDArray) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def speed(options: Options) -> bool:
-    """One core: learning on, by phase; then a runner alone against the stock environment."""
-    seconds = min(60.0, 60 * options.minutes)
-    one_thread()
-    with local_ray(cpus=1):
-        for name, critic in CRITICS.items():
-            league = league_of(critic, learning_starts=1024)
-            algorithm = build(league, interface(league))
-            assert isinstance(algorithm, MADDPG)
-            algorithm.begin_anew(0)
-            curve, phases = learned(algorithm, seconds)
-            algorithm.stop()
-            split = ", ".join(f"{phase.removeprefix('time/')} {value / seconds:.0%}" for phase, value in phases.items())
-            print(f"{name}: {curve[-1]['steps'] / AGENTS / curve[-1]['seconds']:,.0f} environment steps/s; {split}")
-        league = league_of("centralised")
-        runner = ActorRunner(config=algorithm_config(league, interface(league)), worker_index=0)
-        rates: dict[str, list[float]] = {"sampling": [], "stock": []}
-        for _ in range(5):
-            rates["sampling"].append(sampled(runner, seconds / 10))
-            rates["stock"].append(in_parallel(simple_adversary_v3, seconds / 10))
-        runner.stop()
-    ours, stock = (float(np.median(values)) for values in rates.values())
-    met = ours >= 0.75 * stock
-    print(f"sampling alone {ours:,.0f}, the stock environment {stock:,.0f} environment steps/s: {ours / stock:.2f}×")
-    print(f"sampling against the bare environment: target 0.75×: {'met' if met else 'MISSED'}", flush=True)
-    return met
-
-
-def sampled(runner: ActorRunner, seconds: float) -> float:
-    """Environment steps per second of play with exploration, transitions for replay included."""
-    steps, began = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
-        steps += runner.transitions(AGENTS * 1000, exploration=0.1)[0] // AGENTS
-    return steps / elapsed
-
-
-PARTS: dict[str, Callable[[Options], bool]] = {part.__name__: part for part in (speed, cross_play)}
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the parts that were asked for; 1 if a target is missed."""
+    """Train, play, tell; 1 if the target is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     parser.add_argument("--minutes", type=float, default=20.0, help="of each training (20)")
     parser.add_argument("--seeds", type=int, default=5, help="of each of the two (5)")
     parser.add_argument("--episodes", type=int, default=400, help="of each pair in cross-play (400)")
     parser.add_argument("--directory", type=Path, default=Path("build/benchmarks/maddpg"), help="of trained policies")
     parser.add_argument("--quick", action="store_true", help="two seeds of half a minute, for a look")
     given = parser.parse_args(arguments)
-    if unknown := [part for part in given.parts if part not in PARTS]:
-        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
     if given.quick:
         given.minutes, given.seeds, given.episodes = 0.5, 2, 50
-    options = Options(given.minutes, given.seeds, given.episodes, given.directory)
-    missed = []
-    for name in given.parts or PARTS:
-        print(f"\n-- {name} --", flush=True)
-        if not PARTS[name](options):
-            missed.append(name)
-    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
-    return bool(missed)
+    return int(not cross_play(Options(given.minutes, given.seeds, given.episodes, given.directory)))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ EPISODES = 4
 @dataclass(frozen=True, slots=True)
 class Learned:
     """returned: per agent and episode, greedily. joint: (3, 2, 2) the team's value of each pair of actions in each
-    state; the mean of both agents' own values where they are not mixed. seconds: of training."""
+    state; the mean of both agents' own values where they are not mixed. seconds: of the processor, for training."""
 
     returned: float
     joint: NDArray
@@ -42,10 +42,10 @@ def learn(mixer: str, seed: int, **settings: object) -> Learned:
     league = LeagueConfig.load(CONFIG).with_training(mixer=mixer, seed=seed, **settings)
     algorithm = build(league, interface(league))
     try:
-        began = time.perf_counter()
+        began = time.process_time()
         while algorithm.steps < league.training.steps:
             algorithm.train()
-        seconds = time.perf_counter() - began
+        seconds = time.process_time() - began
         returned = greedy_returns(algorithm, EPISODES).mean()
         return Learned(float(returned), joint_values(algorithm), seconds)
     finally:

@@ -28,7 +28,7 @@ HANDS, GAMES, MOVES = 100_000, 2000, 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Of one seed: actions and seconds of training, and what was measured, by name."""
+    """Of one seed: actions of training and seconds of the processor, and what was measured, by name."""
 
     steps: int
     seconds: float
@@ -136,10 +136,10 @@ def _train(
             algorithm.begin_anew(0)
             seconds, curve = 0.0, []
             for checkpoint in (int(steps * scale) for steps in checkpoints):
-                began = time.perf_counter()
+                began = time.process_time()
                 while algorithm.steps < checkpoint:
                     algorithm.train()
-                seconds += time.perf_counter() - began
+                seconds += time.process_time() - began
                 if look is not None:
                     curve.append((algorithm.steps, look(algorithm, league)))
             return Outcome(algorithm.steps, seconds, measure(algorithm, league), tuple(curve))

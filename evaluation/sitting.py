@@ -25,7 +25,7 @@ from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput
 from league.games import Sitting
 from league.interface import Interface
-from league.policies.onnx import OnnxPolicy
+from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.results.scoring import scores
 from league.spaces import ACTION_MASK, DictSpace, Discrete, Space
@@ -86,20 +86,21 @@ def sit(
     cast = {agent: PERSON if agent == asked.agent else asked.opponent for agent in interface.agents}
     steps: list[Step] = []
     last: Moment | None = None
-    waits: _Waits | None = None
-    forfeit: _Forfeited | None = None
+    stop: _Stop | None = None
     try:
-        for last in exhibit(environment, hands, asked.seed):
-            steps.append(step_of(last, cast, interface))
-    except _Waits as waiting:
-        waits = waiting
-    except _Forfeited as forfeited:
-        forfeit = forfeited
+        try:
+            for last in exhibit(environment, hands, asked.seed):
+                steps.append(step_of(last, cast, interface))
+        except _Stop as stopping:
+            stop = stopping
+        picture = data_uri(environment.render(0), LARGEST) if draws else None
     except IllegalAction:
         raise
     except Exception as error:
         raise GameCrashed(f"the game cannot go on: its environment raised {type(error).__name__}: {error}") from error
     assert last is not None, "a game has a beginning"
+    waits = stop if isinstance(stop, _Waits) else None
+    forfeit = stop if isinstance(stop, _Forfeited) else None
     if person.left and not waits:
         made = len(asked.actions) - person.left
         raise InvalidInput(f"actions: the game was over after {made} of these {len(asked.actions)}")
@@ -108,7 +109,7 @@ def sit(
         agent=asked.agent,
         seed=asked.seed,
         steps=tuple(steps),
-        picture=data_uri(environment.render(0), LARGEST) if draws else None,
+        picture=picture,
         legal=waits.legal if waits else (),
         acting=last.acting if waits else (),
         over=waits is None,
@@ -129,7 +130,11 @@ def space_of(interface: Interface, agent: str) -> Discrete:
     return space
 
 
-class _Waits(Exception):
+class _Stop(Exception):
+    """The game cannot go on, or not now."""
+
+
+class _Waits(_Stop):
     """It is the person's turn, and there is no choice yet. inputs: of the adviser's distribution."""
 
     def __init__(self, legal: tuple[int, ...], inputs: NDArray | None) -> None:
@@ -137,7 +142,7 @@ class _Waits(Exception):
         self.legal, self.inputs = legal, inputs
 
 
-class _Forfeited(Exception):
+class _Forfeited(_Stop):
     """An opponent had to act, and gave no action that could be played."""
 
     def __init__(self, agent: str, fault: Fault) -> None:
@@ -172,7 +177,16 @@ class _Person:
             named = ", ".join(map(str, legal[:MOST_NAMED])) + ", …" * (len(legal) > MOST_NAMED)
             raise IllegalAction(f"actions: {choice}, number {number + 1} of them, is illegal there; legal are {named}")
         actions = np.array([choice], dtype=self._space.dtype)
-        return Actions(actions) if advice is None else replace(advice, actions=actions)
+        if advice is None:
+            return Actions(actions)
+        return replace(advice, actions=actions, state=self._after(advice, choice))
+
+    def _after(self, advice: Actions, choice: int) -> dict[str, NDArray] | None:
+        """What the adviser remembers: what it saw, and, if it remembers its last action, what was chosen instead."""
+        if advice.state is None or LAST_ACTION not in advice.state:
+            return advice.state
+        last = np.full_like(advice.state[LAST_ACTION], choice - self._space.start + 1)
+        return {**advice.state, LAST_ACTION: last}
 
     def _legal(self, mask: NDArray | None) -> tuple[int, ...]:
         if mask is None:

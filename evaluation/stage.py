@@ -75,11 +75,14 @@ class Stage:
     def _ready(self) -> Player:
         """The player of the league as it is registered now, and an environment."""
         config = self._registry.league(self._league).config
-        if self._player is None or self._player.config != config:
-            self._player, self._environment = Player(config, self._registry), None
-        if self._environment is None:
-            self._draws = "rgb_array" in render_modes(config.environment)
-            self._environment = stepping(config.environment, 1, render_mode="rgb_array" if self._draws else None)
+        try:
+            if self._player is None or self._player.config != config:
+                self._player, self._environment = Player(config, self._registry), None
+            if self._environment is None:
+                self._draws = "rgb_array" in render_modes(config.environment)
+                self._environment = stepping(config.environment, 1, render_mode="rgb_array" if self._draws else None)
+        except Exception as error:  # whatever the fault is, it is none of who asks
+            raise GameCrashed(f"the environment of {self._league} cannot be made: {error}") from error
         return self._player
 
     @property
@@ -140,7 +143,7 @@ def _in_time(stage: Stage, order: Order, seconds: float) -> Answer:
             raise Expired(GameHung(f"a game of {order.league} was not at its end after {seconds:g} s"))
 
     try:
-        # Native code that minds no signal ends this process, which its studio replaces, and in any case outlives.
+        # Where a signal is not minded the studio ends this process; where there is no studio any more, it ends itself.
         with watched(look, Deadline(seconds, expendable=True)):
             return stage.answer(order.asked)
     except Expired as expired:

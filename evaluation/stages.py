@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from evaluation import children
-from league.errors import BY_CODE, GameHung, NotReady, Overloaded, WorkerLost
+from league.errors import BY_CODE, GameHung, LeagueError, NotReady, Overloaded, WorkerLost
 from league.games import Order
 
 T = TypeVar("T")
@@ -64,7 +64,7 @@ class Stages:
         """
         line = order.model_dump_json()
         answer = self._known.get(line)
-        if answer is None:
+        if answer is None or (answer.done() and not order.has_one_answer):
             answer = self._known[line] = self._stage(order.league).play(line)
         self._known.move_to_end(line)
         self._trim()
@@ -72,10 +72,10 @@ class Stages:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(answer)), patience)
         except TimeoutError:
             raise NotReady(f"a game of {order.league} is still being played: ask again") from None
-        finally:
-            is_lasting = order.has_one_answer and not (answer.done() and answer.exception())
-            if answer.done() and not is_lasting and self._known.get(line) is answer:
-                del self._known[line]
+        except LeagueError:
+            if self._known.get(line) is answer:
+                del self._known[line]  # told once: the next time it may be otherwise
+            raise
 
     def close(self) -> None:
         """End all processes."""

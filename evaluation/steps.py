@@ -10,6 +10,7 @@ from evaluation.captions import chances
 from evaluation.exhibition import Moment, Move
 from evaluation.report import Document
 from league.interface import Interface
+from league.spaces import Space
 
 LARGEST = 480
 """Pixels of a picture's longer side."""
@@ -21,7 +22,7 @@ Chances = tuple[tuple[int, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Played(Document):
+class ToldMove(Document):
     """One agent's part of a step. ref: who played it."""
 
     agent: str
@@ -35,7 +36,7 @@ class Step(Document):
     """picture: after it, as a data URI; None where there is none. opening: whether its actions were random."""
 
     step: int
-    moves: tuple[Played, ...]
+    moves: tuple[ToldMove, ...]
     picture: str | None
     opening: bool
 
@@ -45,12 +46,12 @@ def step_of(
 ) -> Step:
     """The document of a moment. cast: agent → who plays it. opening: how many steps of the game were random."""
     moves = tuple(
-        Played(move.agent, cast[move.agent], move.action, likely(move, interface.agents[move.agent].action))
+        ToldMove(move.agent, cast[move.agent], move.action, likely(move, interface.agents[move.agent].action))
         for move in moment.moves
     )
     return Step(moment.step, moves, picture, 0 < moment.step <= opening)
 
 
-def likely(move: Move, space: Any) -> Chances:
+def likely(move: Move, space: Space) -> Chances:
     """How likely the actions of a move were."""
     return tuple((action, round(chance, 6)) for action, chance in chances(move, space, MOST_CHANCES) if chance > 0)

@@ -70,7 +70,7 @@ class ServeSettings(BaseModel):
     """Share of a core that mirrored requests may take. What does not fit is dropped."""
     studio: str | None = None
     """What plays games, by import string: `evaluation.studio:deployment`, as deploy.yaml has it. None: nobody does, and
-    evaluations are answered 503."""
+    evaluations and games are answered 503."""
     evaluation_workers: int = Field(default=1, ge=1)
     """Processes that play the matches of one evaluation. They give way to replicas, but share their cores."""
     evaluations_at_once: int = Field(default=1, ge=1)

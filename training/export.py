@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from league.interface import AgentInterface
 from league.policies.actions import bounds, dist_inputs_size
-from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
+from league.policies.onnx import ACTION, DIST_INPUTS, LAST_ACTION, STATE_IN, STATE_OUT
 from league.registry.manifest import Tensor as TensorManifest
 from league.spaces import Box, DictSpace, Discrete, MultiDiscrete, Space, inputs
-from training.modules.acting import Acting
+from training.modules.acting import ACTED, Acting
 
 BATCH = "batch"
 
@@ -124,14 +124,20 @@ def graph_tensors(module: Acting, spaces: AgentInterface) -> tuple[Tensors, Tens
         TensorManifest(name=ACTION, dtype=spaces.action.dtype, shape=(None, *spaces.action.shape)),
         TensorManifest(name=DIST_INPUTS, dtype="float32", shape=(None, dist_inputs_size(spaces.action))),
     )
+    initial = module.get_initial_state()
     before, after = (
         tuple(
-            TensorManifest(name=f"{prefix}{i}", dtype=state.dtype.name, shape=(None, *state.shape))
-            for i, state in enumerate(module.get_initial_state().values())
+            TensorManifest(name=name, dtype=state.dtype.name, shape=(None, *state.shape))
+            for name, state in zip(state_names(initial, prefix), initial.values(), strict=True)
         )
         for prefix in (STATE_IN, STATE_OUT)
     )
     return (*observed, *before), (*acted, *after), before
+
+
+def state_names(keys: Iterable[str], prefix: str = STATE_IN) -> list[str]:
+    """A module's keys of its state → the graph's: numbers, but the last action has a name of its own, LAST_ACTION."""
+    return [prefix + (LAST_ACTION.removeprefix(STATE_IN) if key == ACTED else str(i)) for i, key in enumerate(keys)]
 
 
 def _to_environment(space: Space) -> nn.Module:

@@ -20,11 +20,12 @@ from league.errors import ParityError
 from league.interface import Interface
 from league.policies.actions import to_environment
 from league.policies.agreement import excused, same
-from league.policies.onnx import STATE_IN, OnnxPolicy
+from league.policies.onnx import OnnxPolicy
 from league.policies.probes import Probes
 from league.registry.manifest import Parity
 from league.seeds import derive, generator
 from league.spaces import ACTION_MASK, Space
+from training.export import state_names
 from training.modules.acting import Acting
 from training.sampling.distributions import distribution
 from training.sampling.memories import Memories
@@ -167,7 +168,7 @@ def probes(path: Path, batches: list[Met]) -> Probes:
 
 def _state_in(state: Mapping[str, NDArray]) -> dict[str, NDArray]:
     """A module's state under the names of the graph's inputs."""
-    return {f"{STATE_IN}{i}": value for i, value in enumerate(state.values())}
+    return dict(zip(state_names(state), state.values(), strict=True))
 
 
 def answer(module: Acting, situation: Met) -> tuple[NDArray, dict[str, NDArray]]:

@@ -19,6 +19,9 @@ ACTION = "action"
 DIST_INPUTS = "action_dist_inputs"
 STATE_IN = "state_in_"
 STATE_OUT = "state_out_"
+LAST_ACTION = "state_in_action"
+"""State of a graph that remembers its last action: the raw one plus one, (k, 1) float32, 0 at first. The graph answers
+with its greedy action; when another one is drawn, that takes its place."""
 
 DTYPES = {"float": "float32", "double": "float64"}
 """ONNX Runtime's names of element types where they are not NumPy's."""
@@ -63,8 +66,10 @@ class OnnxPolicy:
         outputs = self._run(observations, state, self._exploring if explore else self._greedy)
         if not explore or self._action is None:
             return Actions(outputs[0], self._state(outputs[1:]))
-        actions = to_environment(sample(outputs[1], self._action, rng), self._action)
-        return Actions(actions, self._state(outputs[2:]), outputs[1])
+        raw, after = sample(outputs[1], self._action, rng), self._state(outputs[2:])
+        if after is not None and LAST_ACTION in after:
+            after[LAST_ACTION] = raw[:, np.newaxis].astype(np.float32) + 1
+        return Actions(to_environment(raw, self._action), after, outputs[1])
 
     def distribution(self, observations: Arrays, *, state: Arrays | None = None) -> Actions:
         """As a greedy `act`, with the distribution's inputs."""

@@ -50,7 +50,7 @@ class PolicyManifest(_Record):
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     state: tuple[Tensor, ...] = ()
-    """The recurrent inputs `state_in_<i>`, zeros at the start of an episode."""
+    """The recurrent inputs `state_in_<i>`, zeros at the start of an episode; `<i>` is a number, or `action`."""
     parity: Parity
     probes: str | None = None
     """The file of its probes (policies/probes.py), which it answers before it serves; None in versions without."""

@@ -109,8 +109,8 @@ def counts(session: Session) -> dict[str, int]:
 def points(session: Session, league: str, run: str) -> list[rows.RunPoint]:
     """Those of a run, by their steps, the newest that is known among them. Raises UnknownLeague or UnknownRun."""
     one(session, league, run)
-    query = select(RunPoint).filter_by(league=league, run=run).order_by(RunPoint.steps)
-    return [rows.RunPoint(steps=each.steps, curves=each.curves, at=each.at) for each in session.scalars(query)]
+    query = select(RunPoint.steps, RunPoint.curves, RunPoint.at).filter_by(league=league, run=run)
+    return [rows.RunPoint(*each) for each in session.execute(query.order_by(RunPoint.steps)).tuples()]
 
 
 def _keep(session: Session, row: Run, point: rows.RunPoint) -> None:

@@ -108,12 +108,17 @@ class Ledger:
 
     def match(self, match: str) -> Match:
         """One match by its id. Raises UnknownMatch."""
+        return self.scheduled_match(match)[1]
+
+    def scheduled_match(self, match: str) -> tuple[Schedule, Match]:
+        """One match by its id, with its schedule. Raises UnknownMatch."""
         name, position = _place(match)
         with self._database.read() as session:
             moves = session.scalar(select(tables.Match.moves).filter_by(schedule=name, position=position))
             if moves is None:
                 raise _no_match(match)
-            return _schedule(session, name).match(position, load_games(moves))
+            schedule = _schedule(session, name)
+            return schedule, schedule.match(position, load_games(moves))
 
     def page(
         self, league: str, *, contestants: tuple[str, str] | None = None, before: str | None = None, limit: int = 20

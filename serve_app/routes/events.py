@@ -24,7 +24,8 @@ from serve_app.routes.evaluations import evaluation_document, named
 from serve_app.settings import ACKNOWLEDGED_WITHIN
 
 EVENT_STREAM = "text/event-stream"
-HEADERS = {"cache-control": "no-store"}
+HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
+"""The second is for nginx, which would gather what it passes on."""
 NOTHING_NEW = b": nothing new\n\n"
 
 

@@ -74,10 +74,10 @@ def _listed(entry: Entry) -> dict[str, Any]:
 def _one(registry: Registry, league: str, name: str) -> dict[str, Any]:
     ledger = Ledger(registry)
     registry.league(league)
-    entry, match = ledger.entry(name), ledger.match(name)
+    entry = ledger.entry(name)
+    schedule, match = ledger.scheduled_match(name)
     if match.league != league:
         raise UnknownMatch(f"league {league} has no match {name!r}")
-    schedule = ledger.schedule(match.schedule)
     games = [_game(number, game, match, schedule) for number, game in enumerate(match.games)]
     return {"league": league} | _listed(entry) | {"seed": match.seed, "games": games}
 

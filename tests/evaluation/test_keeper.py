@@ -11,6 +11,7 @@ import pytest
 
 from evaluation import keeper
 from evaluation.keeper import Keeper
+from evaluation.studio import Studio
 from evaluation.tournament import evaluate
 from league.environments.building import interface
 from league.registry.registry import Registry
@@ -102,6 +103,29 @@ def test_it_goes_on_when_the_database_is_back(registry: Registry, caplog: pytest
         away.rename(database)
         played = play(registry, seed=1)
         until(lambda: games(registry) == played)
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_studio_has_one(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    studio = Studio(workers=1, at_once=1)
+    play(registry, seed=1)
+    until(lambda: registry.stale_snapshots() == [])
+    studio.check_health()
+
+    def has_a_bug(_: Registry) -> list[str]:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Registry, "stale_snapshots", has_a_bug)
+    until(lambda: is_ill(studio))
+
+
+def is_ill(studio: Studio) -> bool:
+    try:
+        studio.check_health()
+    except RuntimeError:
+        return True
+    return False
 
 
 STUDIO = """

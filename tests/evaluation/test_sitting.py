@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from onnx import TensorProto, helper, numpy_helper
 
 from evaluation.exhibition import Moment, exhibit
 from evaluation.sitting import PERSON, Sat, sit
@@ -23,6 +24,7 @@ from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
+from league.spaces import inputs
 from tests.evaluation import examples
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
@@ -111,6 +113,45 @@ def test_who_does_what_the_opponent_would_do_plays_the_opponents_game_with_itsel
     assert moves_in(sat) == moves_of(played)
     assert len(set(chosen)) > 1 or not memory
     assert all(move.chances[0][0] == move.action for step in sat.steps for move in step.moves)
+
+
+def following(width: int, actions: int) -> bytes:
+    """A graph that remembers its last action, and prefers the next one."""
+    nodes = [
+        helper.make_node("Mod", ["state_in_action", "count"], ["next"], fmod=1),
+        helper.make_node("Sub", ["all", "next"], ["away"]),
+        helper.make_node("Abs", ["away"], ["far"]),
+        helper.make_node("Neg", ["far"], ["action_dist_inputs"]),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["column"], axis=1, keepdims=1),
+        helper.make_node("Cast", ["column"], ["taken"], to=TensorProto.FLOAT),
+        helper.make_node("Add", ["taken", "one"], ["state_out_action"]),
+    ]
+    weights = {"count": [[actions]], "all": [list(range(actions))], "one": [[1]]}
+    taken, given = {"observation": width, "state_in_action": 1}, {"action_dist_inputs": actions, "state_out_action": 1}
+    graph = helper.make_graph(
+        nodes,
+        "following",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in taken.items()],
+        [
+            helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
+            *(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in given.items()),
+        ],
+        [numpy_helper.from_array(np.array(value, np.float32), name) for name, value in weights.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return bytes(model.SerializeToString())
+
+
+def test_who_is_asked_for_advice_remembers_what_was_done_instead() -> None:
+    _, described, _ = table(SPREAD, **BRIEF)
+    width = inputs(described.of_policy("shared").observation)["observation"].shape[0]
+    players = everybody(described, OnnxPolicy(following(width, actions=5)))
+
+    def advised(*actions: int) -> int:
+        return ask(SPREAD, players, "agent_0", actions, chances=True, kwargs=BRIEF).chances[0][0]
+
+    assert [advised(), advised(0), advised(3), advised(3, 1), advised(3, 4)] == [0, 1, 4, 2, 0]
 
 
 def test_nobody_is_told_chances_who_did_not_ask() -> None:

@@ -195,6 +195,13 @@ def test_what_an_environment_raises_is_told_and_the_next_game_has_a_fresh_one(sh
     assert told(ask(shared, sitting(opponent="script:random"), "raising"))["legal"] == list(range(9))
 
 
+def test_an_environment_that_cannot_be_made_is_no_fault_of_who_asks(shared: Stages, registry: Registry) -> None:
+    lost = examples.config(league="lost", environment={"entry_point": "games.none:none"})
+    registry.register(lost, registry.league(LEAGUE).interface)
+    with pytest.raises(GameCrashed, match=r"the environment of lost cannot be made: .*games\.none"):
+        ask(shared, Table(), "lost")
+
+
 def test_a_league_that_gets_another_environment_is_played_in_that_one(registry: Registry) -> None:
     league = examples.config(league="moving")
     registry.register(league, interface(league))

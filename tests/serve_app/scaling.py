@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from serve_app.launch import DEPLOY_YAML, _document
@@ -17,10 +18,18 @@ def scale(replicas: list[int], raylet: int, count: int) -> None:
     command = Path(f"/proc/{raylet}/cmdline").read_text()
     address = re.search(r"gcs-address=([\d.:]+)", command)
     assert address is not None, command
-    of_replica = Path(f"/proc/{replicas[0]}/environ").read_text().split("\0")
+    of_replica = _environment_of_one(replicas)
     shared = dict(line.split("=", 1) for line in of_replica if line.startswith(TAKEN))
     script = [sys.executable, "-m", "tests.serve_app.scaling", address[1], str(count)]
     subprocess.run(script, env=os.environ | shared, check=True, timeout=120, capture_output=True)
+
+
+def _environment_of_one(processes: list[int]) -> list[str]:
+    """That of the first one that still runs: a replica may be replaced at any time."""
+    for process in processes:
+        with suppress(FileNotFoundError, ProcessLookupError):
+            return Path(f"/proc/{process}/environ").read_text().split("\0")
+    raise AssertionError(f"none of {processes} runs")
 
 
 def main() -> None:

@@ -194,6 +194,22 @@ def test_a_replica_that_stops_ends_its_streams(registry: Registry) -> None:
             httpx.get(f"{server.url}{LEAGUE}")
 
 
+def test_a_replica_that_stops_begins_no_stream(server: Listening) -> None:
+    server.server.events.end()
+    reply = httpx.get(f"{server.url}{LEAGUE}")
+    assert (reply.status_code, reply.json()["code"]) == (503, "not_ready")
+
+
+def test_a_registry_that_does_not_answer_is_not_waited_for(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = threading.Event()
+    monkeypatch.setattr(Registry, "pulse", lambda *_, **__: answer.wait(20))
+    with listening(registry.storage, SOON.model_copy(update={"timeout": 0.05})) as server:
+        reply = httpx.get(f"{server.url}{LEAGUE}")
+        answer.set()
+        assert (reply.status_code, reply.json()["code"]) == (504, "deadline_exceeded")
+        assert server.server.events.open == 0
+
+
 def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "SILENCE", 0.05)
     _, token = registry.create_key("page", ["read"])
@@ -207,6 +223,15 @@ def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.Monk
             until(lambda: len(stays.lines) > before)
         with listener(server) as stranger:
             assert stranger.reply.status_code == 401
+
+
+def test_a_stream_without_a_key_ends_when_there_is_one(
+    server: Listening, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "SILENCE", 0.05)
+    with listener(server) as heard:
+        registry.create_key("first", ["read"])
+        until(lambda: heard.is_over)
 
 
 def test_a_database_that_is_gone_for_a_while_ends_no_stream(

@@ -57,6 +57,7 @@ REAL = {
     "verdict": [WON, PENDING],
     "schedule": [SCHEDULE.id],
     "position": [0, 5],
+    "game": [0, 1, 2],
     "run": ["first"],
 }
 
@@ -115,7 +116,8 @@ def _content(body: Any) -> bytes | None:
 
 
 def _is_not_ready(reply: Any) -> bool:
-    return reply.status_code == 503 and b"no champion" in reply.content
+    """Without a champion, or where the studio is asked, which is closed."""
+    return reply.status_code == 503 and (b"no champion" in reply.content or b"no_studio" in reply.content)
 
 
 MODELS = ("board", "memory", "nested", "kinds", "choice", "vector")

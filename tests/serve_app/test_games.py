@@ -9,6 +9,7 @@ from io import BytesIO
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
 from PIL import Image
 from starlette.testclient import TestClient
 
@@ -22,6 +23,7 @@ from league.results.ledger import Ledger
 from league.results.records import Match
 from league.settings import Storage
 from serve_app.app import Server
+from serve_app.openapi.document import document
 from serve_app.studio import Answer
 from tests.evaluation import examples
 from tests.serve_app.conftest import QUICK, Closed
@@ -95,23 +97,30 @@ def game(match: Match, number: int = 0) -> str:
 def played(client: TestClient, status: int = 200, **body: Any) -> dict[str, Any]:
     reply = client.post(PLAY, json={"opponent": "tictactoe@champion", "agent": "player_1"} | body)
     assert reply.status_code == status, reply.text
-    return dict(reply.json())
+    return described("PlayedGame" if status == 200 else "Error", reply.json())
+
+
+def described(kind: str, answer: dict[str, Any]) -> dict[str, Any]:
+    """An answer that is what the description says."""
+    parts = {"$ref": f"#/components/schemas/{kind}", "components": document(QUICK, [])["components"]}
+    Draft202012Validator(parts).validate(answer)
+    return answer
 
 
 def test_a_recorded_game_is_shown_step_by_step(client: TestClient, match: Match) -> None:
-    document = client.get(game(match, 1)).json()
+    book = described("RecordedGame", client.get(game(match, 1)).json())
     record = match.games[1]
-    assert (document["match"], document["game"], document["fault"]) == (match.id, 1, None)
-    assert [move["action"] for step in document["steps"] for move in step["moves"]] == [
+    assert (book["match"], book["game"], book["fault"]) == (match.id, 1, None)
+    assert [move["action"] for step in book["steps"] for move in step["moves"]] == [
         *record.opening,
         *record.actions,
     ]
-    assert len(document["steps"]) == document["length"] + 1
-    assert document["cast"] == {f"player_{i + 1}": match.contestants[c] for i, c in enumerate(record.sides)}
-    last = document["steps"][-1]["moves"][0]
+    assert len(book["steps"]) == book["length"] + 1
+    assert book["cast"] == {f"player_{i + 1}": match.contestants[c] for i, c in enumerate(record.sides)}
+    last = book["steps"][-1]["moves"][0]
     assert last["chances"][0][0] == last["action"]
     part = client.get(game(match, 1), params={"from": 2, "to": 4, "every": 1}).json()
-    assert part["steps"] == document["steps"][2:4]
+    assert part["steps"] == book["steps"][2:4]
 
 
 def test_a_recorded_game_is_a_film_to_keep(client: TestClient, match: Match) -> None:
@@ -123,24 +132,24 @@ def test_a_recorded_game_is_a_film_to_keep(client: TestClient, match: Match) -> 
 
 
 def test_it_tells_as_whom_and_against_whom_to_play(client: TestClient) -> None:
-    document = client.get(f"{LEAGUE}/playable").json()
-    assert document["opponents"] == ["tictactoe@2", "tictactoe@1", "script:random", "script:one_ply"]
-    assert [seat["agent"] for seat in document["agents"]] == ["player_1", "player_2"]
-    assert (document["playable"], document["draws"]) == (True, True)
+    table = described("Playable", client.get(f"{LEAGUE}/playable").json())
+    assert table["opponents"] == ["tictactoe@2", "tictactoe@1", "script:random", "script:one_ply"]
+    assert [seat["agent"] for seat in table["agents"]] == ["player_1", "player_2"]
+    assert (table["playable"], table["draws"]) == (True, True)
 
 
 def test_a_game_is_played_to_its_end_by_whoever_holds_its_choices(client: TestClient) -> None:
     actions: list[int] = []
-    document = played(client, seed=3, chances=True)
-    assert document["opponent"] == "tictactoe@2", "the champion of this moment, by its number"
-    while not document["over"]:
-        assert document["picture"].startswith("data:image/png")
-        assert sorted(action for action, _ in document["chances"]) == document["legal"]
-        actions.append(document["legal"][-1])
-        document = played(client, opponent=document["opponent"], seed=3, chances=True, actions=actions)
-    assert document["score"] in (0.0, 0.5, 1.0)
-    assert sum(document["returns"].values()) == 0
-    moves = [move for step in document["steps"] for move in step["moves"]]
+    sat = played(client, seed=3, chances=True)
+    assert sat["opponent"] == "tictactoe@2", "the champion of this moment, by its number"
+    while not sat["over"]:
+        assert sat["picture"].startswith("data:image/png")
+        assert sorted(action for action, _ in sat["chances"]) == sat["legal"]
+        actions.append(sat["legal"][-1])
+        sat = played(client, opponent=sat["opponent"], seed=3, chances=True, actions=actions)
+    assert sat["score"] in (0.0, 0.5, 1.0)
+    assert sum(sat["returns"].values()) == 0
+    moves = [move for step in sat["steps"] for move in step["moves"]]
     assert [move["action"] for move in moves if move["ref"] == "person"] == actions
 
 
@@ -198,8 +207,8 @@ def test_what_is_not_there_is_not_shown(client: TestClient, match: Match, path: 
 
 def test_a_league_that_nobody_has_played_is_playable_by_scripts(client: TestClient) -> None:
     body = {"opponent": "script:one_ply", "agent": "player_2"}
-    document = client.post("/v1/leagues/other/play", json=body).json()
-    assert [move["agent"] for step in document["steps"] for move in step["moves"]] == ["player_1"]
+    sat = client.post("/v1/leagues/other/play", json=body).json()
+    assert [move["agent"] for step in sat["steps"] for move in step["moves"]] == ["player_1"]
 
 
 @pytest.mark.parametrize(

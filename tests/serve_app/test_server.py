@@ -349,9 +349,9 @@ def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
 
 @pytest.fixture(scope="module")
 def evaluator(url: str, served: Registry) -> Iterator[httpx.Client]:
-    """Has a key that may start evaluations and nights."""
-    _, token = served.create_key("night-owl", ["read", "evaluate", "promote"])
-    with httpx.Client(base_url=url, headers={"x-api-key": token}) as client:
+    """Has a key that may start evaluations and nights, and play."""
+    _, token = served.create_key("night-owl", ["act", "read", "evaluate", "promote"])
+    with httpx.Client(base_url=url, headers={"x-api-key": token}, timeout=30) as client:
         until(lambda: client.delete(f"{EVALUATIONS}/99").status_code == 404)  # both replicas know it soon
         yield client
 
@@ -435,41 +435,40 @@ def patiently(ask: Callable[[], httpx.Response]) -> httpx.Response:
     until(lambda: replies.append(ask()) or replies[-1].status_code != 503)
     assert all(reply.json()["code"] in ("not_ready", "no_studio") for reply in replies[:-1])
     assert all("retry-after" in reply.headers for reply in replies[:-1])
+    assert replies[-1].status_code == 200, replies[-1].text
     return replies[-1]
 
 
-def test_a_recorded_game_is_shown_and_filmed_by_the_studio(url: str, served: Registry) -> None:
+def test_a_recorded_game_is_shown_and_filmed_by_the_studio(evaluator: httpx.Client, served: Registry) -> None:
     evaluate(examples.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
     match = Ledger(served).matches(league=examples.LEAGUE)[-1]
     game = f"/v1/leagues/tictactoe/matches/{match.id}/games/1"
-    with httpx.Client(base_url=url) as client:
-        document = patiently(lambda: client.get(game)).json()
-        actions = [move["action"] for step in document["steps"] for move in step["moves"]]
-        assert actions == [*match.games[1].opening, *match.games[1].actions]
-        assert patiently(lambda: client.get(f"{game}/film.gif")).content[:6] == b"GIF89a"
+    document = patiently(lambda: evaluator.get(game)).json()
+    actions = [move["action"] for step in document["steps"] for move in step["moves"]]
+    assert actions == [*match.games[1].opening, *match.games[1].actions]
+    assert patiently(lambda: evaluator.get(f"{game}/film.gif")).content[:6] == b"GIF89a"
 
 
-def test_a_game_goes_on_whatever_dies_in_its_midst(url: str, served: Registry) -> None:
+def test_a_game_goes_on_whatever_dies_in_its_midst(evaluator: httpx.Client, served: Registry) -> None:
     body: dict[str, Any] = {"opponent": "tictactoe@2", "agent": "player_1", "chances": True, "actions": []}
-    with httpx.Client(base_url=url, timeout=30) as client:
 
-        def move() -> dict[str, Any]:
-            return dict(patiently(lambda: client.post("/v1/leagues/tictactoe/play", json=body)).json())
+    def move() -> dict[str, Any]:
+        return dict(patiently(lambda: evaluator.post("/v1/leagues/tictactoe/play", json=body)).json())
 
-        body["actions"].append(move()["legal"][0])
-        (stage,) = processes(served.storage, "evaluation.stage")
-        os.kill(stage, signal.SIGKILL)
-        until(lambda: stage not in processes(served.storage, "evaluation.stage"))
-        body["actions"].append(move()["legal"][0])
-        (studio,) = processes(served.storage, ":Studio")
-        os.kill(studio, signal.SIGKILL)
-        document = move()
-        assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
-        until(lambda: studio not in processes(served.storage, ":Studio"))
-        assert len(processes(served.storage, "evaluation.stage")) == 1, "the one of the studio that died is gone"
-        refused = client.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
-        assert (refused.status_code, refused.json()["code"]) == (422, "illegal_action")
-        assert "Traceback" not in refused.text
+    body["actions"].append(move()["legal"][0])
+    (stage,) = processes(served.storage, "evaluation.stage")
+    os.kill(stage, signal.SIGKILL)
+    until(lambda: stage not in processes(served.storage, "evaluation.stage"))
+    body["actions"].append(move()["legal"][0])
+    (studio,) = processes(served.storage, ":Studio")
+    os.kill(studio, signal.SIGKILL)
+    document = move()
+    assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
+    until(lambda: studio not in processes(served.storage, ":Studio"))
+    assert len(processes(served.storage, "evaluation.stage")) == 1, "the one of the studio that died is gone"
+    refused = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
+    assert (refused.status_code, refused.json()["code"]) == (422, "illegal_action")
+    assert "Traceback" not in refused.text
 
 
 def test_a_server_that_was_killed_can_be_started_again(storage: Storage) -> None:

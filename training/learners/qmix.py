@@ -17,7 +17,6 @@ from league.training_config import QMIXConfig
 from training.learners.off_policy import Batch, Loss, OffPolicyLearner
 from training.learners.q_targets import next_actions
 from training.learners.team_targets import TeamSteps
-from training.modules.acting import ACTED, NOT_ACTED
 from training.modules.agent_network import AgentNetwork, Observations, flat
 from training.modules.mixer import Mixer, MonotonicMixer, summed, unmixed
 from training.replay import DISCOUNTS, NEXT, names
@@ -171,8 +170,6 @@ def _in_sequences(network: AgentNetwork, play: _Play, steps: int) -> tuple[Tenso
 
     acted, there = in_time(play.actions), in_time(play.present)
     state = {key: in_time(column)[0] for key, column in play.memory.items()}
-    # Who comes later has done nothing yet, which is not the zero of rows that are not there.
-    state[ACTED] = torch.where(there[0].unsqueeze(-1), state[ACTED], NOT_ACTED)
     seen = {name: in_time(column) for name, column in play.seen.items()}
     values, behind = network.unroll(seen, state, acted, there)
     with torch.no_grad():

@@ -13,9 +13,9 @@ from training.modules.encoder import Encoder
 MASKED = -1e9
 """Logit, or value, of an illegal action: as a logit its probability is exactly 0 in float32, and entropy and gradients
 stay finite."""
-ACTED, NOT_ACTED = "acted", -1.0
-"""Key of the state of a module that remembers its last raw action, (1,) float32, and its value before the first one.
-Who draws actions from the module's distribution puts them there."""
+ACTED = "acted"
+"""Key of the state of a module that remembers its last action: the raw action plus one, (1,) float32; 0 before the
+first one, as all state is 0 where an episode begins. Who draws from the module's distribution puts the action there."""
 
 
 class Acting(TorchRLModule):

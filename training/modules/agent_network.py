@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from torch import Tensor
 
-from training.modules.acting import ACTED, NOT_ACTED, Acting
+from training.modules.acting import ACTED, Acting
 from training.modules.distributions import Categorical
 from training.modules.encoder import Encoder, linear
 from training.modules.gated_memory import GatedMemory
@@ -43,7 +43,7 @@ class AgentNetwork(Acting):
         """The state before an episode's first step, key → (width,); empty without a memory."""
         if self.memory is None:
             return {}
-        return {HIDDEN: np.zeros(self.memory.width, np.float32), ACTED: np.full(1, NOT_ACTED, np.float32)}
+        return {HIDDEN: np.zeros(self.memory.width, np.float32), ACTED: np.zeros(1, np.float32)}
 
     def values(self, observations: Observations) -> Tensor:
         """(B, …) → (B, actions), not masked; without a memory."""
@@ -66,7 +66,7 @@ class AgentNetwork(Acting):
         for step in range(steps):
             new = self.memory(self._recalling(embeddings[step], acted), hidden)
             hidden = torch.where(present[step].unsqueeze(-1), new, hidden)
-            acted = torch.where(present[step], actions[step].to(acted.dtype), acted)
+            acted = torch.where(present[step], actions[step].to(acted.dtype) + 1, acted)
             remembered.append(hidden)
         behind = torch.stack(remembered)
         return self.head(behind), behind
@@ -74,7 +74,7 @@ class AgentNetwork(Acting):
     def values_after(self, observations: Observations, actions: Tensor, hidden: Tensor) -> Tensor:
         """Values (B, actions) of observations (B, …) that follow actions (B,), with what was remembered then."""
         assert self.memory is not None
-        inputs = self._recalling(self.encoder(observations), actions.to(hidden.dtype))
+        inputs = self._recalling(self.encoder(observations), actions.to(hidden.dtype) + 1)
         return self.head(self.memory(inputs, hidden))
 
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
@@ -100,14 +100,14 @@ class AgentNetwork(Acting):
         return masked(self.head(embeddings), observations), hidden
 
     def _recalling(self, embeddings: Tensor, acted: Tensor) -> Tensor:
-        """(B, width) and the last actions (B,), NOT_ACTED at first → the memory's inputs."""
-        numbers = torch.arange(self.actions, device=acted.device, dtype=acted.dtype)
+        """(B, width) and the last actions (B,) plus one, 0 at first → the memory's inputs."""
+        numbers = torch.arange(1, self.actions + 1, device=acted.device, dtype=acted.dtype)
         return torch.cat([embeddings, (acted.unsqueeze(-1) == numbers).to(embeddings.dtype)], dim=-1)
 
 
 def _state(hidden: Tensor, values: Tensor) -> dict[str, Tensor]:
     """As if the greedy action were taken; who draws another one puts it in."""
-    return {HIDDEN: hidden, ACTED: values.argmax(-1, keepdim=True).to(hidden.dtype)}
+    return {HIDDEN: hidden, ACTED: values.argmax(-1, keepdim=True).to(hidden.dtype) + 1}
 
 
 def flat(observations: Observations) -> Observations:

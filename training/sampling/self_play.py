@@ -181,4 +181,4 @@ class SelfPlay:
 
 def _with_action(state: State, raw: NDArray) -> State:
     """The state after, with the action that was drawn where it is remembered."""
-    return state | {ACTED: raw[:, np.newaxis].astype(np.float32)} if ACTED in state else state
+    return state | {ACTED: raw[:, np.newaxis].astype(np.float32) + 1} if ACTED in state else state

@@ -20,7 +20,7 @@ from serve_app.permissions import of_request
 from tests.serve_app.conftest import QUICK
 
 ROOT = Path(__file__).parents[3]
-NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion", "evaluation": "1"}
+NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion", "evaluation": "1", "game": "0"}
 NAMES |= {"verdict": "v", "schedule": "s", "position": "0", "run": "r"}
 
 

@@ -20,7 +20,7 @@ from tests.training.leagues import by_values
 from training import parity
 from training.algorithms.dispatch import algorithm_config, module_spec
 from training.algorithms.off_policy import OffPolicy
-from training.export import export_policy, graph_tensors
+from training.export import export_policy, graph_tensors, state_names
 from training.learners import qmix as learning
 from training.learners.q_targets import next_actions
 from training.modules.acting import ACTED, MASKED
@@ -113,7 +113,7 @@ def test_the_memory_holds_the_actions_that_were_drawn(monkeypatch: pytest.Monkey
         algorithm.stop()
     assert len({tuple(row) for row in drawn}) > 10
     for step, rows in enumerate(remembered):
-        assert rows == ([-1.0] * 4 if step % ROUNDS == 0 else [float(action) for action in drawn[step - 1]])
+        assert rows == ([0.0] * 4 if step % ROUNDS == 0 else [action + 1.0 for action in drawn[step - 1]])
 
 
 def check_values(gamma: float = 0.9, **settings: Any) -> None:
@@ -208,7 +208,7 @@ def test_what_is_exported_sees_its_own_observation_alone(settings: dict[str, Any
     met = parity.gather(league.environment, described, {"shared": module}, seed=1)["shared"]
     proof = parity.prove(tmp_path / "shared.onnx", "shared", module, met, spaces.action)
     assert (proof.mismatches, proof.max_difference < 1e-5) == (0, True)
-    recurrent = {f"state_in_{i}": value for i, value in enumerate(met[0].state.values())}
+    recurrent = dict(zip(state_names(met[0].state), met[0].state.values(), strict=True))
     graph = OnnxPolicy(tmp_path / "shared.onnx").distribution(met[0].observations, state=recurrent or None)
     assert (graph.actions != 1).all()
 

@@ -1,3 +1,4 @@
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -6,7 +7,11 @@ import pytest
 import torch
 from ray.rllib.core.columns import Columns
 
-from training.modules.acting import ACTED, MASKED, NOT_ACTED
+from league.interface import AgentInterface
+from league.policies.onnx import OnnxPolicy
+from league.spaces import from_gymnasium
+from training.export import export_policy
+from training.modules.acting import ACTED, MASKED
 from training.modules.agent_network import AgentNetwork
 from training.modules.memory import HIDDEN
 
@@ -80,7 +85,7 @@ def test_learning_sees_the_values_that_were_acted_by() -> None:
         answer = act({name: rows[step] for name, rows in observed.items()}, state)
         played = answer[Columns.ACTION_DIST_INPUTS][there]
         torch.testing.assert_close(values[step][there][:, [0, 2]], played[:, [0, 2]])
-        new = {HIDDEN: answer[Columns.STATE_OUT][HIDDEN], ACTED: actions[step].unsqueeze(-1).float()}
+        new = {HIDDEN: answer[Columns.STATE_OUT][HIDDEN], ACTED: actions[step].unsqueeze(-1).float() + 1}
         state = {key: torch.where(there.unsqueeze(-1), new[key], state[key]) for key in state}
         later = act({name: rows[step] for name, rows in after.items()}, state)[Columns.ACTION_DIST_INPUTS]
         torch.testing.assert_close(following[step][there][:, [0, 2]], later[there][:, [0, 2]])
@@ -88,10 +93,10 @@ def test_learning_sees_the_values_that_were_acted_by() -> None:
 
 def test_what_was_done_last_is_remembered_as_if_it_were_the_best() -> None:
     module = network()
-    assert module.get_initial_state()[ACTED].tolist() == [NOT_ACTED]
+    assert module.get_initial_state()[ACTED].tolist() == [0]  # as all state that a graph begins with
     answer = module.forward_inference({Columns.OBS: seen(20), Columns.STATE_IN: first(20)})
     best = answer[Columns.ACTION_DIST_INPUTS].argmax(-1)
-    assert answer[Columns.STATE_OUT][ACTED].squeeze(-1).tolist() == best.tolist()
+    assert answer[Columns.STATE_OUT][ACTED].squeeze(-1).tolist() == (best + 1).tolist()
 
 
 def test_the_last_action_is_an_input() -> None:
@@ -100,6 +105,27 @@ def test_the_last_action_is_an_input() -> None:
         module.forward_inference(
             {Columns.OBS: rows, Columns.STATE_IN: first(1) | {ACTED: torch.tensor([[float(action)]])}}
         )[Columns.ACTION_DIST_INPUTS]
-        for action in (NOT_ACTED, 0, 1, 2)
+        for action in range(4)  # none, or one of three
     ]
     assert len({tuple(answer[0].tolist()) for answer in answers}) == 4
+
+
+def test_a_graph_begins_as_its_module_and_remembers_what_was_drawn(tmp_path: Path) -> None:
+    module, agents = network(), 20
+    spaces = AgentInterface(
+        observation=from_gymnasium(SPACE), action=from_gymnasium(gymnasium.spaces.Discrete(ACTIONS))
+    )
+    export_policy(module, spaces, tmp_path / "own.onnx")
+    policy = OnnxPolicy(tmp_path / "own.onnx")
+    draws = [np.random.default_rng(agent) for agent in range(agents)]
+    state, own, others = None, first(agents), 0
+    for _ in range(4):
+        rows = seen(agents)
+        expected = module.forward_inference({Columns.OBS: rows, Columns.STATE_IN: own})
+        answer = policy.act({name: row.numpy() for name, row in rows.items()}, state=state, explore=True, rng=draws)
+        assert answer.dist_inputs is not None
+        torch.testing.assert_close(torch.as_tensor(answer.dist_inputs), expected[Columns.ACTION_DIST_INPUTS])
+        others += int((answer.actions != answer.dist_inputs.argmax(-1)).sum())
+        taken = torch.as_tensor(answer.actions).float().unsqueeze(-1) + 1
+        state, own = answer.state, {HIDDEN: expected[Columns.STATE_OUT][HIDDEN], ACTED: taken}
+    assert others > 0
