@@ -60,12 +60,10 @@ def judgement(registry: Registry, verdict: VerdictRow, events: Sequence[AliasEve
     """Read all that there is to say of a verdict. events: of the champion's history."""
     candidate = f"{verdict.league}@{verdict.candidate}"
     gate = gate_of(verdict)
-    matches = Ledger(registry).matches(league=verdict.league, schedule=verdict.schedule)
     seen = findings(registry, verdict)
     decision = seen.champion
     promoted = any(event.verdict == verdict.id for event in events)
     estimate = decision.estimate
-    sided = Ledger(registry).schedule(verdict.schedule).scoring == "side"
     return Judgement(
         verdict=verdict.id,
         candidate=candidate,
@@ -87,11 +85,18 @@ def judgement(registry: Registry, verdict: VerdictRow, events: Sequence[AliasEve
         score=decision.score,
         elo=_finite(estimate.elo) if estimate else None,
         interval=(_finite(estimate.low), _finite(estimate.high)) if estimate else None,
-        difference=paired_difference(matches[: decision.blocks], candidate) if sided else None,
+        difference=_difference(registry, verdict, candidate, decision.blocks),
         alpha=verdict.alpha,
         anchors=tuple(map(anchor_report, seen.anchors)),
         confirmation=confirmation(registry, verdict),
     )
+
+
+def _difference(registry: Registry, verdict: VerdictRow, candidate: str, blocks: int) -> Difference | None:
+    ledger = Ledger(registry)
+    if ledger.schedule(verdict.schedule).scoring != "side":
+        return None
+    return paired_difference(ledger.matches(league=verdict.league, schedule=verdict.schedule)[:blocks], candidate)
 
 
 def _reason(verdict: VerdictRow, decision: Decision, promoted: bool) -> str:

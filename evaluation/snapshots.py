@@ -29,7 +29,7 @@ from evaluation.played import Played
 from evaluation.schedule import scoring
 from evaluation.standings import rated
 from evaluation.verdicts import schedules_of
-from league.errors import AlreadyRunning
+from league.errors import AlreadyRunning, StorageError
 from league.registry.registry import Registry
 from league.registry.rows import AliasEvent, VerdictRow
 from league.registry.snapshots import FORMAT, SUMMARY
@@ -43,8 +43,8 @@ MOST_POINTS = 400
 
 def refresh(registry: Registry, league: str) -> None:
     """Bring all of a league's snapshots up to date. Raises UnknownLeague, or AlreadyRunning."""
+    registry.league(league)
     with registry.alone(f"snapshots-{league}"), one_thread():
-        registry.league(league)
         mark = registry.marks()[league]  # first: what comes while this reads is computed again
         if registry.snapshot_marks(league).get(SUMMARY) != mark:
             _refresh_verdicts(registry, league)
@@ -88,6 +88,8 @@ def _refresh_verdicts(registry: Registry, league: str) -> None:
             continue
         try:
             document = judgement(registry, verdict, events).to_json()
+        except StorageError:
+            raise
         except Exception:  # one that cannot be told must not keep a league's others from being told
             logger.exception("verdict %s has no snapshot", verdict.id)
             continue

@@ -1,6 +1,6 @@
 """What there is to ask for: leagues, their versions, and which replica serves what.
 
-GET  /v1/leagues
+GET  /v1/leagues                      by name, all of them; with ?limit= or &before= a page
 GET  /v1/leagues/{league}
 GET  /v1/leagues/{league}/versions    ascending, all of them; with ?limit= or &before= a page, newest first
 """
@@ -31,9 +31,11 @@ class LeagueRoutes:
     def __init__(self, models: Models) -> None:
         self._models = models
 
-    async def leagues(self, _: Request) -> Response:
-        """All leagues: their champions, and what goes on in each."""
-        return await looked_up(self._models, _leagues)
+    async def leagues(self, request: Request) -> Response:
+        """Leagues: their champions, and what goes on in each. Raises InvalidInput."""
+        limit = queries.limit(request) if _is_paged(request) else None
+        before = queries.name(request, "before")
+        return await looked_up(self._models, lambda registry: _leagues(registry, before, limit))
 
     async def league(self, request: Request) -> Response:
         """One league: aliases, policies, and what each replica serves. Raises UnknownLeague."""
@@ -43,7 +45,7 @@ class LeagueRoutes:
     async def versions(self, request: Request) -> Response:
         """The versions of a league. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        if not {"limit", "before"} & request.query_params.keys():
+        if not _is_paged(request):
             return await looked_up(self._models, lambda registry: _all_versions(registry, league))
         limit, before = queries.limit(request), queries.number(request, "before")
 
@@ -55,10 +57,18 @@ class LeagueRoutes:
         return await looked_up(self._models, question)
 
 
-def _leagues(registry: Registry) -> dict[str, Any]:
-    aliases: dict[str, dict[str, int]] = {row.slug: {} for row in registry.leagues()}
+def _is_paged(request: Request) -> bool:
+    return not {"limit", "before"}.isdisjoint(request.query_params.keys())
+
+
+def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[str, Any]:
+    """By name, at most `limit` of those behind the one that ended the page before."""
+    names = sorted(row.slug for row in registry.leagues() if before is None or row.slug > before)
+    page, more = queries.paged(names, len(names) if limit is None else limit, lambda name: name)
+    aliases: dict[str, dict[str, int]] = {league: {} for league in page}
     for (league, alias), number in registry.all_aliases().items():
-        aliases.setdefault(league, {})[alias] = number
+        if league in aliases:
+            aliases[league][alias] = number
     versions, verdicts, summaries = registry.version_numbers(), registry.last_verdicts(), registry.snapshots(SUMMARY)
     evaluations, runs = registry.evaluation_counts(), registry.run_counts()
     asked = requests(registry.reports(since=ACKNOWLEDGED_WITHIN).values())
@@ -77,7 +87,7 @@ def _leagues(registry: Registry) -> dict[str, Any]:
             "running_runs": runs.get(league, 0),
         } | _asked(asked.get(league, NONE_YET))
 
-    return {"leagues": [document(league, found) for league, found in aliases.items()]}
+    return {"leagues": [document(league, found) for league, found in aliases.items()], "next": more}
 
 
 def _league(registry: Registry, league: str) -> dict[str, Any]:

@@ -68,6 +68,14 @@ def test_the_leagues_say_what_goes_on_in_each(reader: TestClient) -> None:
     assert (empty["champion"], empty["versions"], empty["games"], empty["last_verdict"]) == (None, 0, None, None)
 
 
+def test_leagues_are_read_by_pages(reader: TestClient) -> None:
+    every = [each["league"] for each in get(reader, "/v1/leagues", "Leagues")["leagues"]]
+    split = pages(reader, "/v1/leagues", "Leagues", "leagues", limit=3)
+    assert [len(page) for page in split] == [3, 3, 1]
+    assert [each["league"] for page in split for each in page] == every
+    assert reader.get("/v1/leagues", params={"limit": 0}).json()["code"] == "invalid_input"
+
+
 def test_a_league_says_when_its_standings_were_computed(reader: TestClient) -> None:
     board = get(reader, BOARD, "League")
     assert (board["summary"]["games"], board["up_to_date"]) == (12, True)
