@@ -152,6 +152,7 @@ function drawLevels(plot, levels, look) {
     ctx.stroke();
     ctx.font = `${12 * scale}px system-ui, sans-serif`;
     ctx.textAlign = "left";
+    ctx.textBaseline = "alphabetic";
     ctx.fillText(name, bbox.left + 6 * scale, y + (value < 0 ? 14 : -6) * scale);
     ctx.restore();
   }

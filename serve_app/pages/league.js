@@ -110,7 +110,7 @@ function Summary({ of: about, isFirst }) {
       ["Games", count(summary?.games)],
       ["Different ones", count(summary?.distinct_games)],
       about.requests_per_second != null && ["Requests/s", rate(about.requests_per_second)],
-      ["Standings of", html`<${When} at=${about.computed_at} />`],
+      ["Standings of", html`<${When} at=${about.computed_at} />${about.computed_at && !about.up_to_date && html`<small>being renewed</small>`}`],
     ]} cls=${isFirst ? "" : "aside"} />
     ${faults.length > 0 && html`<div class="notice bad" role="alert"><p><strong>A replica does not serve what it should.</strong></p>
       <ul>${faults.map((fault) => html`<li>${fault}</li>`)}</ul></div>`}`;

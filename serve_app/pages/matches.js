@@ -3,7 +3,7 @@
 import { html } from "./vendor/preact-htm.js";
 import { of, query } from "./api.js";
 import { useList, useMark } from "./data.js";
-import { Await, Empty, league as at, More, Table, useTitle, When } from "./parts.js";
+import { Await, Badge, Empty, league as at, More, Table, useTitle, When } from "./parts.js";
 import { useAddress } from "./router.js";
 import { count, number, tail } from "./words.js";
 
@@ -32,7 +32,7 @@ function Row({ league, of: match }) {
     <td>${match.contestants.map((ref, place) => html`${place > 0 && html`<span class="soft"> · </span>`}<span class="ref">${tail(ref)}</span>`)}</td>
     <td class="nowrap">${match.scores.map((score) => number(score, 1)).join(" : ")}</td>
     <td class="number">${count(match.games)}</td>
-    <td>${match.kind}</td>
+    <td class="nowrap">${match.kind}${!match.counts && html` <${Badge} sign="∅">does not count<//>`}</td>
     <td class="nowrap"><${When} at=${match.played_at} /></td>
   </tr>`;
 }

@@ -8,7 +8,7 @@ import { Await, Empty, Facts, league as at, More, State, Table, useTitle, When }
 import { count, short } from "./words.js";
 
 export function Runs({ league }) {
-  const runs = useList(of(league, "runs"), "runs", useMark("runs"));
+  const runs = useList(of(league, "runs"), "runs", useMark("run", "runs"));
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Training</h2></div>
     <${Await} of=${runs}>${runs.items && (runs.items.length

@@ -3,24 +3,23 @@
 import { html, useState } from "./vendor/preact-htm.js";
 import { of } from "./api.js";
 import { Chart } from "./chart.js";
-import { useData, useMark } from "./data.js";
+import { useData, useList, useMark } from "./data.js";
 import { Await, Badge, Empty, More, Ref, Table, When } from "./parts.js";
 import { Promote } from "./promoting.js";
 import { count, interval, several, short, signed } from "./words.js";
-
-const PAGE = 50;
 
 export function Versions({ league, about }) {
   const [promoted, setPromoted] = useState(null);
   const mark = useMark("computed_at", "aliases", "version");
   const ratings = useData(of(league, "ratings"), mark);
-  const versions = useData(of(league, "versions"), mark);
+  const versions = useList(of(league, "versions"), "versions", mark);
   const rated = ratings.data?.versions ?? [];
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Versions</h2></div>
     ${rated.some((each) => each.rating != null) && html`<${Way} of=${rated} />`}
-    <${Await} of=${versions}>${versions.data && html`<${List} league=${league} versions=${versions.data.versions}
+    <${Await} of=${versions}>${versions.items && html`<${List} league=${league} versions=${versions.items}
       rated=${new Map(rated.map((each) => [each.number, each]))} champion=${about.champion} promote=${setPromoted} />`}<//>
+    <${More} of=${versions} />
     ${promoted != null && html`<${Promote} league=${league} champion=${about.champion} version=${promoted} onClose=${() => setPromoted(null)} />`}
   </section>`;
 }
@@ -38,14 +37,11 @@ function Way({ of: all }) {
 }
 
 function List({ league, versions, rated, champion, promote }) {
-  const [shown, setShown] = useState(PAGE);
   if (!versions.length) return html`<${Empty}>No version is published yet.<//>`;
-  const newest = [...versions].reverse();
-  const more = { more: shown < newest.length ? () => setShown(shown + PAGE) : null };
   const head = [["Version"], ["Rating", "number"], ["95 % interval"], ["Games", "number"], ["Made by"], ["Steps", "number"], ["From"], ["Made"], ["Promote", "", true]];
   return html`<${Table} caption="Versions, newest first" head=${head} cls="full">
-    ${newest.slice(0, shown).map((each) => html`<${Row} key=${each.version} league=${league} of=${each} rated=${rated.get(each.version)} champion=${champion} promote=${promote} />`)}
-  <//><${More} of=${more} />`;
+    ${versions.map((each) => html`<${Row} key=${each.version} league=${league} of=${each} rated=${rated.get(each.version)} champion=${champion} promote=${promote} />`)}
+  <//>`;
 }
 
 function Row({ league, of: each, rated, champion, promote }) {
