@@ -28,8 +28,8 @@ PAGES = {
     f"{L}/matches/{{schedule}}/0/0": (r"player_1", r"of \d"),
     f"{L}/evaluations": (r"None was asked for yet|#\d",),
     f"{L}/evaluations/new": (r"Contestants: every version", r"At most minutes"),
-    f"{L}/runs": (RUN, r"50 %"),
-    f"{L}/runs/{RUN}": (r"20,000 of 40,000", r"entropy", r"More curves"),
+    f"{L}/runs": (RUN, r"5\d %"),
+    f"{L}/runs/{RUN}": (r"2\d,000 of 40,000", r"entropy", r"More curves"),
     f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your seat"),
     f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
     f"{L}/nothing": (r"There is no such page",),
@@ -130,3 +130,12 @@ def test_everything_is_reached_by_keyboard(tab: Tab) -> None:
     expect(page.get_by_role("heading", level=2)).to_contain_text("against script:random")
     page.go_back()
     expect(page.get_by_role("heading", level=2)).to_have_text("Who beats whom")
+
+
+def test_a_long_list_is_shown_page_by_page(tab: Tab) -> None:
+    page = tab.open(f"{L}/matches")
+    rows = page.locator("tbody tr")
+    expect(rows).to_have_count(50)
+    page.get_by_role("button", name="Show more").click()
+    expect(rows).to_have_count(100)
+    assert len(set(page.locator("tbody th a").evaluate_all("links => links.map(link => link.href)"))) == 100
