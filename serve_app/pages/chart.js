@@ -9,9 +9,9 @@ const dashOf = (number) => DASHES[(number + Math.floor(number / 6)) % 6];
 const FONT = "12px system-ui, sans-serif";
 
 /**
- * `x`: the places, ascending. `lines`: {name, values} over them (null where there is none); {kind: "steps"} for stairs.
+ * `x`: the places, ascending. `lines`: {name, values, dots} over them, null where there is none; dots: whether each has one.
  * `levels`: {name, value, tone} across. `spans`: [low, high] or null over each place of the first line.
- * `stars`: of which places the first line's points are marked, with what is written there.
+ * `stars`: at which places the first line is marked. `words`: a value → how it is written.
  */
 export function Chart({ label, x, lines, levels = [], spans, stars, xName, yName, height = 260, words = short }) {
   const place = useRef();
@@ -106,14 +106,13 @@ function optionsOf({ look, latest, xName, yName, height, words, width, moved }) 
     cursor: { y: false, drag: { x: true, y: false }, points: { size: 7 } },
     scales: { x: { time: false, range: (_, low, high) => padded(low, high, 0.02) }, y: { range: (_, low, high) => reach(latest.current, low, high) } },
     axes: [
-      { ...axis, label: xName, labelSize: 18, size: 30, grid: { show: false }, values: (_, ticks) => ticks.map((tick) => (Number.isInteger(tick) || tick === null ? short(tick) : "")) },
+      { ...axis, label: xName, labelSize: 18, size: 30, grid: { show: false }, values: (_, ticks) => ticks.map((tick) => (Number.isInteger(tick) ? short(tick) : "")) },
       { ...axis, label: yName, labelSize: 18, size: 52, values: (_, ticks) => ticks.map((tick) => words(tick)) },
     ],
     series: [{}, ...lines.map((line, number) => ({
       label: line.name,
       stroke: look[`c${number % 6}`],
-      width: line.faint ? 1 : 1.75,
-      alpha: line.faint ? 0.6 : 1,
+      width: 1.75,
       dash: dashOf(number),
       spanGaps: true,
       points: { show: line.dots ?? line.values.length < 2, size: 7, fill: look.paper },

@@ -11,7 +11,7 @@ export function useData(path, mark = "") {
   return useFetched(path, mark, (signal) => ask(path, { signal }));
 }
 
-/** {items, more, fault, again, first} of a paged list: `more()` shows the next page, null where there is none. */
+/** {items, more, fault, again} of a paged list: `more()` shows the next page, null where there is none. */
 export function useList(path, name, mark = "") {
   const [least, setLeast] = useState(PAGE);
   useEffect(() => setLeast(PAGE), [path]);
@@ -28,7 +28,7 @@ async function collect(path, name, least, signal) {
     const limit = Math.min(LARGEST, least - items.length);
     const page = await ask(query(...withQuery(path, { limit, before: next })), { signal });
     items.push(...page[name]);
-    next = page.next ?? page.before ?? null;
+    next = page.next;
   } while (next != null && items.length < least);
   return { items, next };
 }

@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from league.registry.registry import Registry
 from serve_app.launch import running
 from tests.browser import leagues
+from tests.evaluation.examples import LEAGUE
 
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update"]
 PATIENCE = 20_000
@@ -35,7 +36,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         with pytest.MonkeyPatch.context() as environment:
             environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
             with running(registry.storage, replicas=1, insecure=True) as url:
-                for league in (leagues.LEAGUE, leagues.CONNECT_FOUR):
+                for league in (LEAGUE, leagues.CONNECT_FOUR):
                     leagues.answer("GET", f"{url}/v1/leagues/{league}/playable")  # the studio has started
                 yield Served(url, registry, keys)
 

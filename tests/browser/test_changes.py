@@ -2,7 +2,7 @@
 
 import re
 
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import Served, Tab
 from tests.browser.leagues import EMPTY, RUN, record
@@ -100,6 +100,24 @@ def test_a_key_is_kept_in_the_session_alone(tab: Tab, served: Served) -> None:
     assert page.evaluate("sessionStorage.getItem('key')") is None
 
 
+def test_where_looking_needs_a_key_it_is_asked_for_once(tab: Tab, served: Served) -> None:
+    def locked(route: Route) -> None:
+        if route.request.headers.get("authorization") == f"Bearer {served.keys['reader']}":
+            route.continue_()
+        else:
+            route.fulfill(status=401, json={"code": "unauthenticated", "message": "this needs an API key"})
+
+    tab.page.route("**/v1/**", locked)
+    page = tab.open(L)
+    expect(page.get_by_role("dialog")).to_have_count(1)
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("alert").first).to_contain_text("A key is needed")
+    page.get_by_role("button", name=re.compile("^Key")).click()
+    enter_key(page, served.keys["reader"])
+    leader(page, 3)
+    tab.forgive(401)
+
+
 def test_an_evaluation_is_started_watched_and_stopped(tab: Tab, served: Served) -> None:
     page = tab.open(f"{L}/evaluations/new")
     page.get_by_label("script:random").check()
@@ -193,7 +211,7 @@ def test_who_was_champion_then(tab: Tab, served: Served) -> None:
 def test_a_server_that_is_busy_for_a_moment_is_asked_again(tab: Tab) -> None:
     answers = iter([503, 429])
 
-    def busy(route) -> None:  # type: ignore[no-untyped-def]
+    def busy(route: Route) -> None:
         status = next(answers, None)
         if status is None:
             route.continue_()
