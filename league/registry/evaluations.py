@@ -111,8 +111,9 @@ def wait(session: Session) -> bool:
 def claim(session: Session, runner: str, workers: int) -> EvaluationRow | None:
     """Give the oldest that waits, or whose runner has died, to `runner`; None if there is none."""
     now = datetime.now(UTC)
-    query = select(Evaluation).where(_is_free()).order_by(Evaluation.id)
-    for evaluation in session.scalars(query.with_for_update(skip_locked=True)):
+    # One at a time: who locked all that are free would leave none to those who claim beside it.
+    query = select(Evaluation).where(_is_free()).order_by(Evaluation.id).limit(1)
+    while (evaluation := session.scalar(query.with_for_update(skip_locked=True))) is not None:
         if not _ends_here(evaluation):
             evaluation.state, evaluation.runner, evaluation.workers = RUNNING, runner, workers
             evaluation.attempts += 1
