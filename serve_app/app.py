@@ -54,6 +54,7 @@ from serve_app.routes.history import HistoryRoutes
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.matches import MatchRoutes
 from serve_app.routes.metrics import MetricsRoute
+from serve_app.routes.pages import PageRoutes
 from serve_app.routes.promotion import PromotionRoutes
 from serve_app.routes.runs import RunRoutes
 from serve_app.routes.standings import StandingsRoutes
@@ -234,6 +235,7 @@ class Server:
                 Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
+                *PageRoutes().routes(),
             ],
             middleware=[
                 Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log),
