@@ -14,6 +14,7 @@ ORDER = (
     "maddpg",
     "parity",
     "serving",
+    "pages",
     "formats",
     "promotions",
     "shadowing",
@@ -24,6 +25,7 @@ ORDER = (
     "strength",
     "calibration",
     "evaluation",
+    "crowded_league",
 )
 
 

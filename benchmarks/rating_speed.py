@@ -128,6 +128,9 @@ def _written(scratch: Path, results: Sequence[BlockResult]) -> Registry:
             {
                 "schedule": schedule.id,
                 "position": block.position,
+                "league": LEAGUE,
+                "first": block.contestants[0],
+                "second": block.contestants[1],
                 "games": block.games,
                 "scores": dump_numbers(block.scores),
                 "returns": dump_numbers(block.returns),

@@ -52,12 +52,13 @@ def publish(home: Path, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Regi
     registry = Registry.open(Storage.at(home))
     registry.register(config, interface(config))
     for seed in range(versions):
-        registry.publish(LEAGUE, _builder(registry, seed, hidden), source=f"random/{seed}")
+        registry.publish(LEAGUE, builder(registry, seed, hidden), source=f"random/{seed}")
     registry.set_alias(LEAGUE, "champion", 1, expected=ANY, actor="benchmark", reason="something must answer")
     return registry
 
 
-def _builder(registry: Registry, seed: int, hidden: tuple[int, ...]) -> Callable[[Path, int], Manifest]:
+def builder(registry: Registry, seed: int, hidden: tuple[int, ...]) -> Callable[[Path, int], Manifest]:
+    """Writes a version's files into a directory."""
     row = registry.league(LEAGUE)
     (policy,) = row.interface.policy_ids
     spaces = row.interface.of_policy(policy)

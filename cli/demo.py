@@ -93,8 +93,9 @@ def _play(config: LeagueConfig, url: str) -> None:
 def _invite(league: str, url: str) -> None:
     say("")
     console.print(Rule("what to try next", align="left"))
+    say(f"Open {url} in a browser: standings, verdicts, games to watch, and")
+    say(f"  {url}/leagues/{league}/play    to play against the champion yourself.")
     say("In another terminal, after `source .venv/bin/activate`:")
-    say(f"  curl {url}/v1/leagues/{league}        what is served, by which replica")
     say(f"  league act {league}@champion            ask for an action over HTTP")
     say(f"  league versions {league}                versions with aliases and ratings")
     say(f"  league evaluate {league}                a round robin of all versions and scripts")

@@ -66,7 +66,7 @@ def _show(registry: Registry, refs: list[str], match: str | None, game: int, sid
         return between(refs, registry, side, seed)
     if refs:
         raise InvalidReference(f"match {match} says who plays: leave out {', '.join(refs)}")
-    return recorded(match, game, registry)
+    return recorded(match, game, registry, chances=True)
 
 
 def _tell(caption: "Caption") -> None:

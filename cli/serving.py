@@ -48,6 +48,7 @@ def serve(
         address=address,
         on_ready=lambda url: say(
             f"Serving the leagues of {storage.home} on {url}\n"
+            f"  {url}                                     the leagues, to look at and to play with in a browser\n"
             f"  {url}/docs                                every call, to try in a browser\n"
             f"  {url}/v1/leagues                          what is served\n"
             f"  {url}/v1/policies/LEAGUE/action           POST an observation, get an action\n"

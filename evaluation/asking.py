@@ -70,6 +70,18 @@ def ask(policy: Policy, batch: Batch, space: Leaf, state: State | None, generato
     return answer
 
 
+def fault_of(given: Actions, space: Leaf, mask: NDArray | None) -> Fault | None:
+    """Why the action of a batch of one row cannot be played; None if it can. Raises IllegalMask as `ask` does."""
+    try:
+        _check_form(given, 1, space)
+    except _Malformed as error:
+        return Fault("malformed", str(error))
+    if legal_rows(given.actions, space, mask).all():
+        return None
+    _check_mask(mask, space)
+    return _illegal(given.actions[0], mask, 0)
+
+
 class _Malformed(Exception):
     """An answer that is no array of actions."""
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import softmax
 
 from evaluation.exhibition import Moment, Move
@@ -87,9 +86,7 @@ class Captions:
             ref=ref,
             color=self._colors[ref],
             action=_action([move.action for move in moves]),
-            chances=_chances(moves[0].dist_inputs, moves[0].action, space)
-            if len(agents) == 1 and moves
-            else _shares(moves),
+            chances=_named(chances(moves[0], space)) if len(agents) == 1 and moves else _shares(moves),
             value=sum(moment.returns[agent] for agent in agents) / len(agents),
             acted=not acting.isdisjoint(agents),
         )
@@ -108,21 +105,27 @@ def _action(actions: Sequence[Any]) -> str:
     return " ".join(words)
 
 
-def _chances(inputs: NDArray | None, action: Any, space: Space) -> tuple[tuple[str, float], ...]:
-    """The most probable actions; of several choices at once the probability of each; nothing for continuous actions."""
-    if inputs is None:
+def chances(move: Move, space: Space, most: int = MOST_CHANCES) -> tuple[tuple[int, float], ...]:
+    """(action, probability) of the `most` probable actions; of several choices at once that of each that was made;
+    nothing for continuous actions, and where nobody was asked how likely they were."""
+    if move.dist_inputs is None:
         return ()
+    inputs = move.dist_inputs.astype(np.float64)
     match space:
         case Discrete(start=start):
-            likely = softmax(inputs.astype(np.float64))
-            best = np.argsort(-likely, kind="stable")[:MOST_CHANCES]
-            return tuple((str(index + start), float(likely[index])) for index in best.tolist())
+            likely = softmax(inputs)
+            best = np.argsort(-likely, kind="stable")[:most]
+            return tuple((index + start, float(likely[index])) for index in best.tolist())
         case MultiDiscrete():
-            chosen, raw = np.ravel(action), np.ravel(action) - np.ravel(space.start)
-            parts = np.split(inputs.astype(np.float64), np.cumsum(np.ravel(space.nvec))[:-1])
+            chosen, raw = np.ravel(move.action), np.ravel(move.action) - np.ravel(space.start)
+            parts = np.split(inputs, np.cumsum(np.ravel(space.nvec))[:-1])
             odds = [float(softmax(part)[index]) for part, index in zip(parts, raw, strict=True)]
-            return tuple(zip(map(str, chosen.tolist()), odds, strict=True))[:MOST_CHANCES]
+            return tuple(zip(chosen.tolist(), odds, strict=True))[:most]
     return ()
+
+
+def _named(likely: Sequence[tuple[int, float]]) -> tuple[tuple[str, float], ...]:
+    return tuple((str(action), chance) for action, chance in likely)
 
 
 def _shares(moves: Sequence[Move]) -> tuple[tuple[str, float], ...]:

@@ -1,19 +1,19 @@
 """One game for people to watch: any policies, near or behind HTTP, one step at a time. Nothing is recorded."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.running import State
 from league.config import LeagueConfig
 from league.environments.lockstep import stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Episode, Turn
 from league.errors import UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
-from league.policies.policy import Policy
+from league.policies.policy import Actions, Arrays, Policy
 from league.seeds import generator
 from league.spaces import Space, paths
 
@@ -73,6 +73,15 @@ def exhibit(environment: BatchedEnvironment, players: Mapping[str, Policy], seed
         yield Moment(step, moves, tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
 
 
+def answer(
+    policy: Policy, observations: Arrays, state: Arrays | None, rng: Sequence[np.random.Generator] | None
+) -> Actions:
+    """What a policy answers greedily, of a graph with the inputs of the distribution that its action is the mode of."""
+    if isinstance(policy, OnnxPolicy):
+        return policy.distribution(observations, state=state)
+    return policy.act(observations, state=state, rng=rng)
+
+
 def first_observation(config: LeagueConfig, interface: Interface, policy: str | None, seed: int = 0) -> Any:
     """What `policy` (None: whoever begins) sees first in a fresh episode, as nested lists: the body of a request.
 
@@ -99,18 +108,15 @@ class _Actor:
     def __init__(self, agent: str, policy: Policy, seed: int) -> None:
         self._agent, self._policy = agent, policy
         self._draws = generator(seed, agent)
-        self._state: State | None = None
+        self._state: Arrays | None = None
 
     def act(self, batch: Batch) -> tuple[NDArray, Move]:
         """The actions (1, …) of a batch of this agent alone, and the move that they are."""
-        if isinstance(self._policy, OnnxPolicy):
-            answer = self._policy.distribution(batch.observations, state=self._state)
-        else:
-            answer = self._policy.act(batch.observations, state=self._state, rng=[self._draws])
-        self._state, inputs = answer.state, answer.dist_inputs
+        given = answer(self._policy, batch.observations, self._state, [self._draws])
+        self._state, inputs = given.state, given.dist_inputs
         seen = {name: array[0] for name, array in batch.observations.items()}
-        move = Move(self._agent, seen, answer.actions[0].tolist(), None if inputs is None else inputs[0])
-        return answer.actions, move
+        move = Move(self._agent, seen, given.actions[0].tolist(), None if inputs is None else inputs[0])
+        return given.actions, move
 
 
 def _place(item: tuple[str, Batch]) -> int:

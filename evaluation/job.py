@@ -22,6 +22,7 @@ import ray
 from ray.exceptions import RayError
 
 from evaluation.budget import Budget
+from evaluation.children import end_with_studio, step_aside
 from evaluation.nightly import nightly
 from evaluation.report import EvaluationReport, Listener, NightReport, Progress, VerdictReport
 from evaluation.runners import Order
@@ -35,8 +36,6 @@ from league.settings import Storage
 logger = logging.getLogger("policy_league")
 BEAT = 1.0
 """Seconds between two signs of life: far less than `league.registry.evaluations.SILENT`."""
-ASIDE = 19
-"""The niceness of processes that play: a replica that has something to answer goes first."""
 
 
 class Stopped(Exception):
@@ -157,27 +156,14 @@ def _joined(order: Order) -> Iterator[None]:
 def _aside() -> dict[str, Any]:
     """The environment of tasks: they find the modules that this process finds, and give way as it does."""
     return {
-        "worker_process_setup_hook": "evaluation.job.step_aside",
+        "worker_process_setup_hook": "evaluation.children.step_aside",
         "env_vars": {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
     }
 
 
-def step_aside() -> None:
-    """Let others go first."""
-    os.nice(ASIDE)
-
-
-def _end_with_studio(order: Order, registry: Registry) -> None:
-    """Put the evaluation back and end when the process that started this one is gone."""
-
-    def watch() -> None:
-        while sys.stdin.buffer.read(1024):
-            pass
-        with suppress(LeagueError):
-            registry.release_evaluation(order.evaluation, order.runner)
-        os._exit(1)
-
-    threading.Thread(target=watch, name="studio", daemon=True).start()
+def _put_back(order: Order, registry: Registry) -> None:
+    with suppress(LeagueError):
+        registry.release_evaluation(order.evaluation, order.runner)
 
 
 def main() -> None:
@@ -185,7 +171,7 @@ def main() -> None:
     order = Order(**json.loads(sys.argv[1]))
     step_aside()
     registry = Registry.open(Storage.from_environment(), create=False)
-    _end_with_studio(order, registry)
+    end_with_studio(lambda: _put_back(order, registry))
     with _joined(order):
         play(order, registry)
 

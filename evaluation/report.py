@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from typing import Any, Literal
 
 from league.results.records import Scoring
@@ -27,6 +28,11 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def when(moment: datetime) -> str:
+    """An instant as documents have it: `2026-03-03T12:00:00Z`."""
+    return moment.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
 @dataclass(frozen=True, slots=True)
 class Standing(Document):
     """One contestant's results. `score` is in [0, 1], `mean_return` in the environment's own unit, over the blocks of
@@ -44,6 +50,21 @@ class Standing(Document):
     distinct_games: int | None
     rating: float | None
     interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class RatedVersion(Document):
+    """A version on its way. rating, interval: as in a Standing. champion_at: each time that it became champion."""
+
+    ref: str
+    number: int
+    made_at: str
+    steps: int
+    parent: int | None
+    rating: float | None
+    interval: tuple[float, float] | None
+    games: int
+    champion_at: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

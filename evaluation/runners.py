@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import secrets
 import subprocess
-import sys
 import threading
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 
+from evaluation import children
 from league.errors import LeagueError
 from league.registry.registry import Registry
 
@@ -108,10 +107,7 @@ class Runners:
         return asked is not None and datetime.now(UTC) - asked > GRACE
 
     def _bury(self, runner: _Runner) -> None:
-        code = runner.process.wait()
-        if runner.process.stdin is not None:
-            runner.process.stdin.close()
-        if code:
+        if code := children.bury(runner.process):
             logger.error("the process of evaluation %d ended with code %d", runner.order.evaluation, code)
         self._registry.release_evaluation(runner.order.evaluation, runner.order.runner)
 
@@ -122,15 +118,4 @@ class Runners:
             if claimed is None:
                 return
             order = Order(claimed.id, claimed.league, name, self._workers, self._address)
-            self._runners.append(_Runner(order, _process(order)))
-
-
-def _process(order: Order) -> subprocess.Popen[bytes]:
-    """A process that finds the modules that this one finds. Its standard input is open as long as this one lives."""
-    paths = os.pathsep.join(path for path in sys.path if path)
-    return subprocess.Popen(
-        [sys.executable, "-m", "evaluation.job", json.dumps(asdict(order))],
-        stdin=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": paths},
-        start_new_session=True,  # Ctrl-C is for the server, which ends it
-    )
+            self._runners.append(_Runner(order, children.start("evaluation.job", json.dumps(asdict(order)))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from evaluation.exhibition import Moment, exhibit
@@ -10,10 +11,11 @@ from evaluation.play import sides_of
 from evaluation.replay import replay, seated
 from league.config import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
-from league.errors import InvalidReference
+from league.errors import InvalidReference, LeagueError
 from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.pinning import pinned
+from league.policies.policy import Policy
 from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -25,7 +27,7 @@ class Show:
     """A game that can be played before somebody's eyes.
 
     cast: agent → reference of who plays it. play: environment of one copy → the game, step by step.
-    note: what is to be said of its end beside the returns.
+    opening: how many of its first steps were random. note: what is to be said of its end beside the returns.
     """
 
     title: str
@@ -33,6 +35,7 @@ class Show:
     interface: Interface
     cast: Mapping[str, str]
     play: Callable[[BatchedEnvironment], Iterator[Moment]]
+    opening: int = 0
     note: str | None = None
 
 
@@ -62,25 +65,40 @@ def between(refs: Sequence[str], registry: Registry, side: str | None = None, se
     )
 
 
-def recorded(match: str, game: int, registry: Registry) -> Show:
+def recorded(match: str, game: int, registry: Registry, chances: bool = False) -> Show:
     """Game number `game` of a match of the ledger, exactly as it was played.
 
+    chances: ask the versions once more how likely each action was; those that cannot be loaded any more are not asked.
     Raises NotFound, and InvalidReference if the match has no such game.
     """
-    record = Ledger(registry).match(match)
+    ledger = Ledger(registry)
+    record = ledger.match(match)
     if not 0 <= game < len(record.games):
         raise InvalidReference(f"match {match} has games 0 to {len(record.games) - 1}, not {game}")
     row = registry.league(record.league)
     agents = list(row.interface.agents)
     seats = zip(agents, sides_of(agents, seated(row.interface, record.games[game])), strict=True)
+    cast = {agent: record.contestants[record.games[game].sides[side]] for agent, side in seats}
+    players = _graphs(cast, registry, row.interface) if chances else {}
     return Show(
         title=f"{match} · game {game}",
         config=row.config,
         interface=row.interface,
-        cast={agent: record.contestants[record.games[game].sides[side]] for agent, side in seats},
-        play=lambda environment: replay(environment, row.config, row.interface, record, game),
+        cast=cast,
+        play=lambda environment: replay(environment, row.config, row.interface, record, game, players),
+        opening=ledger.schedule(record.schedule).opening_plies,
         note=_forfeits(record, game),
     )
+
+
+def _graphs(cast: Mapping[str, str], registry: Registry, interface: Interface) -> dict[str, Policy]:
+    """agent → its policy, of those that are played by versions which are still there."""
+    found: dict[str, Mapping[str, tuple[str, Policy]]] = {}
+    for ref in set(cast.values()):
+        if isinstance(parse_ref(ref), CheckpointRef):
+            with suppress(LeagueError):
+                found[ref] = contestant(ref, registry, interface)
+    return {agent: found[ref][agent][1] for agent, ref in cast.items() if ref in found}
 
 
 def _forfeits(match: Match, game: int) -> str | None:

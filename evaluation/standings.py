@@ -9,8 +9,9 @@ from dataclasses import replace
 from evaluation.contestants import ANCHOR
 from evaluation.payoff import only_side
 from evaluation.ratings import rate
-from evaluation.report import Standing
+from evaluation.report import RatedVersion, Standing, when
 from league.registry.registry import Registry
+from league.registry.rows import AliasEvent, VersionRow
 from league.results.ledger import Ledger
 from league.results.records import BlockResult, Game, Match
 
@@ -19,6 +20,22 @@ def standings(registry: Registry, league: str) -> tuple[Standing, ...]:
     """Everybody who played in the league's present environment, best first. Raises UnknownLeague."""
     digest = registry.league(league).environment_digest
     return ranked(Ledger(registry).results(league, digest))
+
+
+def rated(version: VersionRow, standings: Sequence[Standing], events: Sequence[AliasEvent]) -> RatedVersion:
+    """Where a version stands among `standings`, and when it became champion. events: of the champion's history."""
+    standing = next((each for each in standings if each.ref == version.ref), None)
+    return RatedVersion(
+        ref=version.ref,
+        number=version.number,
+        made_at=when(version.created_at),
+        steps=version.steps,
+        parent=version.parent,
+        rating=standing.rating if standing else None,
+        interval=standing.interval if standing else None,
+        games=standing.games if standing else 0,
+        champion_at=tuple(when(event.at) for event in reversed(events) if event.version == version.number),
+    )
 
 
 def by_side(sides: Sequence[str], matches: Sequence[Match]) -> dict[str, tuple[Standing, ...]]:

@@ -106,9 +106,15 @@ def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bo
     """
     row = registry.void_verdict(verdict, f"voided by {actor}: {reason}")
     if purge:
-        own = [row.schedule, *(anchor["schedule"] for anchor in row.settings.get("anchors", ()))]
-        Ledger(registry).purge([*own, row.settings.get("confirmation") or row.schedule])
+        Ledger(registry).purge(schedules_of(row))
     return row
+
+
+def schedules_of(verdict: VerdictRow) -> list[str]:
+    """The ids of the schedules whose matches are a verdict's own."""
+    anchors = [anchor["schedule"] for anchor in verdict.settings.get("anchors", ())]
+    confirmation = verdict.settings.get("confirmation")
+    return [verdict.schedule, *anchors, *([confirmation] if confirmation else [])]
 
 
 def _tests(registry: Registry, verdict: VerdictRow) -> list[tuple[Schedule, GateConfig]]:

@@ -18,6 +18,9 @@ LeagueError
 │   ├── UnknownAlias
 │   ├── UnknownPolicy
 │   ├── UnknownEvaluation
+│   ├── UnknownRun
+│   ├── UnknownVerdict
+│   ├── UnknownMatch
 │   └── UnknownKey
 ├── Conflict                  the world has moved on
 │   ├── AliasMoved              a compare-and-set lost
@@ -155,6 +158,24 @@ class UnknownEvaluation(NotFound):
     """The league has no evaluation of that number."""
 
     code = "unknown_evaluation"
+
+
+class UnknownRun(NotFound):
+    """The league has no training run of that name."""
+
+    code = "unknown_run"
+
+
+class UnknownVerdict(NotFound):
+    """There is no verdict of that id."""
+
+    code = "unknown_verdict"
+
+
+class UnknownMatch(NotFound):
+    """The ledger has no match of that id, or the match no such game."""
+
+    code = "unknown_match"
 
 
 class UnknownKey(NotFound):
@@ -315,3 +336,9 @@ class StorageError(LeagueError):
     """The database or the artefact store cannot be read or written."""
 
     code = "storage_error"
+
+
+BY_CODE: dict[str, type[LeagueError]] = {
+    error.code: error for error in list(vars().values()) if isinstance(error, type) and issubclass(error, LeagueError)
+}
+"""What a code that came from another process stands for."""

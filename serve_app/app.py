@@ -30,6 +30,7 @@ from serve_app.access_log import AccessLog
 from serve_app.alias_watcher import AliasWatcher
 from serve_app.doors import Doors, Guarded
 from serve_app.error_handlers import ErrorHandlers
+from serve_app.events import Events
 from serve_app.exposure import serves_other_machines
 from serve_app.inference_protocol.catalogue import Catalogue
 from serve_app.inference_protocol.grpc_handlers import offer
@@ -46,12 +47,20 @@ from serve_app.reporting import Reporter
 from serve_app.routes.action import ActionRoute, Shortcut
 from serve_app.routes.docs import DocsRoutes
 from serve_app.routes.evaluations import EvaluationRoutes
+from serve_app.routes.events import EventRoutes
+from serve_app.routes.games import GameRoutes
 from serve_app.routes.health import HealthRoutes
+from serve_app.routes.history import HistoryRoutes
 from serve_app.routes.leagues import LeagueRoutes
+from serve_app.routes.matches import MatchRoutes
 from serve_app.routes.metrics import MetricsRoute
+from serve_app.routes.pages import PageRoutes
 from serve_app.routes.promotion import PromotionRoutes
+from serve_app.routes.runs import RunRoutes
+from serve_app.routes.standings import StandingsRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
+from serve_app.routes.verdicts import VerdictRoutes
 from serve_app.settings import ServeSettings
 from serve_app.shadow import Shadow
 from serve_app.streams import StreamParts
@@ -60,6 +69,7 @@ from serve_app.traffic import Traffic
 from serve_app.versions import Versions
 
 LOOPBACK = "127.0.0.1"
+GAME = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
 SWITCH = 0.0005
 """Seconds after which a thread that looks at the database, or computes a shadow, gives way to the event loop. Python's
 default of 5 ms would be the time that the slowest requests wait."""
@@ -103,13 +113,13 @@ class PolicyServer:
             replica,
             machine=_node_address(),
             is_exposed=serves_other_machines(),
-            studio=studio and StudioHandle(studio),
+            studio=studio and StudioHandle(studio, settings.timeout),
         )
 
     def __serve_build_asgi_app__(self) -> Starlette:
         application = self._server.application()
         shorten(application)
-        http_protocol.install()
+        http_protocol.install(self._server.events.end)
         websocket_protocol.install(self._server.settings.max_body)
         offer(self._server.inference_service)
         gc.freeze()  # what is loaded by now stays: looking through it again and again would stop the event loop
@@ -159,20 +169,33 @@ class Server:
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
         self.evaluations = EvaluationRoutes(self.models, settings, studio)
+        self.games = GameRoutes(self.models, settings, studio)
+        self.events = Events(self.models, settings)
         self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
             self.inference, self.catalogue, self.watcher, self.doors, settings, machine, self.metrics.failed
         )
 
     def _in_flight(self) -> dict[str, int]:
-        return {"action": self.action.in_flight, "infer": self.inference.in_flight, "stream": self.stream.open}
+        return {
+            "action": self.action.in_flight,
+            "infer": self.inference.in_flight,
+            "stream": self.stream.open,
+            "events": self.events.open,
+        }
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
         leagues = LeagueRoutes(self.models)
+        standings = StandingsRoutes(self.models)
+        verdicts = VerdictRoutes(self.models)
+        matches = MatchRoutes(self.models)
+        runs = RunRoutes(self.models)
+        history = HistoryRoutes(self.models)
         promotion = PromotionRoutes(self.models, self.settings)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
+        events = EventRoutes(self.events, self.doors)
         docs = DocsRoutes(self.live, self.doors, self.settings)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
@@ -183,6 +206,16 @@ class Server:
                 Route("/v1/leagues", leagues.leagues),
                 Route("/v1/leagues/{league}", leagues.league),
                 Route("/v1/leagues/{league}/versions", leagues.versions),
+                Route("/v1/leagues/{league}/standings", standings.standings),
+                Route("/v1/leagues/{league}/payoff", standings.payoff),
+                Route("/v1/leagues/{league}/ratings", standings.ratings),
+                Route("/v1/leagues/{league}/verdicts", verdicts.every),
+                Route("/v1/leagues/{league}/verdicts/{verdict}", verdicts.one),
+                Route("/v1/leagues/{league}/matches", matches.every),
+                Route("/v1/leagues/{league}/matches/{schedule}/{position}", matches.one),
+                Route("/v1/leagues/{league}/runs", runs.every),
+                Route("/v1/leagues/{league}/runs/{run}", runs.one),
+                Route("/v1/leagues/{league}/aliases/{alias}/history", history.history),
                 Route("/v1/leagues/{league}/aliases/{alias}", promotion.move, methods=["POST"]),
                 Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
                 Route("/v1/leagues/{league}/traffic", traffic.show),
@@ -191,11 +224,18 @@ class Server:
                 Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.one),
                 Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
+                Route("/v1/leagues/{league}/evaluations/{evaluation}/events", events.evaluation),
+                Route("/v1/leagues/{league}/events", events.league),
+                Route(GAME, self.games.recording),
+                Route(f"{GAME}/film.gif", self.games.film),
+                Route("/v1/leagues/{league}/playable", self.games.table),
+                Route("/v1/leagues/{league}/play", self.games.play, methods=["POST"]),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),
                 Route("/v1/health/live", health.live),
                 Route("/v1/health/ready", health.ready),
+                *PageRoutes().routes(),
             ],
             middleware=[
                 Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log),
@@ -214,6 +254,7 @@ class Server:
                 await running.enter_async_context(self.key_watcher.watching())
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
+                await running.enter_async_context(self.events.watching())
                 yield
         finally:
             self.shadow.close()

@@ -1,33 +1,34 @@
 """The doors of a replica: every request, over HTTP, a WebSocket or gRPC, passes here before anything of ours sees it.
 
-    key → rate → backlog → deadline → the application
-    401   429     429       504
-    403
+    origin → key → rate → backlog → deadline → the application
+    403      401   429    429       504
+             403
 
 Behind HAProxy a replica still has ports of its own, which whoever reaches them may call: so the check is in the
-replica. A deadline is for HTTP alone: gRPC has one of its own, and a stream lasts.
+replica. A deadline is for HTTP alone: gRPC has one of its own, and a stream, of events too, lasts.
 """
 
 from collections.abc import Awaitable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
-from serve_app import permissions
+from serve_app import cross_site, permissions
 from serve_app.access_log import LINE, AccessLog
 from serve_app.backlog import Backlog
 from serve_app.bodies import IS_READ
 from serve_app.deadlines import Expired, within
 from serve_app.error_handlers import BodyTooSlow, ErrorHandlers
 from serve_app.keyring import Key, Keyring
+from serve_app.middleware import lasts
 from serve_app.permissions import Need
 from serve_app.settings import ServeSettings
 
 KEY = "league.key"
 """In the scope of a request that showed a key: that `Key`."""
 BEARER = b"bearer "
-READ_HERE = frozenset((b"authorization", b"x-api-key", b"x-request-timeout-ms"))
+READ_HERE = cross_site.READ | {b"authorization", b"x-api-key", b"x-request-timeout-ms"}
 DENIAL = "websocket.http.response"
 """ASGI's extension by which a WebSocket that is refused learns why."""
 POLICY_VIOLATION = 1008
@@ -66,26 +67,30 @@ class Doors:
 
         Raises Unauthenticated (also if the key is valid no longer), RateLimited or Overloaded.
         """
+        self.admit_still(key)
+        if key is not None:
+            _take(key)
+        self.backlog.admit()
+
+    def admit_still(self, key: Key | None) -> None:
+        """Let a stream go on that was opened with `key`. Raises Unauthenticated if that is valid no longer."""
         if key is None:
             if self.are_locked:
                 raise Unauthenticated("this stream needs an API key by now")
         elif not self._keyring.holds(key):
             raise Unauthenticated(f"the API key {key.name} was revoked, or has expired")
-        else:
-            _take(key)
-        self.backlog.admit()
 
     def lets_read_all(self, headers: Iterable[tuple[bytes, bytes]]) -> bool:
         """Whether a request that needs no key may be told of all leagues, by the key that it shows."""
         try:
-            self.admit(Need("read", None, is_of_all=True), _shown(headers)[0])
+            self.admit(Need("read", None, is_of_all=True), _shown(headers).token)
         except LeagueError:
             return False
         return True
 
     def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
         """Let a call of gRPC's GRPCInferenceService pass. Raises what `admit` raises."""
-        self.admit(permissions.of_rpc(rpc, model), _shown(headers_of(metadata))[0])
+        self.admit(permissions.of_rpc(rpc, model), _shown(headers_of(metadata)).token)
 
     def _authorize(self, need: Need, token: bytes | None) -> Key:
         key = None if token is None else self._keyring.find(token)
@@ -138,17 +143,19 @@ class Guarded:
             send = self._log.begin(scope, _path(scope), send)
         reply = Reply(send)
         try:
-            token, patience = _shown(scope["headers"])
-            need = permissions.of_request(kind, scope.get("method", "GET"), _path(scope))
-            key = self._doors.admit(need, token)
+            shown = _shown(scope["headers"])
+            method = scope.get("method", "GET")
+            if shown.is_browser:
+                cross_site.refuse_cross_site(method, scope["headers"])
+            key = self._doors.admit(permissions.of_request(kind, method, _path(scope)), shown.token)
             if key is not None:
                 scope[KEY] = key
                 if self._log is not None:
                     scope[LINE]["key"] = key.name
-            if kind != "http":
-                await self._application(scope, receive, send)
+            if kind != "http" or lasts(_path(scope)):
+                await self._application(scope, receive, reply.send)
                 return
-            timeout = self._timeout if patience is None else min(_seconds(patience), self._timeout)
+            timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
             await within(timeout, self._application(scope, receive, reply.send))
         except LeagueError as error:
             if reply.is_begun:
@@ -191,18 +198,30 @@ def headers_of(metadata: Iterable[tuple[str, Any]] | None) -> list[tuple[bytes, 
     return [(name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()]
 
 
-def _shown(headers: Iterable[tuple[bytes, bytes]]) -> tuple[bytes | None, bytes | None]:
-    """The key's text and the time limit that a request's headers hold."""
-    token, timeout = None, None
+class Shown(NamedTuple):
+    """What the headers of a request say."""
+
+    token: bytes | None
+    """The key's text."""
+    timeout: bytes | None
+    """Its time limit, in milliseconds."""
+    is_browser: bool
+    """Whether a browser tells where it comes from."""
+
+
+def _shown(headers: Iterable[tuple[bytes, bytes]]) -> Shown:
+    token, timeout, is_browser = None, None, False
     for name, value in headers:
         if name in READ_HERE:
             if name == b"x-request-timeout-ms":
                 timeout = value
             elif name == b"x-api-key":
                 token = value.strip()
+            elif name in cross_site.READ:
+                is_browser = True
             elif value[: len(BEARER)].lower() == BEARER:
                 token = value[len(BEARER) :].strip()
-    return token, timeout
+    return Shown(token, timeout, is_browser)
 
 
 def _seconds(milliseconds: bytes) -> float:

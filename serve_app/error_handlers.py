@@ -1,8 +1,8 @@
 """Errors become HTTP answers here, once: a status, a stable `code`, and a sentence.
 
-InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415) · Unauthenticated 401 · Forbidden 403
+InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415, IllegalAction 422) · Unauthenticated 401 · Forbidden 403
 NotFound 404 (VersionRetired 410) · BodyTooSlow 408 · Conflict 409 · Overloaded, RateLimited 429 with Retry-After
-NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · DeadlineExceeded 504 · anything else 500
+NotReady, ArtifactCorrupt, StorageError 503 with Retry-After · DeadlineExceeded, GameHung 504 · anything else 500
 """
 
 import logging
@@ -21,6 +21,8 @@ from league.errors import (
     Conflict,
     DeadlineExceeded,
     Forbidden,
+    GameHung,
+    IllegalAction,
     InvalidInput,
     LeagueError,
     NotFound,
@@ -47,6 +49,12 @@ class UnsupportedMediaType(InvalidInput):
     code = "unsupported_media_type"
 
 
+class CrossSite(Forbidden):
+    """A request that a page of another site made."""
+
+    code = "cross_site"
+
+
 class BodyTooSlow(LeagueError):
     """A body that has not arrived in time."""
 
@@ -56,6 +64,7 @@ class BodyTooSlow(LeagueError):
 STATUSES: dict[type[LeagueError], int] = {
     BodyTooLarge: 413,
     UnsupportedMediaType: 415,
+    IllegalAction: 422,
     InvalidInput: 400,
     Unauthenticated: 401,
     Forbidden: 403,
@@ -69,6 +78,7 @@ STATUSES: dict[type[LeagueError], int] = {
     ArtifactCorrupt: 503,
     StorageError: 503,
     DeadlineExceeded: 504,
+    GameHung: 504,
     LeagueError: 500,
 }
 """The nearest class of an error's ancestors counts."""

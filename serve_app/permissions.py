@@ -1,18 +1,19 @@
 """What a request needs: a scope, and the league that it is about. Pure.
 
-act      POST …/action, …/infer; a stream
+act      POST …/action, …/infer, …/play; a stream
 read     GET (HEAD) of anything else; the index of models
 evaluate POST and DELETE of evaluations, even where no other request needs a key
 promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
          thought of is not the one that is open
-nothing  health; the description of the server, which tells strangers nothing of a league
+nothing  health; the description of the server and the pages, which tell strangers nothing of a league
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 HEALTH = ("/v1/health/", "/v2/health/")
-DESCRIPTION = ("/docs", "/openapi.json")
+DESCRIPTION = ("/docs", "/openapi.json", "/", "/leagues")
+PAGES = ("/leagues/", "/pages/")
 ALIASES = ("aliases", "rollback", "traffic")
 
 
@@ -34,7 +35,7 @@ NOTHING = Need(None, None)
 @lru_cache(maxsize=4096)  # the same few come again and again
 def of_request(kind: str, method: str, path: str) -> Need:
     """What a request needs; `kind` is ASGI's, `http` or `websocket`, and `path` is below the root path."""
-    if (path.startswith(HEALTH) or path in DESCRIPTION) and method in ("GET", "HEAD"):
+    if (path.startswith(HEALTH + PAGES) or path in DESCRIPTION) and method in ("GET", "HEAD"):
         return NOTHING
     league = league_of(path)
     scope = _scope(kind, method, path)
@@ -59,7 +60,7 @@ def _scope(kind: str, method: str, path: str) -> str:
         return "read"
     is_action = path.startswith("/v1/policies/") and path.endswith("/action")
     is_inference = path.startswith("/v2/models/") and path.endswith("/infer")
-    if is_action or is_inference:
+    if is_action or is_inference or (method == "POST" and _is_below_league(path, ("play",))):
         return "act"
     is_evaluation = method in ("POST", "DELETE") and _is_below_league(path, ("evaluations",))
     return "evaluate" if is_evaluation else "promote"

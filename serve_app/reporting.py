@@ -12,6 +12,7 @@ from league.registry.rows import Shadowing
 from serve_app.alias_watcher import GOODBYE
 from serve_app.metrics import Metrics
 from serve_app.polling import Polling
+from serve_app.request_rates import RATE, RequestRates
 from serve_app.settings import ServeSettings
 from serve_app.shadow import Shadow
 
@@ -37,6 +38,7 @@ class Reporter:
         pace = settings.model_copy(update={"poll": settings.heartbeat, "poll_slowest": slowest})
         self._polling = Polling(self.report, "reports", pace)
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="report")
+        self._rates = RequestRates()
         self._written: dict[tuple[str, int, int], Shadowing] = {}
 
     @asynccontextmanager
@@ -59,6 +61,8 @@ class Reporter:
             for one in self._shadow.shadowings()
             if self._written.get((one.league, one.candidate, one.champion)) != one
         ]
-        write = partial(self._registry.report, self._replica, self._metrics.report(), shadowings)
+        report = self._metrics.report()
+        report |= {RATE: self._rates.since_last(report)}
+        write = partial(self._registry.report, self._replica, report, shadowings)
         await asyncio.get_running_loop().run_in_executor(self._thread, write)
         self._written |= {(one.league, one.candidate, one.champion): one for one in shadowings}

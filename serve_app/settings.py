@@ -25,6 +25,8 @@ class ServeSettings(BaseModel):
     """Requests for actions that a replica has begun and not yet answered; beyond them it answers 429."""
     max_streams: int = Field(default=1024, ge=1)
     """Streams open in a replica; one more is refused with 429."""
+    max_listeners: int = Field(default=200, ge=1)
+    """Streams of events open in a replica; one more is refused with 429."""
     max_batch: int = Field(default=1024, ge=1)
     """Most observations in one request."""
     timeout: float = Field(default=4.5, gt=0)
@@ -53,6 +55,8 @@ class ServeSettings(BaseModel):
     within a second, as promised, if poll ≤ 0.5."""
     poll_slowest: float = Field(default=5.0, gt=0)
     """The longest pause between looks while the database fails; pauses double up to it. At least `poll`."""
+    poll_events: float = Field(default=0.5, gt=0)
+    """Between two looks at what streams of events tell of; nobody looks while none is open."""
     heartbeat: float = Field(default=4.0, gt=0)
     """Between two acknowledgements of the same. At most a third of ACKNOWLEDGED_WITHIN: two may get lost."""
     retry: float = Field(default=3.0, gt=0)
@@ -66,7 +70,7 @@ class ServeSettings(BaseModel):
     """Share of a core that mirrored requests may take. What does not fit is dropped."""
     studio: str | None = None
     """What plays games, by import string: `evaluation.studio:deployment`, as deploy.yaml has it. None: nobody does, and
-    evaluations are answered 503."""
+    evaluations and games are answered 503."""
     evaluation_workers: int = Field(default=1, ge=1)
     """Processes that play the matches of one evaluation. They give way to replicas, but share their cores."""
     evaluations_at_once: int = Field(default=1, ge=1)

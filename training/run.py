@@ -18,6 +18,7 @@ from league.registry.rows import VersionRow
 from league.training_config import AnyTraining, TrainingConfig
 from training.algorithms.dispatch import algorithm_config, module_spec
 from training.algorithms.off_policy import replay_is_lost
+from training.chronicle import Chronicle
 from training.cluster import UNLIMITED, LocalRay, connected
 from training.faults import told
 from training.interrupts import Interrupted
@@ -52,7 +53,8 @@ def train(
     """Train `config` until its budget (`training.steps`, `training.minutes`) is spent.
 
     Registers the league, runs one Ray Tune trial, shows its progress on `console` (a bar in a terminal, plain lines
-    elsewhere), writes TensorBoard files below `<home>/runs/<league>/<run>` and publishes a version at each checkpoint.
+    elsewhere), records it in the registry for others to see, writes TensorBoard files below
+    `<home>/runs/<league>/<run>` and publishes a version at each checkpoint.
 
     parent: train on from this version; the first version of the run names it as its parent.
     resume: go on with the newest run of the league, which was interrupted, or has a larger budget now. What it
@@ -84,10 +86,10 @@ def train(
     with connected(address, registry.storage, local) as dashboard:
         run = interrupted or Run.begin(registry.storage, config, number, git_commit(config_path), pins)
         progress = Progress(console or Console(), run.record.config.training, interface.policy_ids)
-        with run.locked(), progress:
+        with run.locked(), progress, Chronicle(registry, run) as chronicle:
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
-            _work(run, registry, interface, progress)
+            _work(run, registry, interface, progress, chronicle)
     return versions(registry, run)
 
 
@@ -97,11 +99,11 @@ def check(config: LeagueConfig, interface: Interface) -> None:
     module_spec(config.training, interface).build()
 
 
-def _work(run: Run, registry: Registry, interface: Interface, progress: Progress) -> None:
+def _work(run: Run, registry: Registry, interface: Interface, progress: Progress, chronicle: Chronicle) -> None:
     publisher = Publisher(run, registry, interface, progress)
     try:
         _publish_rest(run, publisher)
-        spent = _tune(run, interface, registry, publisher, progress)
+        spent = _tune(run, interface, registry, publisher, progress, chronicle)
     except Exception:
         publisher.settle()
         raise
@@ -156,7 +158,14 @@ def _start(run: Run, registry: Registry) -> Start:
     return AFRESH
 
 
-def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publisher, progress: Progress) -> bool:
+def _tune(
+    run: Run,
+    interface: Interface,
+    registry: Registry,
+    publisher: Publisher,
+    progress: Progress,
+    chronicle: Chronicle,
+) -> bool:
     """One life of the run, as a Tune experiment of one trial. Whether its budget is spent."""
     config, life = run.record.config, run.next_life()
     (life / CHECKPOINTS).mkdir(parents=True)
@@ -165,6 +174,7 @@ def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publish
     if start.checkpoint is not None and replay_is_lost(config.training, start.checkpoint):
         progress.say("The replay buffer begins empty: nothing is learned until training.learning_starts transitions.")
     plan = Plan(start, life / CHECKPOINTS, life / END, registry.storage, cpus=share)
+    chronicle.begin(start.steps - start.steps_before_run, start.seconds)
 
     def ask_to_end() -> None:
         plan.end.touch()
@@ -178,7 +188,7 @@ def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publish
             "plan": plan,
         },
         tune_config=tune.TuneConfig(trial_dirname_creator=lambda _: life.name),
-        run_config=run_config(run.path, [_Driver(publisher, progress)], _StopOnError(publisher)),
+        run_config=run_config(run.path, [_Driver(publisher, progress, chronicle)], _StopOnError(publisher)),
     )
     result = fit(tuner, ask_to_end)[0]
     if result.error is not None:
@@ -189,12 +199,14 @@ def _tune(run: Run, interface: Interface, registry: Registry, publisher: Publish
 class _Driver(Unpickled, tune.Callback):
     """Hears each result of the trial, in the driver's process."""
 
-    def __init__(self, publisher: Publisher, progress: Progress) -> None:
+    def __init__(self, publisher: Publisher, progress: Progress, chronicle: Chronicle) -> None:
         self._publisher = publisher
         self._progress = progress
+        self._chronicle = chronicle
 
     def on_trial_result(self, *, result: dict[str, Any], **_: Any) -> None:
         self._progress.update(result)
+        self._chronicle.tell(result)
         if "checkpoint" in result:
             self._publisher.add(Path(result["checkpoint"]))
 

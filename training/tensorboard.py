@@ -25,7 +25,7 @@ class TensorBoard(TBXLoggerCallback):
     def log_trial_result(self, _: int, trial: Trial, result: dict[str, Any]) -> None:
         if trial not in self._trial_writer:
             self.log_trial_start(trial)
-        curves = {tag(name): value for name, value in result.items() if _is_curve(name, value)}
+        curves = {tag(name): value for name, value in result.items() if is_curve(name, value)}
         for name, value in curves.items():
             self._trial_writer[trial].add_scalar(name, value, global_step=result["timesteps_total"])
         self._trial_writer[trial].flush()
@@ -38,5 +38,6 @@ def tag(curve: str) -> str:
     return curve if "/" in curve else f"{WHOLE}/{curve}"
 
 
-def _is_curve(name: str, value: Any) -> bool:
+def is_curve(name: str, value: Any) -> bool:
+    """Whether an item of a result is a curve's value: a finite number that is not Tune's own bookkeeping."""
     return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value) and name not in NOT_CURVES

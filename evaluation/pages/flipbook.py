@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from io import BytesIO
-
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from evaluation.captions import Caption, Captions, Line
 from evaluation.film import render_modes
 from evaluation.pages.surprises import Surprise
+from evaluation.pictures import data_uri
 from evaluation.report import Document
 from evaluation.shows import recorded
 from league.environments.lockstep import stepping
@@ -25,10 +20,8 @@ MOST_STEPS = 240
 """Of a game; of a longer one every second, fourth, … is kept."""
 MOST_BYTES = 3_000_000
 """Of all pictures of all games of one page, as data URIs."""
-LARGEST, COLORS = 256, 48
-"""Pixels of a picture's longer side, and its colours."""
-SMALLEST = 128
-"""Smaller pictures are enlarged towards this by a whole factor."""
+LARGEST = 256
+"""Pixels of a picture's longer side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +80,9 @@ def _flipbook(registry: Registry, surprise: Surprise, environment: BatchedEnviro
         captions, kept, last = Captions(show.title, show.interface, show.cast), _Kept(room), None
         for last in show.play(environment):
             caption = captions.of(last)
-            did = _words(caption, is_opening=0 < last.step <= surprise.opening_plies)
+            did = _words(caption, is_opening=0 < last.step <= show.opening)
             if kept.wants(last.step) or last.is_over:
-                picture = _picture(environment.render(0)) if room else None
+                picture = data_uri(environment.render(0), LARGEST) if room else None
                 kept.add(Step(last.step, did, picture), is_last=last.is_over)
         assert last is not None, "a game has a beginning"
     except Exception as error:  # as above
@@ -158,15 +151,3 @@ def _line(line: Line) -> str:
     """`player_1 plays 4`; of a crowd how often each action was taken."""
     did = line.action or ", ".join(f"{action} ({share:.0%})" for action, share in line.chances)
     return f"{line.name} plays {did}" if did else line.name
-
-
-def _picture(pixels: NDArray) -> str:
-    """(height, width, 3) uint8 → a small PNG as a data URI."""
-    image = Image.fromarray(np.ascontiguousarray(pixels))
-    longer = max(image.size)
-    factor = LARGEST / longer if longer > LARGEST else max(1, SMALLEST // longer)
-    size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
-    scaled = image.resize(size, Image.Resampling.NEAREST if factor >= 1 else Image.Resampling.LANCZOS)
-    out = BytesIO()
-    scaled.quantize(COLORS, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
-    return f"data:image/png;base64,{b64encode(out.getvalue()).decode()}"

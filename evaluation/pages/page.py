@@ -17,9 +17,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from evaluation.contestants import ANCHOR
+from evaluation.judgement import OPEN, Judgement
 from evaluation.pages import charts
 from evaluation.pages.flipbook import Flipbook
-from evaluation.pages.league_report import OPEN, Judgement, LeagueReport
+from evaluation.pages.league_report import LeagueReport
 from evaluation.report import Confirmation, Difference, Standing
 from league.errors import StorageError
 from league.results.records import Scoring

@@ -18,12 +18,11 @@ LEAST = 0.4
 class Surprise:
     """A recorded game in which `better` scored `score` against `other`, and was expected to score `expected`.
 
-    match, game: where it is in the ledger. opening_plies: the game's first steps, which were random.
+    match, game: where it is in the ledger.
     """
 
     match: str
     game: int
-    opening_plies: int
     better: str
     other: str
     expected: float
@@ -42,12 +41,12 @@ class Surprises:
         self._ratings, self._most = ratings, most
         self._kept: defaultdict[tuple[str, ...], dict[bytes, Surprise]] = defaultdict(dict)
 
-    def see(self, match: Match, opening_plies: int) -> None:
+    def see(self, match: Match) -> None:
         if any(ref not in self._ratings for ref in match.contestants):
             return
         kept = self._kept[tuple(sorted(match.contestants))]
         for index, game in enumerate(match.games):
-            found = _surprise_of(match, index, game, opening_plies, self._ratings)
+            found = _surprise_of(match, index, game, self._ratings)
             if found is None or (len(kept) == self._most and _order(found) >= max(map(_order, kept.values()))):
                 continue
             key = identity(match, game)
@@ -67,9 +66,7 @@ class Surprises:
         return sorted((surprise for _, surprise in chosen), key=_order)
 
 
-def _surprise_of(
-    match: Match, index: int, game: Game, opening_plies: int, ratings: Mapping[str, float]
-) -> Surprise | None:
+def _surprise_of(match: Match, index: int, game: Game, ratings: Mapping[str, float]) -> Surprise | None:
     """From the view of who did better than expected; None if nobody did by much."""
     found = None
     for own, score in enumerate(game.scores):
@@ -77,7 +74,7 @@ def _surprise_of(
             continue
         better, other = match.contestants[own], match.contestants[1 - own]
         expected = score_of(ratings[better] - ratings[other])
-        each = Surprise(match.id, index, opening_plies, better, other, expected, score)
+        each = Surprise(match.id, index, better, other, expected, score)
         if each.size > (found.size if found else LEAST):
             found = each
     return found

@@ -1,7 +1,7 @@
 """The calls of a client, each as a request and how its reply is read: no connection, so both clients share them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
@@ -32,7 +32,8 @@ class Call(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class Promotion:
-    """A movement of an alias, as the registry recorded it. kind: `promotion` or `rollback`."""
+    """A movement of an alias, as the registry recorded it. kind: `promotion` or `rollback`. verdict: what it rests on,
+    None of one by hand."""
 
     league: str
     alias: str
@@ -43,6 +44,7 @@ class Promotion:
     reason: str
     at: str
     event: int
+    verdict: str | None = None
 
 
 def act(model: Model, question: Question) -> Call[Answer]:
@@ -158,4 +160,10 @@ def _change(path: str, document: Document, reason: str | None, key: str | None) 
     if reason is not None:
         document["reason"] = reason
     headers = {"idempotency-key": key or str(uuid4())}
-    return Call(path, lambda reply, _: Promotion(**reply), to_json(document), headers)
+    return Call(path, _moved, to_json(document), headers)
+
+
+def _moved(reply: Document, _: str) -> Promotion:
+    """What a server of a later version says besides is left out."""
+    known = {each.name for each in fields(Promotion)}
+    return Promotion(**{name: value for name, value in reply.items() if name in known})

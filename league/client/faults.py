@@ -2,13 +2,8 @@
 
 import httpx
 
-from league import errors
 from league.client.patience import asked_for, told
-from league.errors import InvalidInput, LeagueError, RateLimited, RemoteError
-
-BY_CODE = {
-    error.code: error for error in vars(errors).values() if isinstance(error, type) and issubclass(error, LeagueError)
-}
+from league.errors import BY_CODE, InvalidInput, LeagueError, RateLimited, RemoteError
 
 
 def fault(reply: httpx.Response, where: str) -> LeagueError:

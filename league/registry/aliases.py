@@ -103,10 +103,17 @@ def roll_back(session: Session, league: str, alias: str, *, actor: str, reason: 
     return _record(session, league, alias, last, event)
 
 
-def history(session: Session, league: str, alias: str, at: datetime | None) -> list[rows.AliasEvent]:
-    """The events of an alias, newest first; with `at`, only the one in force then. Raises UnknownLeague."""
+def history(
+    session: Session, league: str, alias: str, at: datetime | None, before: int | None, limit: int | None
+) -> list[rows.AliasEvent]:
+    """The events of an alias, newest first; with `at`, only the one in force then. Raises UnknownLeague.
+
+    before: those older than the event of this id. limit: so many at most.
+    """
     leagues.require(session, league)
-    query = select(AliasEvent).filter_by(league=league, alias=alias).order_by(AliasEvent.id.desc())
+    query = select(AliasEvent).filter_by(league=league, alias=alias).order_by(AliasEvent.id.desc()).limit(limit)
+    if before is not None:
+        query = query.where(AliasEvent.id < before)
     if at is not None:
         query = query.where(AliasEvent.at <= at).limit(1)
     return [row(event) for event in session.scalars(query)]

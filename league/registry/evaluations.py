@@ -78,6 +78,12 @@ def newest(session: Session, league: str, before: int | None, limit: int) -> lis
     return [row(evaluation) for evaluation in session.scalars(query)]
 
 
+def active(session: Session, league: str) -> tuple[EvaluationRow, ...]:
+    """Those of a league that are queued or running, oldest first."""
+    query = select(Evaluation).where(Evaluation.state.in_((QUEUED, RUNNING)), Evaluation.league == league)
+    return tuple(row(evaluation) for evaluation in session.scalars(query.order_by(Evaluation.id)))
+
+
 def counts(session: Session) -> dict[str, dict[str, int]]:
     """league → how many are queued and running, of the leagues that have any."""
     query = select(Evaluation.league, Evaluation.state, func.count()).where(Evaluation.state.in_((QUEUED, RUNNING)))
@@ -105,8 +111,9 @@ def wait(session: Session) -> bool:
 def claim(session: Session, runner: str, workers: int) -> EvaluationRow | None:
     """Give the oldest that waits, or whose runner has died, to `runner`; None if there is none."""
     now = datetime.now(UTC)
-    query = select(Evaluation).where(_is_free()).order_by(Evaluation.id)
-    for evaluation in session.scalars(query.with_for_update(skip_locked=True)):
+    # One at a time: who locked all that are free would leave none to those who claim beside it.
+    query = select(Evaluation).where(_is_free()).order_by(Evaluation.id).limit(1)
+    while (evaluation := session.scalar(query.with_for_update(skip_locked=True))) is not None:
         if not _ends_here(evaluation):
             evaluation.state, evaluation.runner, evaluation.workers = RUNNING, runner, workers
             evaluation.attempts += 1

@@ -20,8 +20,11 @@ from league.registry import (
     leagues,
     nights,
     publishing,
+    pulse,
     reports,
+    runs,
     shadows,
+    snapshots,
     traffic,
     verdicts,
     versions,
@@ -41,7 +44,12 @@ from league.registry.rows import (
     LeagueRow,
     NightRow,
     Portion,
+    Pulse,
+    RunPoint,
+    RunRow,
+    RunState,
     Shadowing,
+    SnapshotRow,
     Traffic,
     VerdictRow,
     VersionRow,
@@ -54,7 +62,7 @@ Build = Callable[[Path, int], Manifest]
 
 
 class Registry:
-    """Leagues, versions, aliases, verdicts, evaluations, acknowledgements. May be used by several threads.
+    """Leagues, versions, aliases, verdicts, evaluations, training runs … May be used by several threads.
 
     Every method raises StorageError, in one sentence, when the database or the artefact store fails.
     """
@@ -91,6 +99,14 @@ class Registry:
         with self.database.read() as session:
             return leagues.get(session, slug)
 
+    def pulse(self, league: str, since: timedelta = timedelta(seconds=15)) -> Pulse:
+        """Where a league stands: another, if anything of it is. Raises UnknownLeague.
+
+        since: for how long a replica that serves it may have been silent.
+        """
+        with self.database.read() as session:
+            return pulse.take(session, league, since)
+
     # Versions
 
     def publish(self, league: str, build: Build, *, source: str, parent: int | None = None) -> VersionRow:
@@ -119,6 +135,11 @@ class Registry:
         """All versions of a league, ascending. Raises UnknownLeague."""
         with self.database.read() as session:
             return versions.every(session, league)
+
+    def newest_versions(self, league: str, *, before: int | None = None, limit: int = 20) -> list[VersionRow]:
+        """A league's versions, newest first, of those with a lower number than `before`. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return versions.newest(session, league, before, limit)
 
     def version_numbers(self, league: str | None = None) -> dict[str, list[int]]:
         """league → numbers of its versions, ascending: of one league or of all that have any."""
@@ -225,10 +246,21 @@ class Registry:
                 session, league, call, lambda: aliases.roll_back(session, league, CHAMPION, actor=actor, reason=reason)
             )
 
-    def history(self, league: str, alias: str = CHAMPION, at: datetime | None = None) -> list[AliasEvent]:
-        """The events of an alias, newest first; with `at`, only the one that was in force then."""
+    def history(
+        self,
+        league: str,
+        alias: str = CHAMPION,
+        at: datetime | None = None,
+        *,
+        before: int | None = None,
+        limit: int | None = None,
+    ) -> list[AliasEvent]:
+        """The events of an alias, newest first; with `at`, only the one that was in force then.
+
+        before: those older than the event of this id. limit: so many at most. Raises UnknownLeague.
+        """
         with self.database.read() as session:
-            return aliases.history(session, league, alias, at)
+            return aliases.history(session, league, alias, at, before, limit)
 
     # Acknowledgements
 
@@ -360,20 +392,20 @@ class Registry:
             return verdicts.start(session, league, candidate, champion, schedule, settings)
 
     def close_verdict(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
-        """Record how a verdict came out; twice is once. Raises NotFound, or Conflict if it is another."""
+        """Record how a verdict came out; twice is once. Raises UnknownVerdict, or Conflict if it is another."""
         with self.database.write() as session:
             verdicts.close(session, verdict, outcome, evidence)
 
     def void_verdict(self, verdict: str, note: str) -> VerdictRow:
-        """End a verdict for a reason beside its games, or take back one that has fallen. Raises NotFound or Conflict.
+        """End a verdict for a reason beside its games, or take back one that has fallen.
 
-        Its alpha is spent. A promotion that it led to stays.
+        Its alpha is spent. A promotion that it led to stays. Raises UnknownVerdict or Conflict.
         """
         with self.database.write() as session:
             return verdicts.void(session, verdict, note)
 
     def verdict(self, verdict: str) -> VerdictRow:
-        """A verdict by its id. Raises NotFound."""
+        """A verdict by its id. Raises UnknownVerdict."""
         with self.database.read() as session:
             return verdicts.one(session, verdict)
 
@@ -381,6 +413,24 @@ class Registry:
         """All verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
         with self.database.read() as session:
             return verdicts.every(session, league)
+
+    def newest_verdicts(self, league: str, *, before: str | None = None, limit: int = 20) -> list[VerdictRow]:
+        """A league's verdicts, newest first, of those opened before the verdict `before`.
+
+        Raises UnknownLeague, or InvalidInput if `before` is none of them.
+        """
+        with self.database.read() as session:
+            return verdicts.newest(session, league, before, limit)
+
+    def verdict_reasons(self, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
+        """verdict → its outcome and the reason for that, as last computed, of those for which that was."""
+        with self.database.read() as session:
+            return snapshots.reasons(session, league, verdicts)
+
+    def last_verdicts(self) -> dict[str, VerdictRow]:
+        """league → the verdict that was closed last, of the leagues that have one."""
+        with self.database.read() as session:
+            return verdicts.last_closed(session)
 
     # Nights
 
@@ -485,3 +535,105 @@ class Registry:
         """Say that a runner is gone: another may go on."""
         with self.database.write() as session:
             evaluations.release(session, number, runner)
+
+    # Snapshots
+
+    def snapshot(self, league: str, part: str) -> SnapshotRow | None:
+        """A part of what pages show of a league; None if it was not computed yet. Raises UnknownLeague."""
+        with self.database.read() as session:
+            return snapshots.one(session, league, part)
+
+    def snapshots(self, part: str) -> dict[str, SnapshotRow]:
+        """league → the same part, of all leagues that have it."""
+        with self.database.read() as session:
+            return snapshots.of_part(session, part)
+
+    def snapshot_marks(self, league: str) -> dict[str, str]:
+        """part → the mark of what it was computed from, of all parts of a league."""
+        with self.database.read() as session:
+            return snapshots.computed_from(session, league)
+
+    def put_snapshots(self, league: str, documents: Mapping[str, Any], mark: str) -> None:
+        """Replace these parts of a league's, all or none. Raises UnknownLeague.
+
+        mark: of what they were computed from.
+        """
+        with self.database.write() as session:
+            snapshots.put(session, league, documents, mark)
+
+    def marks(self) -> dict[str, str]:
+        """league → a mark of all that its snapshots follow from, of all leagues: another one, if anything is new."""
+        with self.database.read() as session:
+            return snapshots.marks(session)
+
+    def stale_snapshots(self) -> list[str]:
+        """The leagues whose snapshots are not up to date, those that have waited longest first."""
+        with self.database.read() as session:
+            return snapshots.stale(session)
+
+    # Training runs
+
+    def begin_run(
+        self,
+        league: str,
+        run: str,
+        *,
+        algorithm: str,
+        settings: dict[str, Any],
+        seed: int,
+        target: int,
+        parent: int | None = None,
+        steps: int = 0,
+    ) -> RunRow:
+        """Record that a training run begins, or goes on: what it told beyond `steps` is forgotten.
+
+        target: steps at which it ends. parent: the version that it trains on from. Raises UnknownLeague.
+        """
+        with self.database.write() as session:
+            return runs.begin(
+                session,
+                league,
+                run,
+                algorithm=algorithm,
+                settings=settings,
+                seed=seed,
+                target=target,
+                parent=parent,
+                steps=steps,
+            )
+
+    def record_point(self, league: str, run: str, point: RunPoint | None, seconds: float | None = None) -> None:
+        """Say that a run's driver lives, and where its curves are by now, if that is new. Raises UnknownRun.
+
+        seconds: of training so far.
+        """
+        with self.database.write() as session:
+            runs.tell(session, league, run, point, seconds)
+
+    def end_run(self, league: str, run: str, state: RunState, error: str | None = None) -> None:
+        """Record how a run ended. Raises UnknownRun."""
+        with self.database.write() as session:
+            runs.end(session, league, run, state, error)
+
+    def run(self, league: str, run: str) -> RunRow:
+        """One training run. Raises UnknownLeague or UnknownRun."""
+        with self.database.read() as session:
+            return runs.one(session, league, run)
+
+    def runs(self, league: str, *, before: str | None = None, limit: int = 20) -> list[RunRow]:
+        """A league's training runs, newest first, of those that began before the run `before`.
+
+        Raises UnknownLeague, or InvalidInput if `before` is none of them.
+        """
+        with self.database.read() as session:
+            return runs.newest(session, league, before, limit)
+
+    def run_counts(self) -> dict[str, int]:
+        """league → training runs that are on, of the leagues that have any."""
+        with self.database.read() as session:
+            return runs.counts(session)
+
+    def run_points(self, league: str, run: str) -> list[RunPoint]:
+        """The points of a run's curves, by their steps: some hundred at most. Raises UnknownLeague or UnknownRun."""
+        with self.database.read() as session:
+            return runs.points(session, league, run)

@@ -232,3 +232,78 @@ class EvaluationRow:
     stop_at: datetime | None
     stopped_by: str | None
     ended_at: datetime | None
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotRow:
+    """A part of what pages show of a league. `mark`: of what it was computed from."""
+
+    document: Any
+    mark: str
+    at: datetime
+
+
+RunState = Literal["running", "silent", "ended", "failed", "stopped"]
+
+
+@dataclass(frozen=True, slots=True)
+class RunRow:
+    """A training run. `steps`, `seconds` of training and `curves` are the newest that are known."""
+
+    league: str
+    id: str
+    algorithm: str
+    settings: dict[str, Any]
+    seed: int
+    target: int
+    """Steps at which it ends."""
+    parent: int | None
+    """The version that it trains on from."""
+    state: RunState
+    """`silent`: nobody has ended it, and nothing was heard of it for a while."""
+    error: str | None
+    lives: int
+    """How often it was begun or gone on with."""
+    steps: int
+    seconds: float
+    curves: dict[str, float]
+    began_at: datetime
+    heartbeat_at: datetime
+    ended_at: datetime | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunPoint:
+    """Where the curves of a run were after so many steps."""
+
+    steps: int
+    curves: dict[str, float]
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """Where a league stands, in a few numbers: one of them is another whenever something of the league is."""
+
+    league: str
+    aliases: dict[str, int]
+    event: int | None
+    """The newest movement of an alias."""
+    version: int | None
+    """The newest."""
+    traffic: int | None
+    """The setting of canary and shadow."""
+    serving: dict[int, int]
+    """version → how many replicas it is the champion of."""
+    verdicts: dict[str, int]
+    """outcome, or `open` → how many."""
+    evaluation: int | None
+    """The newest."""
+    evaluations: tuple[EvaluationRow, ...]
+    """Those that are queued or running."""
+    run: str | None
+    """The newest training run."""
+    runs: tuple[RunRow, ...]
+    """Those that nobody has ended."""
+    computed_at: datetime | None
+    """When the newest of its snapshots was computed."""

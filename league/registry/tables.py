@@ -247,6 +247,7 @@ class Schedule(Table):
     sequence: Mapped[int] = mapped_column(primary_key=True)
     id: Mapped[str] = mapped_column(String(255), unique=True)
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), index=True)
+    kind: Mapped[str] = mapped_column(String(32))
     document: Mapped[str] = mapped_column(Text)
     opened_at: Mapped[datetime] = mapped_column(Utc)
     purged_at: Mapped[datetime | None] = mapped_column(Utc)
@@ -254,12 +255,20 @@ class Schedule(Table):
 
 
 class Match(Table):
-    """The ledger: one block of games. Who played, and from which seed, follows from the schedule."""
+    """The ledger: one block of games. Who played, and from which seed, follows from the schedule; league and
+    contestants are here too, so that lists of matches need no schedule."""
 
     __tablename__ = "matches"
+    __table_args__ = (
+        Index("ix_matches_league_played_at", "league", "played_at"),
+        Index("ix_matches_league_first_second_played_at", "league", "first", "second", "played_at"),
+    )
 
     schedule: Mapped[str] = mapped_column(ForeignKey("schedules.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    league: Mapped[str] = mapped_column(String(255))
+    first: Mapped[str] = mapped_column(Text)
+    second: Mapped[str] = mapped_column(Text)
     games: Mapped[int]
     scores: Mapped[str] = mapped_column(Text)
     returns: Mapped[str] = mapped_column(Text)
@@ -336,3 +345,58 @@ class Evaluation(Table):
     """When somebody asked for its end."""
     stopped_by: Mapped[str | None] = mapped_column(Text)
     ended_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
+class Snapshot(Table):
+    """A part of what pages show of a league, computed ahead of time: see evaluation/snapshots.py."""
+
+    __tablename__ = "snapshots"
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    part: Mapped[str] = mapped_column(String(300), primary_key=True)
+    mark: Mapped[str] = mapped_column(Text)
+    """Of what it was computed from: another mark, another document."""
+    document: Mapped[Any] = mapped_column(JSON)
+    at: Mapped[datetime] = mapped_column(Utc)
+
+
+class Run(Table):
+    """A training run, as its driver tells of it."""
+
+    __tablename__ = "runs"
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    algorithm: Mapped[str] = mapped_column(String(32))
+    settings: Mapped[dict[str, Any]] = mapped_column(JSON)
+    seed: Mapped[int] = mapped_column(BigInteger)
+    target: Mapped[int] = mapped_column(BigInteger)
+    """Steps at which it ends."""
+    parent: Mapped[int | None]
+    """The version that it trains on from."""
+    state: Mapped[str] = mapped_column(String(16))
+    error: Mapped[str | None] = mapped_column(Text)
+    lives: Mapped[int]
+    """How often it was begun or gone on with."""
+    steps: Mapped[int] = mapped_column(BigInteger)
+    seconds: Mapped[float] = mapped_column(Double)
+    curves: Mapped[dict[str, float]] = mapped_column(JSON)
+    """The newest value of each."""
+    spacing: Mapped[int] = mapped_column(BigInteger)
+    """Steps between two points at least, so that there are never too many."""
+    began_at: Mapped[datetime] = mapped_column(Utc)
+    heartbeat_at: Mapped[datetime] = mapped_column(Utc)
+    ended_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
+class RunPoint(Table):
+    """Where the curves of a run were after so many steps."""
+
+    __tablename__ = "run_points"
+    __table_args__ = (ForeignKeyConstraint(["league", "run"], ["runs.league", "runs.id"]),)
+
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    run: Mapped[str] = mapped_column(String(64), primary_key=True)
+    steps: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    curves: Mapped[dict[str, float]] = mapped_column(JSON)
+    at: Mapped[datetime] = mapped_column(Utc)

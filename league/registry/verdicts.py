@@ -5,10 +5,10 @@ else is ever changed.
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select, tuple_
 from sqlalchemy.orm import Session
 
-from league.errors import Conflict, NotFound
+from league.errors import Conflict, InvalidInput, UnknownVerdict
 from league.registry import leagues, rows, versions
 from league.registry.database import insert
 from league.registry.tables import AliasEvent, Verdict
@@ -31,10 +31,10 @@ def start(
 
 
 def close(session: Session, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
-    """Record how it came out; twice is once. Raises NotFound, or Conflict if it came out otherwise before."""
+    """Record how it came out; twice is once. Raises UnknownVerdict, or Conflict if it came out otherwise before."""
     row = session.get(Verdict, verdict, with_for_update=True)
     if row is None:
-        raise NotFound(f"there is no verdict {verdict!r}")
+        raise UnknownVerdict(f"there is no verdict {verdict!r}")
     if row.outcome is not None:
         if row.outcome != outcome:
             raise Conflict(f"verdict {verdict} is {row.outcome!r} already, it cannot become {outcome!r}")
@@ -46,11 +46,11 @@ def void(session: Session, verdict: str, note: str) -> rows.VerdictRow:
     """End a verdict for a reason beside its games, or take back one that has fallen; twice is once.
 
     What it has shown stays in its evidence, and its alpha is spent. A promotion that it led to is not undone.
-    Raises NotFound, or Conflict for one whose promotion is just being applied.
+    Raises UnknownVerdict, or Conflict for one whose promotion is just being applied.
     """
     row = session.get(Verdict, verdict, with_for_update=True)
     if row is None:
-        raise NotFound(f"there is no verdict {verdict!r}")
+        raise UnknownVerdict(f"there is no verdict {verdict!r}")
     if row.outcome is None:
         leagues.lock(session, row.league)
         if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
@@ -69,10 +69,10 @@ def require_open(session: Session, verdict: str) -> None:
 
 
 def one(session: Session, verdict: str) -> rows.VerdictRow:
-    """A verdict by its id. Raises NotFound."""
+    """A verdict by its id. Raises UnknownVerdict."""
     row = session.get(Verdict, verdict)
     if row is None:
-        raise NotFound(f"there is no verdict {verdict!r}")
+        raise UnknownVerdict(f"there is no verdict {verdict!r}")
     return _row(row)
 
 
@@ -81,6 +81,29 @@ def every(session: Session, league: str) -> list[rows.VerdictRow]:
     leagues.require(session, league)
     query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at, Verdict.id)
     return [_row(verdict) for verdict in session.scalars(query)]
+
+
+def newest(session: Session, league: str, before: str | None, limit: int) -> list[rows.VerdictRow]:
+    """Those of a league, newest first, at most `limit`, of those opened before `before`.
+
+    Raises UnknownLeague, or InvalidInput if `before` is none of them.
+    """
+    leagues.require(session, league)
+    query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at.desc(), Verdict.id.desc()).limit(limit)
+    if before is not None:
+        last = session.get(Verdict, before)
+        if last is None or last.league != league:
+            raise InvalidInput(f"before: league {league} has no verdict {before!r}")
+        query = query.where(tuple_(Verdict.opened_at, Verdict.id) < (last.opened_at, last.id))
+    return [_row(verdict) for verdict in session.scalars(query)]
+
+
+def last_closed(session: Session) -> dict[str, rows.VerdictRow]:
+    """league → the verdict that was closed last, of the leagues that have one."""
+    closed = select(Verdict).where(Verdict.closed_at.is_not(None)).order_by(Verdict.closed_at, Verdict.id)
+    latest = select(Verdict.league, func.max(Verdict.closed_at).label("at")).group_by(Verdict.league).subquery()
+    of_latest = (Verdict.league == latest.c.league) & (Verdict.closed_at == latest.c.at)
+    return {verdict.league: _row(verdict) for verdict in session.scalars(closed.join(latest, of_latest))}
 
 
 def _row(verdict: Verdict) -> rows.VerdictRow:

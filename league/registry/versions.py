@@ -23,6 +23,18 @@ def every(session: Session, league: str) -> list[VersionRow]:
     return _rows(session, league, list(session.scalars(_ready(league).order_by(Version.number))))
 
 
+def newest(session: Session, league: str, before: int | None, limit: int) -> list[VersionRow]:
+    """Those of a league, newest first, at most `limit`, of those with a lower number than `before`.
+
+    Raises UnknownLeague.
+    """
+    leagues.require(session, league)
+    query = _ready(league).order_by(Version.number.desc()).limit(limit)
+    if before is not None:
+        query = query.where(Version.number < before)
+    return _rows(session, league, list(session.scalars(query)))
+
+
 def numbers(session: Session, league: str | None) -> dict[str, list[int]]:
     """league → numbers of its versions, ascending: of one league or of all. Their manifests are not read."""
     query = select(Version.league, Version.number).filter_by(state=READY).order_by(Version.league, Version.number)

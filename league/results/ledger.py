@@ -1,13 +1,13 @@
 """The append-only store of what was played. It takes what its schedules ask for, and each match once."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any, TypeVarTuple
 
-from sqlalchemy import Select, select, update
+from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
-from league.errors import NotFound
+from league.errors import InvalidInput, NotFound, UnknownMatch
 from league.registry import leagues, tables
 from league.registry.database import insert
 from league.registry.registry import Registry
@@ -20,9 +20,11 @@ from league.results.documents import (
     load_numbers,
     load_schedule,
 )
-from league.results.records import BlockResult, Match, Schedule
+from league.results.records import BlockResult, Entry, Match, Schedule
 
 Columns = TypeVarTuple("Columns")
+STRIDE = 1000
+"""Matches that are read at a time by whoever goes through many."""
 
 
 class Ledger:
@@ -33,7 +35,7 @@ class Ledger:
 
     def open(self, schedule: Schedule) -> Schedule:
         """Store a schedule unless its id is there already; returns the stored one. Raises UnknownLeague."""
-        row = {"id": schedule.id, "league": schedule.league, "document": dump_schedule(schedule)}
+        row = {"id": schedule.id, "league": schedule.league, "kind": schedule.kind, "document": dump_schedule(schedule)}
         with self._database.write() as session:
             leagues.require(session, schedule.league)
             insert(session, tables.Schedule, [row | {"opened_at": datetime.now(UTC)}])
@@ -75,7 +77,7 @@ class Ledger:
             schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
             for match in matches:
                 admit(match, schedules[match.schedule])
-            return insert(session, tables.Match, [_row(match) for match in matches])
+            return insert(session, tables.Match, [row(match) for match in matches])
 
     def matches(self, *, league: str, schedule: str | None = None, after: int | None = None) -> list[Match]:
         """The matches of a league, or of one of its schedules, in schedule order.
@@ -92,21 +94,73 @@ class Ledger:
             found = session.execute(query)
             return [schedules[of].match(position, load_games(moves)) for of, position, moves in found]
 
+    def walk(self, schedule: Schedule) -> Iterator[Match]:
+        """The matches of a schedule in its order, a few of them in memory at a time."""
+        last, table = -1, tables.Match
+        query = select(table.position, table.moves).filter_by(schedule=schedule.id).order_by(table.position)
+        while True:
+            with self._database.read() as session:
+                found = session.execute(query.where(table.position > last).limit(STRIDE)).all()
+            yield from (schedule.match(position, load_games(moves)) for position, moves in found)
+            if len(found) < STRIDE:
+                return
+            last = found[-1].position
+
     def match(self, match: str) -> Match:
-        """One match by its id. Raises NotFound."""
-        name, _, position = match.rpartition("/")
+        """One match by its id. Raises UnknownMatch."""
+        return self.scheduled_match(match)[1]
+
+    def scheduled_match(self, match: str) -> tuple[Schedule, Match]:
+        """One match by its id, with its schedule. Raises UnknownMatch."""
+        name, position = _place(match)
         with self._database.read() as session:
-            schedule = _schedule(session, name)
-            query = select(tables.Match.moves).filter_by(schedule=name)
-            moves = session.scalar(query.filter_by(position=int(position))) if position.isdecimal() else None
+            moves = session.scalar(select(tables.Match.moves).filter_by(schedule=name, position=position))
             if moves is None:
-                raise NotFound(f"schedule {name} has no match {position!r}")
-            return schedule.match(int(position), load_games(moves))
+                raise _no_match(match)
+            schedule = _schedule(session, name)
+            return schedule, schedule.match(position, load_games(moves))
+
+    def page(
+        self, league: str, *, contestants: tuple[str, str] | None = None, before: str | None = None, limit: int = 20
+    ) -> list[Entry]:
+        """The matches of a league as they were played, newest first, without their moves, purged ones included.
+
+        contestants: only those between these two, in either order. before: those played before the match of this id.
+        Raises UnknownLeague, or InvalidInput if `before` is no match of the league.
+        """
+        table = tables.Match
+        ways = dict.fromkeys((contestants, contestants[::-1])) if contestants else ()
+        with self._database.read() as session:
+            leagues.require(session, league)
+            query = select(*_LISTED).where(table.league == league)
+            if before is not None:
+                query = query.where(tuple_(*_PLAYED) < _when_played(session, league, before))
+            query = query.order_by(*(column.desc() for column in _PLAYED)).limit(limit)
+            # Each way round is read by itself, as it is then a range of an index.
+            parts = [query.where(table.first == first, table.second == second) for first, second in ways] or [query]
+            return _entries(session, union_all(*(select(part.subquery()) for part in parts)).subquery(), limit)
+
+    def entry(self, match: str) -> Entry:
+        """A match by its id, without its moves. Raises UnknownMatch."""
+        schedule, position = _place(match)
+        with self._database.read() as session:
+            one = select(*_LISTED).filter_by(schedule=schedule, position=position)
+            found = _entries(session, one.subquery(), limit=1)
+        if not found:
+            raise _no_match(match)
+        return found[0]
 
     def positions(self, schedule: str) -> set[int]:
         """Which positions of a schedule were played."""
         with self._database.read() as session:
             return set(session.scalars(select(tables.Match.position).filter_by(schedule=schedule)))
+
+    def counts(self, league: str) -> dict[str, int]:
+        """schedule → how many of its matches were played, of all schedules of a league of which any were."""
+        match = tables.Match
+        query = select(match.schedule, func.count()).filter_by(league=league).group_by(match.schedule)
+        with self._database.read() as session:
+            return dict(session.execute(query).tuples().all())
 
     def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
         """The matches of a league without their moves, in schedule order; of one environment if given.
@@ -137,6 +191,14 @@ class Ledger:
             ]
 
 
+_LISTED = tuple(
+    getattr(tables.Match, name)
+    for name in ("schedule", "position", "first", "second", "games", "scores", "returns", "played_at")
+)
+_PLAYED = tables.Match.played_at, tables.Match.schedule, tables.Match.position
+"""The order in which matches were played."""
+
+
 def _schedules(session: Session, league: str, only: str | None = None) -> list[Schedule]:
     leagues.require(session, league)
     query = select(tables.Schedule.document).filter_by(league=league).order_by(tables.Schedule.sequence)
@@ -152,17 +214,63 @@ def _schedule(session: Session, name: str) -> Schedule:
     return load_schedule(document)
 
 
+def _place(match: str) -> tuple[str, int]:
+    """Schedule and position of a match's id; a position that no match has if it is no id."""
+    schedule, _, position = match.rpartition("/")
+    return schedule, int(position) if position.isdecimal() and len(position) < 10 else -1
+
+
+def _no_match(match: str) -> UnknownMatch:
+    schedule, _, position = match.rpartition("/")
+    return UnknownMatch(f"schedule {schedule} has no match {position!r}")
+
+
+def _when_played(session: Session, league: str, match: str) -> tuple[Any, ...]:
+    schedule, position = _place(match)
+    found = session.execute(select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)).first()
+    if found is None:
+        raise InvalidInput(f"before: league {league} has no match {match!r}")
+    return tuple(found)
+
+
+def _entries(session: Session, found: Subquery, limit: int) -> list[Entry]:
+    """What was found in the ledger's table, newest first, each with what its schedule says."""
+    schedule, newest_first = tables.Schedule, (found.c[column.key].desc() for column in _PLAYED)
+    query = select(*found.c, schedule.kind, schedule.purged_at).join(schedule, schedule.id == found.c.schedule)
+    return [
+        Entry(
+            BlockResult(
+                schedule=each.schedule,
+                position=each.position,
+                contestants=(each.first, each.second),
+                games=each.games,
+                scores=load_numbers(each.scores),
+                returns=load_numbers(each.returns) or None,
+            ),
+            kind=each.kind,
+            played_at=each.played_at,
+            is_purged=each.purged_at is not None,
+        )
+        for each in session.execute(query.order_by(*newest_first).limit(limit))
+    ]
+
+
 def _in_order(query: Select[*Columns], league: str) -> Select[*Columns]:
     query = query.join(tables.Schedule, tables.Schedule.id == tables.Match.schedule)
     query = query.where(tables.Schedule.league == league)
     return query.order_by(tables.Schedule.sequence, tables.Match.position)
 
 
-def _row(match: Match) -> dict[str, Any]:
+def row(match: Match) -> dict[str, Any]:
+    """A match as the ledger keeps it."""
     result = match.result()
+    first, second = match.contestants
     return {
         "schedule": match.schedule,
         "position": match.position,
+        "league": match.league,
+        "first": first,
+        "second": second,
         "games": result.games,
         "scores": dump_numbers(result.scores),
         "returns": dump_numbers(result.returns or ()),

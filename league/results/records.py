@@ -6,6 +6,7 @@ opening, in which the two change places. Position i of a schedule is match `"<sc
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, Literal
 
 from league.seeds import derive
@@ -138,6 +139,22 @@ class BlockResult:
     games: int
     scores: tuple[float, ...]
     returns: tuple[float, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A match as lists of the ledger show it."""
+
+    result: BlockResult
+    kind: str
+    """Of its schedule."""
+    played_at: datetime
+    is_purged: bool
+    """Whether it counts for nothing."""
+
+    @property
+    def id(self) -> str:
+        return f"{self.result.schedule}/{self.result.position}"
 
 
 @dataclass(frozen=True, slots=True)

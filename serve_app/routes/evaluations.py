@@ -1,7 +1,7 @@
 """Evaluations: games between a league's versions, played by the studio, followed and stopped from here.
 
 POST    /v1/leagues/{league}/evaluations        {"contestants": ["connect_four@3", "script:one_ply"], "blocks": 64}
-GET     /v1/leagues/{league}/evaluations        newest first; ?limit=20&before={evaluation}
+GET     /v1/leagues/{league}/evaluations        newest first; ?limit= &before=
 GET     /v1/leagues/{league}/evaluations/{evaluation}
 DELETE  /v1/leagues/{league}/evaluations/{evaluation}
 
@@ -14,12 +14,13 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
-from league.errors import Forbidden, InvalidInput, NoStudio, UnknownEvaluation
+from league.errors import Forbidden, NoStudio, UnknownEvaluation
 from league.evaluations import Asked, Night, Tournament
 from league.policies.pinning import check_eligible, eligible, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.rows import EvaluationRow
+from serve_app import queries
 from serve_app.bodies import read_body
 from serve_app.doors import KEY
 from serve_app.keyring import Key
@@ -29,7 +30,6 @@ from serve_app.settings import ServeSettings
 from serve_app.studio import Studio
 
 PAGE, LARGEST_PAGE = 20, 100
-LARGEST = 2**31 - 1
 
 
 class EvaluationRoutes:
@@ -68,31 +68,33 @@ class EvaluationRoutes:
 
         row = await self._models.ask(ask)
         self._studio.look()
-        return JSONResponse(_whole(row), 202, {"location": f"{request.url.path}/{row.id}"})
+        return JSONResponse(evaluation_document(row), 202, {"location": f"{request.url.path}/{row.id}"})
 
     async def every(self, request: Request) -> JSONResponse:
         """A page of a league's evaluations, without their results. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        limit = _number(request, "limit", LARGEST_PAGE) or PAGE
-        before = _number(request, "before", LARGEST)
+        limit = queries.number(request, "limit", LARGEST_PAGE) or PAGE
+        before = queries.number(request, "before")
         rows = await self._models.ask(lambda registry: registry.evaluations(league, before=before, limit=limit + 1))
-        page = [_document(row) for row in rows[:limit]]
-        more = page[-1]["evaluation"] if len(rows) > limit else None
-        return JSONResponse({"league": league, "evaluations": page, "before": more})
+        page, more = queries.paged(rows, limit, lambda row: row.id)
+        documents = [_document(row) for row in page]
+        return JSONResponse({"league": league, "evaluations": documents, "next": more})
 
     async def one(self, request: Request) -> JSONResponse:
         """One evaluation: how far it is, and what it has brought. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = _named(request)
-        return JSONResponse(_whole(await self._models.ask(lambda registry: registry.evaluation(league, number))))
+        league, number = named(request)
+        return JSONResponse(
+            evaluation_document(await self._models.ask(lambda registry: registry.evaluation(league, number)))
+        )
 
     async def stop(self, request: Request) -> JSONResponse:
         """Ask for its end; what has ended stays as it is. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = _named(request)
+        league, number = named(request)
         key: Key = request.scope[KEY]
         row = await self._models.ask(lambda registry: registry.stop_evaluation(league, number, actor=key.name))
         if self._studio is not None:
             self._studio.look()
-        return JSONResponse(_whole(row))
+        return JSONResponse(evaluation_document(row))
 
 
 def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
@@ -108,21 +110,12 @@ def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
     return document
 
 
-def _named(request: Request) -> tuple[str, int]:
+def named(request: Request) -> tuple[str, int]:
+    """The league and the number of an evaluation that a path names. Raises InvalidReference or UnknownEvaluation."""
     league, number = check_slug("league", request.path_params["league"]), request.path_params["evaluation"]
-    if not (number.isascii() and number.isdigit() and len(number) <= 10 and int(number) <= LARGEST):
+    if not (number.isascii() and number.isdigit() and len(number) <= 10 and int(number) <= queries.LARGEST):
         raise UnknownEvaluation(f"league {league} has no evaluation {number[:32]!r}: it is a number")
     return league, int(number)
-
-
-def _number(request: Request, name: str, largest: int) -> int | None:
-    """A positive number of the query. Raises InvalidInput."""
-    text = request.query_params.get(name)
-    if text is None:
-        return None
-    if not (text.isascii() and text.isdigit() and len(text) <= 10 and 1 <= int(text) <= largest):
-        raise InvalidInput(f"{name} must be a number from 1 to {largest}, got {text[:32]!r}")
-    return int(text)
 
 
 def _document(row: EvaluationRow) -> dict[str, Any]:
@@ -142,5 +135,6 @@ def _document(row: EvaluationRow) -> dict[str, Any]:
     } | {name: instant and instant.isoformat() for name, instant in instants.items()}
 
 
-def _whole(row: EvaluationRow) -> dict[str, Any]:
+def evaluation_document(row: EvaluationRow) -> dict[str, Any]:
+    """An evaluation as JSON, with its result."""
     return _document(row) | {"result": row.result}

@@ -94,7 +94,7 @@ class PromotionRoutes:
     ) -> JSONResponse:
         key, call = call_of(request, body)
         event = await self._models.ask(lambda registry: change(registry, key.name, call))
-        return JSONResponse(_document(event))
+        return JSONResponse(event_document(event))
 
 
 def call_of(request: Request, body: BaseModel) -> tuple[Key, Call]:
@@ -127,7 +127,8 @@ def parse(kind: type[B], body: bytes) -> B:
         raise InvalidInput(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
 
 
-def _document(event: AliasEvent) -> dict[str, Any]:
+def event_document(event: AliasEvent) -> dict[str, Any]:
+    """A movement of an alias as JSON."""
     return {
         "league": event.league,
         "alias": event.alias,
@@ -136,6 +137,7 @@ def _document(event: AliasEvent) -> dict[str, Any]:
         "previous": event.previous,
         "actor": event.actor,
         "reason": event.reason,
+        "verdict": event.verdict,
         "at": event.at.isoformat(),
         "event": event.id,
     }

@@ -1,5 +1,7 @@
-"""Tic-tac-toe whose first move never ends, or raises."""
+"""Tic-tac-toe whose first move never ends, raises, or ends the process."""
 
+import os
+import signal
 from threading import Event
 from typing import Any
 
@@ -14,3 +16,16 @@ class Hanging(tictactoe_v3.raw_env):
 class Raising(tictactoe_v3.raw_env):
     def step(self, action: Any) -> None:
         raise ValueError("the board is gone")
+
+
+class Deaf(tictactoe_v3.raw_env):
+    """Minds no signal, as native code that does not come back."""
+
+    def step(self, action: Any) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
+        Event().wait()
+
+
+class Dying(tictactoe_v3.raw_env):
+    def step(self, action: Any) -> None:
+        os._exit(7)

@@ -4,10 +4,13 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
+from league.errors import NoStudio
+from league.games import Order
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Server
 from serve_app.settings import ServeSettings
+from serve_app.studio import Answer
 from tests.serve_app.leagues import everything
 
 QUICK = ServeSettings(poll=0.01, poll_slowest=0.05, retry=0.05, heartbeat=0.2, max_body=64 * 1024, max_batch=8)
@@ -59,3 +62,7 @@ class Closed:
 
     def look(self) -> None:
         """Do nothing."""
+
+    async def ask(self, order: Order) -> Answer:
+        """Nobody is here."""
+        raise NoStudio("nobody is at work")

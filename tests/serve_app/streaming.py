@@ -38,9 +38,9 @@ def listening(
     storage: Storage, settings: ServeSettings = QUICK, replica: str = "replica-1", port: int = 0, **options: Any
 ) -> Iterator[Listening]:
     """A replica in a thread of its own, on a port of this machine, by default a free one. options: of uvicorn."""
-    http_protocol.install()
-    websocket_protocol.install(settings.max_body)
     server = Server(Registry.open(storage), settings, replica, studio=Closed())
+    http_protocol.install(server.events.end)
+    websocket_protocol.install(settings.max_body)
     config = uvicorn.Config(
         server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
     )

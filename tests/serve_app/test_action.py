@@ -246,7 +246,7 @@ def test_a_continuous_policy_explores_reproducibly(unchanging: TestClient) -> No
         ("/v1/policies/board/action?version=%00", 400, "invalid_reference"),
         ("/v1/policies/board/act", 404, "unknown_path"),
         ("/v1/policies//action", 404, "unknown_path"),
-        ("/", 404, "unknown_path"),
+        ("/", 405, "method_not_allowed"),
     ],
 )
 def test_what_does_not_exist(unchanging: TestClient, path: str, status: int, code: str) -> None:

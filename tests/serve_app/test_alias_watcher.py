@@ -145,7 +145,7 @@ def test_an_empty_registry_in_the_place_of_the_one_that_was_followed_is_not_foll
         home.rename(tmp_path / "away")
         (tmp_path / "other").rename(home)
         until(lambda: "not the one that was there" in caplog.text)
-        assert client.get("/v1/leagues").json() == {"leagues": []}
+        assert client.get("/v1/leagues").json() == {"leagues": [], "next": None}
         assert act(client, observation=BOARD)["version"] == 1
         shutil.rmtree(home)
         (tmp_path / "away").rename(home)

@@ -20,6 +20,7 @@ ERRORS = [
 EXPECTED = {
     "BodyTooLarge": 413,
     "UnsupportedMediaType": 415,
+    "IllegalAction": 422,
     "Overloaded": 429,
     "InvalidInput": 400,
     "VersionRetired": 410,
@@ -27,6 +28,7 @@ EXPECTED = {
     "Conflict": 409,
     "NotReady": 503,
     "StorageError": 503,
+    "GameHung": 504,
 }
 
 

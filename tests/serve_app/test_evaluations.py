@@ -128,7 +128,7 @@ def test_other_keys_start_and_stop_nothing(
 
 
 def test_without_a_key_nothing_is_started_even_where_none_is_asked_for(client: TestClient) -> None:
-    assert client.get(BOARD).json() == {"league": "board", "evaluations": [], "before": None}
+    assert client.get(BOARD).json() == {"league": "board", "evaluations": [], "next": None}
     assert start(client, status=401)["code"] == "unauthenticated"
     assert client.delete(f"{BOARD}/1").status_code == 401
 
@@ -146,8 +146,8 @@ def test_they_are_listed_newest_first_by_pages(evaluator: TestClient) -> None:
     page = evaluator.get(BOARD, params={"limit": 2}).json()
     assert [each["evaluation"] for each in page["evaluations"]] == numbers[:2:-1]
     assert "result" not in page["evaluations"][0]
-    rest = evaluator.get(BOARD, params={"before": page["before"], "limit": 3}).json()
-    assert ([each["evaluation"] for each in rest["evaluations"]], rest["before"]) == (numbers[2::-1], None)
+    rest = evaluator.get(BOARD, params={"before": page["next"], "limit": 3}).json()
+    assert ([each["evaluation"] for each in rest["evaluations"]], rest["next"]) == (numbers[2::-1], None)
 
 
 @pytest.mark.parametrize("query", ["limit=0", "limit=101", "limit=x", "before=-1", "before=99999999999"])

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import uvicorn
@@ -12,6 +13,7 @@ from starlette.types import Receive, Scope, Send
 from serve_app.http_protocol import HttpProtocol
 
 CLIENTS = 40
+PROTOCOL = partial(HttpProtocol, lambda: None)
 REQUEST = b"GET / HTTP/1.1\r\nhost: here\r\nconnection: close\r\n\r\n"
 
 
@@ -45,7 +47,9 @@ def answered(connection: socket.socket) -> bool:
     return reply.startswith(b"HTTP/1.1 204")
 
 
-def served(protocol: type[asyncio.Protocol] | str, loop: str, use: Callable[[Counting, tuple[str, int]], None]) -> None:
+def served(
+    protocol: Callable[..., asyncio.Protocol], loop: str, use: Callable[[Counting, tuple[str, int]], None]
+) -> None:
     application = Counting()
     config = uvicorn.Config(application, port=0, loop=loop, http=protocol, lifespan="off", log_config=None)  # type: ignore[arg-type]
     server = uvicorn.Server(config)
@@ -78,7 +82,7 @@ def test_clients_that_came_while_the_loop_was_busy_begin_together(loop: str) -> 
         assert len(application.seen) == CLIENTS + 1
         assert application.seen[-1] - application.seen[1] < CLIENTS / 4, "turns between the first and the last"
 
-    served(HttpProtocol, loop, use)
+    served(PROTOCOL, loop, use)
 
 
 def test_a_server_that_stops_accepts_no_more() -> None:
@@ -90,6 +94,6 @@ def test_a_server_that_stops_accepts_no_more() -> None:
         client.sendall(REQUEST)
         assert answered(client)
 
-    served(HttpProtocol, "uvloop", use)
+    served(PROTOCOL, "uvloop", use)
     with socket.socket() as probe:
         assert probe.connect_ex(taken[0]) != 0

@@ -1,4 +1,4 @@
-"""Actions go the short way where there is one; everything else goes through Ray Serve."""
+"""Actions and what lasts go the short way where there is one; everything else goes through Ray Serve."""
 
 import pytest
 from starlette.responses import PlainTextResponse
@@ -19,12 +19,17 @@ def client(monkeypatch: pytest.MonkeyPatch) -> TestClient:
     [
         ("/v1/policies/board/action", "short"),
         ("/v2/models/board/infer", "short"),
+        ("/v1/leagues/board/events", "short"),
+        ("/v1/leagues/board/evaluations/3/events", "short"),
+        ("/v1/leagues/events", "long"),
+        ("/v1/leagues/board/aliases/events", "long"),
+        ("/v1/leagues/board/evaluations", "long"),
         ("/v2/health/ready", "long"),
         ("/v1/leagues", "long"),
         ("/-/healthz", "long"),
     ],
 )
-def test_only_actions_take_the_short_way(client: TestClient, path: str, way: str) -> None:
+def test_who_takes_the_short_way(client: TestClient, path: str, way: str) -> None:
     middleware.shorten(PlainTextResponse("short"))
     assert client.post(path).text == way
 

@@ -25,6 +25,11 @@ from tests.serve_app.conftest import QUICK
         ("HEAD", "/openapi.json", NOTHING),
         ("POST", "/docs", Need("promote", None, True)),
         ("GET", "/docs/elsewhere", Need("read", None, True)),
+        ("GET", "/", NOTHING),
+        ("GET", "/leagues/board/verdicts", NOTHING),
+        ("HEAD", "/pages/app.js", NOTHING),
+        ("POST", "/leagues/board", Need("promote", None, True)),
+        ("GET", "/leaguesque", Need("read", None, True)),
         ("GET", "/v1/leagues", Need("read", None, True)),
         ("GET", "/v1/leagues/board/versions", Need("read", "board")),
         ("HEAD", "/v1/leagues/board", Need("read", "board")),
@@ -34,6 +39,16 @@ from tests.serve_app.conftest import QUICK
         ("DELETE", "/v1/leagues/board/evaluations/3", Need("evaluate", "board", is_change=True)),
         ("GET", "/v1/leagues/board/evaluations/3", Need("read", "board")),
         ("PUT", "/v1/leagues/board/evaluations/3", Need("promote", "board")),
+        ("POST", "/v1/leagues/board/play", Need("act", "board")),
+        ("PUT", "/v1/leagues/board/play", Need("promote", "board")),
+        ("POST", "/v1/leagues/play", Need("promote", "play")),
+        ("GET", "/v1/leagues/board/playable", Need("read", "board")),
+        ("GET", "/v1/leagues/board/matches/s/3/games/0/film.gif", Need("read", "board")),
+        ("GET", "/v1/leagues/board/evaluations/3/events", Need("read", "board")),
+        ("GET", "/v1/leagues/board/events", Need("read", "board")),
+        ("GET", "/v1/leagues/board/aliases/champion/history", Need("read", "board")),
+        ("GET", "/v1/leagues/board/matches/board-gauntlet-1/0", Need("read", "board")),
+        ("POST", "/v1/leagues/board/verdicts/won", Need("promote", "board")),
         ("POST", "/v1/leagues/evaluations", Need("promote", "evaluations")),
         ("GET", "/v1/health/ready", NOTHING),
         ("GET", "/v2/health/live", NOTHING),
@@ -69,13 +84,14 @@ def test_what_a_call_needs(rpc: str, model: str, need: Need) -> None:
     assert of_rpc(rpc, model) == need
 
 
-def test_every_route_but_health_and_the_description_needs_something(registry: Registry) -> None:
+def test_every_route_but_health_the_description_and_the_pages_needs_something(registry: Registry) -> None:
     for route in Server(registry, QUICK, "replica-1").application().routes:
         assert isinstance(route, Route | WebSocketRoute), "whoever mounts something thinks of its permissions here"
         kind = "websocket" if isinstance(route, WebSocketRoute) else "http"
         for method in getattr(route, "methods", None) or ("GET",):
             need = of_request(kind, method, route.path.replace("{", "").replace("}", ""))
-            is_open = "/health/" in route.path or route.path in ("/docs", "/openapi.json")
+            is_page = not getattr(route, "include_in_schema", True)
+            is_open = is_page or "/health/" in route.path or route.path in ("/docs", "/openapi.json")
             assert (need.scope is None) == is_open, route.path
             if "{league}" in route.path or "{model}" in route.path:
                 assert need.league in ("league", "model"), route.path

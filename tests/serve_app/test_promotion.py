@@ -45,6 +45,7 @@ def test_a_promotion_is_in_the_history_with_the_keys_name(promoter: TestClient, 
         "previous": 1,
         "actor": "release-bot",
         "reason": "it is stronger",
+        "verdict": None,
     }
     newest = registry.history("board")[0]
     assert (newest.version, newest.actor, newest.reason) == (2, "release-bot", "it is stronger")

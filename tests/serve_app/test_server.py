@@ -39,6 +39,7 @@ from tests.league.policies.graphs import masked_mlp
 from tests.serve_app.leagues import everything, promote, publish
 from tests.serve_app.scaling import scale
 from tests.serve_app.test_action import BOARD
+from tests.serve_app.test_events import listener
 
 ACTION = "/v1/policies/board/action"
 EVALUATIONS = "/v1/leagues/tictactoe/evaluations"
@@ -275,9 +276,25 @@ def test_promotions_end_no_stream(url: str, served: Registry) -> None:
             assert (pinned.version, following.version) == (1, version)
 
 
+def test_streams_of_events_come_through_and_outlast_every_limit(url: str, served: Registry) -> None:
+    """HAProxy cuts a reply on which nothing comes for 5 s."""
+    with listener(url) as heard:
+        until(lambda: heard.lines.count(": nothing new") >= 4)
+        promote(served, "board", 2)
+        until(lambda: heard.last["aliases"] == {"champion": 2})
+        until(lambda: heard.last["serving"] == {"2": 2})
+        assert not heard.is_over
+    promote(served, "board", 1)
+    until(lambda: serving(served, 1) >= 2)
+
+
 def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> None:
-    """The observations are ones, and the third action is 1: whoever forgot what was before would answer 0."""
+    """The observations are ones, and the third action is 1: whoever forgot what was before would answer 0.
+
+    Streams of events at that replica end, the others go on.
+    """
     with Client(url) as client, ExitStack() as until_done:
+        listeners = [until_done.enter_context(listener(url)) for _ in range(6)]
         streams = [until_done.enter_context(client.stream("memory")) for _ in range(6)]
         for _ in range(2):
             assert [stream.act([1.0]) for stream in streams] == [0] * 6
@@ -288,6 +305,8 @@ def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> N
         assert codes
         assert set(codes) == {1012}
         assert [stream.act([1.0]) for stream in streams] == [1] * 6
+        until(lambda: any(each.is_over for each in listeners))
+        assert not all(each.is_over for each in listeners)
         scale(processes(served.storage, "PolicyServer"), processes(served.storage, "raylet")[0], 2)
     until(lambda: serving(served, 1) >= 2)
 
@@ -330,9 +349,9 @@ def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
 
 @pytest.fixture(scope="module")
 def evaluator(url: str, served: Registry) -> Iterator[httpx.Client]:
-    """Has a key that may start evaluations and nights."""
-    _, token = served.create_key("night-owl", ["read", "evaluate", "promote"])
-    with httpx.Client(base_url=url, headers={"x-api-key": token}) as client:
+    """Has a key that may start evaluations and nights, and play."""
+    _, token = served.create_key("night-owl", ["act", "read", "evaluate", "promote"])
+    with httpx.Client(base_url=url, headers={"x-api-key": token}, timeout=30) as client:
         until(lambda: client.delete(f"{EVALUATIONS}/99").status_code == 404)  # both replicas know it soon
         yield client
 
@@ -408,6 +427,48 @@ def test_a_night_that_finds_another_at_work_says_so_and_the_next_one_promotes(
     night = ended(evaluator, start(evaluator, kind="nightly", reason="second"))
     assert (night["state"], night["result"]["champion"]) == ("done", "tictactoe@2")
     assert served.aliases("tictactoe")["champion"] == 2
+
+
+def patiently(ask: Callable[[], httpx.Response]) -> httpx.Response:
+    """What is answered in the end to a request that may take longer than one waits."""
+    replies: list[httpx.Response] = []
+    until(lambda: replies.append(ask()) or replies[-1].status_code != 503)
+    assert all(reply.json()["code"] in ("not_ready", "no_studio") for reply in replies[:-1])
+    assert all("retry-after" in reply.headers for reply in replies[:-1])
+    assert replies[-1].status_code == 200, replies[-1].text
+    return replies[-1]
+
+
+def test_a_recorded_game_is_shown_and_filmed_by_the_studio(evaluator: httpx.Client, served: Registry) -> None:
+    evaluate(examples.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
+    match = Ledger(served).matches(league=examples.LEAGUE)[-1]
+    game = f"/v1/leagues/tictactoe/matches/{match.id}/games/1"
+    document = patiently(lambda: evaluator.get(game)).json()
+    actions = [move["action"] for step in document["steps"] for move in step["moves"]]
+    assert actions == [*match.games[1].opening, *match.games[1].actions]
+    assert patiently(lambda: evaluator.get(f"{game}/film.gif")).content[:6] == b"GIF89a"
+
+
+def test_a_game_goes_on_whatever_dies_in_its_midst(evaluator: httpx.Client, served: Registry) -> None:
+    body: dict[str, Any] = {"opponent": "tictactoe@2", "agent": "player_1", "chances": True, "actions": []}
+
+    def move() -> dict[str, Any]:
+        return dict(patiently(lambda: evaluator.post("/v1/leagues/tictactoe/play", json=body)).json())
+
+    body["actions"].append(move()["legal"][0])
+    (stage,) = processes(served.storage, "evaluation.stage")
+    os.kill(stage, signal.SIGKILL)
+    until(lambda: stage not in processes(served.storage, "evaluation.stage"))
+    body["actions"].append(move()["legal"][0])
+    (studio,) = processes(served.storage, ":Studio")
+    os.kill(studio, signal.SIGKILL)
+    document = move()
+    assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
+    until(lambda: studio not in processes(served.storage, ":Studio"))
+    assert len(processes(served.storage, "evaluation.stage")) == 1, "the one of the studio that died is gone"
+    refused = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
+    assert (refused.status_code, refused.json()["code"]) == (422, "illegal_action")
+    assert "Traceback" not in refused.text
 
 
 def test_a_server_that_was_killed_can_be_started_again(storage: Storage) -> None:

@@ -73,6 +73,11 @@ def test_a_run_publishes_its_checkpoints_and_further_training_names_its_parent(r
     assert {"run/steps_per_second", *(f"time/{name}" for name in ("sampling", "learning", "weights"))} <= set(tags)
     assert curves(run).Scalars("shared/entropy")[-1].step == 1024
     assert not any(tag.startswith("ray/") or "since_restore" in tag for tag in tags), "curves alone"
+    (told,) = registry.runs("tictactoe")
+    assert (told.id, told.state, told.steps, told.target) == (run.name, "ended", 1024, 1024)
+    assert registry.run_points("tictactoe", run.name)[-1].steps == 1024
+    assert {f"shared/{name}" for name in of_policy} <= set(told.curves)
+    assert not any(name.startswith("agents/") for name in told.curves)
     with pytest.raises(NotFound, match="complete"):
         train(LEAGUE, registry=registry, resume=True)
 
@@ -152,6 +157,8 @@ def test_a_failing_proof_ends_the_run_and_the_versions_before_stay(
     with pytest.raises(ParityError, match="the graph differs"):
         train(tictactoe(steps=4096, **SETTINGS), registry=registry)
     assert lineage(registry.versions("tictactoe")) == [(1, 512, None)]
+    (told,) = registry.runs("tictactoe")
+    assert (told.state, told.error) == ("failed", "the graph differs")
 
     monkeypatch.undo()
     versions = train(tictactoe(steps=1024, **SETTINGS), registry=registry, resume=True)
@@ -234,6 +241,10 @@ def test_a_run_that_is_killed_and_goes_on_publishes_what_one_that_was_not_does(t
     assert len({json.dumps(graphs(version)) for version in whole}) == 3, "it learns"
     assert [version.sha256 for version in resumed[: len(before)]] == [version.sha256 for version in before]
     assert [version.parent for version in resumed] == [None, *(version.number for version in resumed[:-1])]
+    (told,) = killed.runs("tictactoe")
+    assert (told.state, told.lives, told.steps) == ("ended", 2, 1536)
+    steps = [point.steps for point in killed.run_points("tictactoe", told.id)]
+    assert steps == sorted(steps)
 
 
 def graphs(version: VersionRow) -> dict[str, str]:

@@ -29,7 +29,7 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
 
 
 def surprise(match: Match, game: int = 0) -> Surprise:
-    return Surprise(match.id, game, 2, match.contestants[0], match.contestants[1], 0.1, 1.0)
+    return Surprise(match.id, game, match.contestants[0], match.contestants[1], 0.1, 1.0)
 
 
 def played(registry: Registry, league: str = LEAGUE, *refs: str, **config: Any) -> Match:
@@ -108,7 +108,7 @@ def test_an_environment_that_draws_nothing_is_told_in_words(registry: Registry) 
 
 def test_a_game_that_cannot_be_played_again_says_why_and_leaves_the_others(registry: Registry) -> None:
     match = played(registry)
-    gone = Surprise("nowhere/0", 0, 2, *match.contestants, 0.1, 1.0)
+    gone = Surprise("nowhere/0", 0, *match.contestants, 0.1, 1.0)
     lost, found = flipbooks(registry, LEAGUE, [gone, surprise(match)], pictures=False)
     assert lost.fault is not None
     assert "nowhere" in lost.fault

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from evaluation import played
 from evaluation.gate import distinct_games
 from evaluation.nightly import nightly
 from evaluation.pages import league_report as module
@@ -162,7 +163,8 @@ def test_unlike_sides_are_rated_one_by_one(tmp_path: Path) -> None:
 
 
 def test_what_is_left_out_is_said(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST_CONTESTANTS", 3)
+    for named in (module, played):
+        monkeypatch.setattr(named, "MOST_CONTESTANTS", 3)
     monkeypatch.setattr(module, "MOST_VERDICTS", 1)
     report = league_report(registry, LEAGUE, pictures=False)
     assert report.payoff is not None

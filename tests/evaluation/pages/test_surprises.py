@@ -20,7 +20,7 @@ def match(position: int, contestants: tuple[str, str], *scores: float, moves: in
 def greatest(matches: list[Match], most: int = 3) -> list[tuple[str, int, str]]:
     seen = Surprises(RATINGS, most)
     for each in matches:
-        seen.see(each, opening_plies=2)
+        seen.see(each)
     return [(found.match, found.game, found.better) for found in seen.greatest()]
 
 
@@ -37,7 +37,7 @@ def test_what_was_expected_is_no_surprise_and_a_draw_of_very_unequals_is_one() -
     assert greatest([match(0, ("duel@1", "duel@2"), 0.0, 0.5)]) == [("s/0", 1, "duel@1")]
     assert greatest([match(0, ("duel@1", "duel@2"), 0.0, 0.0)]) == []
     found = Surprises(RATINGS, 1)
-    found.see(match(0, ("duel@1", "duel@2"), 1.0), opening_plies=2)
+    found.see(match(0, ("duel@1", "duel@2"), 1.0))
     (surprise,) = found.greatest()
     assert (surprise.other, surprise.score, round(surprise.expected, 3)) == ("duel@2", 1.0, 0.091)
 

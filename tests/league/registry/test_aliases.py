@@ -112,6 +112,15 @@ def test_history_tells_what_was_in_force_at_a_time(registry: Registry) -> None:
     assert registry.history(LEAGUE, "candidate") == []
 
 
+def test_history_comes_in_pages(registry: Registry) -> None:
+    for version in (1, 2, 1, 2):
+        registry.set_alias(LEAGUE, "champion", version, expected=ANY, actor="ada", reason="test")
+    whole = registry.history(LEAGUE)
+    assert [event.version for event in whole] == [2, 1, 2, 1]
+    assert registry.history(LEAGUE, limit=3) == whole[:3]
+    assert registry.history(LEAGUE, before=whole[1].id, limit=3) == whole[2:]
+
+
 def test_rolling_back_returns_to_the_champion_before(registry: Registry) -> None:
     promote(registry, 1, expected=None)
     promote(registry, 2, expected=1)

@@ -303,3 +303,14 @@ def test_a_manifest_must_agree_with_itself() -> None:
     document["policies"]["shared"]["action"]["n"] = 4
     with pytest.raises(ValueError, match="policy shared has other spaces than its agents"):
         Manifest.model_validate(document)
+
+
+def test_versions_are_listed_newest_first(registry: Registry) -> None:
+    for run in range(4):
+        publish(registry, f"run/{run}")
+    registry.set_alias(LEAGUE, "champion", 3, expected=None, actor="ada", reason="test")
+    page = registry.newest_versions(LEAGUE, limit=2)
+    assert [(version.number, version.aliases) for version in page] == [(4, ()), (3, ("champion",))]
+    assert [version.number for version in registry.newest_versions(LEAGUE, before=3, limit=5)] == [2, 1]
+    with pytest.raises(UnknownLeague):
+        registry.newest_versions("chess")

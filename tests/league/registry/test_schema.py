@@ -1,11 +1,13 @@
 """Migrations: equal to the tables, applied once, by whoever comes first."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from alembic.operations import Operations
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
 
@@ -14,7 +16,10 @@ from league.registry import migrations
 from league.registry.database import Database
 from league.registry.registry import Registry
 from league.registry.tables import Table
+from league.results.ledger import Ledger
 from league.settings import Storage
+from tests.league.registry.examples import LEAGUE, registered
+from tests.league.results.test_ledger import SCHEDULE, played
 
 
 def test_migrations_build_the_tables(empty: Registry) -> None:
@@ -74,6 +79,33 @@ def test_a_failed_migration_leaves_nothing(storage: Storage, monkeypatch: pytest
     registry = Registry.open(storage)
     assert registry.leagues() == []
     registry.close()
+
+
+def test_matches_of_before_are_found_by_their_contestants(storage: Storage) -> None:
+    """A ledger of an earlier release: its matches are known by their schedules alone."""
+    registry = registered(Registry.open(storage))
+    ledger = Ledger(registry)
+    schedules = [SCHEDULE, replace(SCHEDULE, id="later", kind="gauntlet", contestants=SCHEDULE.contestants[::-1])]
+    for schedule in schedules:
+        ledger.open(schedule)
+        ledger.extend([played(schedule, position) for position in (0, 2, 4)])
+    ledger.open(replace(SCHEDULE, id="never-played"))
+    expected = ledger.page(LEAGUE)
+    with registry.database.engine.execution_options(writes=True).begin() as connection:
+        operations = Operations(MigrationContext.configure(connection))
+        for index in ("ix_matches_league_played_at", "ix_matches_league_first_second_played_at"):
+            operations.drop_index(index, "matches")
+        for table, columns in (("schedules", ("kind",)), ("matches", ("league", "first", "second"))):
+            for column in columns:
+                operations.drop_column(table, column)
+        for table in ("snapshots", "run_points", "runs"):
+            operations.drop_table(table)
+        connection.execute(text("UPDATE alembic_version SET version_num = '0005'"))
+    registry.close()
+    upgraded = Registry.open(storage)
+    assert Ledger(upgraded).page(LEAGUE) == expected
+    assert Ledger(upgraded).page(LEAGUE, contestants=("script:random", "tictactoe@1"), limit=1) == expected[:1]
+    upgraded.close()
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import math
 import pytest
 from sqlalchemy.exc import StatementError
 
-from league.errors import Conflict, NotFound, UnknownLeague, UnknownVersion
+from league.errors import Conflict, InvalidInput, NotFound, UnknownLeague, UnknownVersion
 from league.registry.registry import Registry
 from tests.league.registry.examples import LEAGUE, registered
 
@@ -65,3 +65,26 @@ def test_verdicts_are_listed_as_they_were_opened(registry: Registry) -> None:
     for schedule in ("b", "a", "c"):
         registry.open_verdict(LEAGUE, 2, "tictactoe@1", schedule, SETTINGS)
     assert [verdict.id for verdict in registry.verdicts(LEAGUE)] == ["b", "a", "c"]
+
+
+def test_they_are_listed_newest_first(registry: Registry) -> None:
+    names = ["c", "a", "d", "b"]
+    for name in names:
+        registry.open_verdict(LEAGUE, 2, "tictactoe@1", name, SETTINGS)
+    assert [row.id for row in registry.newest_verdicts(LEAGUE)] == names[::-1]
+    assert [row.id for row in registry.newest_verdicts(LEAGUE, limit=2)] == names[:1:-1]
+    assert [row.id for row in registry.newest_verdicts(LEAGUE, before="d", limit=5)] == names[1::-1]
+    with pytest.raises(InvalidInput, match="before: league tictactoe has no verdict 'e'"):
+        registry.newest_verdicts(LEAGUE, before="e")
+
+
+def test_each_league_s_last_verdict_is_the_one_that_was_closed_last(registry: Registry) -> None:
+    assert registry.last_verdicts() == {}
+    registered(registry, "chess", versions=1)
+    for name in ("first", "second", "third"):
+        registry.open_verdict(LEAGUE, 2, "tictactoe@1", name, SETTINGS)
+    registry.open_verdict("chess", 1, "script:random", "open", SETTINGS)
+    registry.close_verdict("second", "promote", EVIDENCE)
+    registry.close_verdict("first", "reject", EVIDENCE)
+    last = registry.last_verdicts()
+    assert {league: (row.id, row.outcome) for league, row in last.items()} == {LEAGUE: ("first", "reject")}

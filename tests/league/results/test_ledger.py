@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.errors import LedgerRefusal, NotFound, UnknownLeague
+from league.errors import InvalidInput, LedgerRefusal, NotFound, UnknownLeague
 from league.registry.registry import Registry
+from league.results import ledger as ledger_module
 from league.results.documents import dump_games, dump_schedule, load_games, load_schedule
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Forfeit, Game, Match, Schedule
+from league.results.records import BlockResult, Entry, Forfeit, Game, Match, Schedule
 from league.settings import Storage
 from tests.league.registry.examples import LEAGUE, config, registered
 
@@ -138,6 +139,85 @@ def test_a_block_with_a_forfeit_has_scores_and_no_returns(ledger: Ledger) -> Non
     assert ledger.results(LEAGUE) == [match.result()]
     assert match.result() == BlockResult(SCHEDULE.id, 0, match.contestants, 2, (0.5, 1.5), None)
     assert match.mean_return(0) is None
+
+
+def entry(schedule: Schedule, position: int) -> tuple[str, BlockResult, str]:
+    return schedule.match_id(position), played(schedule, position).result(), schedule.kind
+
+
+def listed(entries: list[Entry]) -> list[tuple[str, BlockResult, str]]:
+    return [(entry.id, entry.result, entry.kind) for entry in entries]
+
+
+def test_matches_are_listed_as_they_were_played_newest_first(ledger: Ledger) -> None:
+    other = replace(SCHEDULE, id="a-gauntlet", kind="gauntlet")
+    for schedule in (SCHEDULE, other):
+        ledger.open(schedule)
+    order = [(other, 4), (SCHEDULE, 0), (other, 1), (SCHEDULE, 7), (SCHEDULE, 2)]
+    for schedule, position in order:
+        ledger.append(played(schedule, position))
+    expected = [entry(*each) for each in reversed(order)]
+    page = ledger.page(LEAGUE, limit=2)
+    assert listed(page) == expected[:2]
+    assert page[0].played_at > page[1].played_at
+    assert not page[0].is_purged
+    assert listed(ledger.page(LEAGUE, before=page[-1].id)) == expected[2:]
+    assert ledger.page(LEAGUE, before=expected[-1][0]) == []
+    ledger.purge([other.id])
+    assert [entry.is_purged for entry in ledger.page(LEAGUE)] == [False, False, True, False, True]
+
+
+def test_matches_of_two_are_listed_whichever_is_named_first(ledger: Ledger) -> None:
+    turned = replace(SCHEDULE, id="turned", contestants=SCHEDULE.contestants[::-1])
+    for schedule in (SCHEDULE, turned):
+        ledger.open(schedule)
+        ledger.extend([played(schedule, position) for position in range(9)])
+    # Of the pairings (0, 1), (0, 2), (1, 2) versions 1 and 2 are the first, and turned round the last.
+    expected = [entry(turned, position) for position in (8, 5, 2)] + [entry(SCHEDULE, at) for at in (6, 3, 0)]
+    assert {each[1].contestants for each in expected} == {
+        ("tictactoe@1", "tictactoe@2"),
+        ("tictactoe@2", "tictactoe@1"),
+    }
+    for first, second in (("tictactoe@1", "tictactoe@2"), ("tictactoe@2", "tictactoe@1")):
+        assert listed(ledger.page(LEAGUE, contestants=(first, second))) == expected
+        page = ledger.page(LEAGUE, contestants=(first, second), before="turned/5", limit=2)
+        assert listed(page) == expected[2:4]
+    assert ledger.page(LEAGUE, contestants=("tictactoe@1", "tictactoe@1")) == []
+
+
+def test_one_who_played_in_a_team_with_itself_is_listed_once(ledger: Ledger) -> None:
+    schedule = replace(SCHEDULE, id="team", kind="cross_play", scoring="team", pairings=((0, 0), (0, 1), (1, 1)))
+    ledger.open(schedule)
+    for position in range(3):
+        games = tuple(replace(game(schedule, position, i), scores=(None, None)) for i in range(2))
+        ledger.append(schedule.match(position, games))
+    (found,) = ledger.page(LEAGUE, contestants=("tictactoe@2", "tictactoe@2"))
+    assert (found.id, found.result.contestants) == ("team/2", ("tictactoe@2", "tictactoe@2"))
+
+
+def test_a_schedule_is_walked_through_a_few_matches_at_a_time(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ledger_module, "STRIDE", 3)
+    for schedule in (SCHEDULE, replace(SCHEDULE, id="another")):
+        ledger.open(schedule)
+    for played_already in ([], [0, 1, 3], [0, 1, 3, 4, 5, 6, 8]):
+        ledger.extend([played(SCHEDULE, position) for position in played_already])
+        assert list(ledger.walk(SCHEDULE)) == [played(SCHEDULE, position) for position in played_already]
+    assert ledger.counts(LEAGUE) == {SCHEDULE.id: 7}
+
+
+def test_one_match_is_found_without_its_moves(ledger: Ledger) -> None:
+    ledger.open(SCHEDULE)
+    ledger.append(played(SCHEDULE, 1))
+    assert ledger.page(LEAGUE) == [ledger.entry(SCHEDULE.match_id(1))]
+    for name in (SCHEDULE.match_id(2), "nothing/1", "nothing", f"{SCHEDULE.id}/{10**30}", f"{SCHEDULE.id}/-1"):
+        with pytest.raises(NotFound):
+            ledger.entry(name)
+        with pytest.raises(NotFound):
+            ledger.match(name)
+        with pytest.raises(InvalidInput, match="before: league tictactoe has no match"):
+            ledger.page(LEAGUE, before=name)
+    with pytest.raises(UnknownLeague):
+        ledger.page("chess")
 
 
 def alone(schedule: Schedule, position: int, *returns: float) -> Match:

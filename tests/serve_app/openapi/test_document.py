@@ -20,7 +20,8 @@ from serve_app.permissions import of_request
 from tests.serve_app.conftest import QUICK
 
 ROOT = Path(__file__).parents[3]
-NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion", "evaluation": "1"}
+NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion", "evaluation": "1", "game": "0"}
+NAMES |= {"verdict": "v", "schedule": "s", "position": "0", "run": "r"}
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,8 @@ def test_it_describes_every_route_and_no_other(described: dict[str, Any], regist
     routes = set()
     for route in Server(registry, QUICK, "replica-1").application().routes:
         assert isinstance(route, Route | WebSocketRoute)
+        if not getattr(route, "include_in_schema", True):
+            continue  # the pages, which are for people
         methods = {"GET"} if isinstance(route, WebSocketRoute) else (route.methods or set()) - {"HEAD"}
         routes |= {(route.path, method) for method in methods}
     assert {(path, method) for path, method, _ in operations(described)} == routes
@@ -107,6 +110,17 @@ def test_general_examples_fit_their_schemas(described: dict[str, Any]) -> None:
         for example in (content or {}).get("examples", {}).values():
             schema = content["schema"] | {"components": described["components"]}
             Draft202012Validator(schema).validate(example["value"])
+            seen += 1
+    assert seen > 8
+
+
+def test_examples_of_answers_fit_their_schemas(described: dict[str, Any]) -> None:
+    seen = 0
+    for _, _, operation in operations(described):
+        content = operation["responses"].get("200", {}).get("content", {}).get("application/json", {})
+        for example in content.get("examples", {}).values():
+            schema = content["schema"] | {"components": described["components"]}
+            Draft202012Validator(schema).validate(resolved(described, example)["value"])
             seen += 1
     assert seen > 8
 

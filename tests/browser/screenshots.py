@@ -1,0 +1,152 @@
+"""The pictures of docs/pages.md: every page of a league with real results.
+
+python -m tests.browser.screenshots [DIRECTORY]
+"""
+
+import math
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import product
+from pathlib import Path
+from random import Random
+from shutil import which
+from tempfile import TemporaryDirectory
+
+from PIL import Image
+from playwright.sync_api import Browser, expect, sync_playwright
+
+from evaluation.nightly import nightly
+from evaluation.tournament import evaluate
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.registry.registry import Registry
+from league.registry.rows import Portion, RunPoint
+from serve_app.launch import running
+from tests.browser.conftest import ARGUMENTS
+from tests.browser.leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
+from tests.evaluation import examples
+from tests.evaluation.examples import LEAGUE
+
+IMAGES = Path(__file__).parents[2] / "docs" / "images"
+CONFIG = examples.config(play={"opening_plies": 2, "copies": 8})
+SEED = 4
+COLORS = 160
+DESK, PHONE = {"width": 1180, "height": 780}, {"width": 390, "height": 780}
+L = f"/leagues/{LEAGUE}"
+PLAYED = f"/leagues/{CONNECT_FOUR}/play#opponent=script:one_ply&agent=player_0&seed=3&actions=3,2,4,2"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A page as it is shown when it says `words`."""
+
+    name: str
+    path: str
+    words: str
+    is_dark: bool = False
+    is_phone: bool = False
+
+
+PICTURES = (
+    Picture("leagues", "/", CONNECT_FOUR),
+    Picture("standings", L, "95 % interval"),
+    Picture("standings-dark", L, "95 % interval", is_dark=True),
+    Picture("standings-phone", L, "95 % interval", is_phone=True),
+    Picture("payoff", f"{L}/payoff", "always wins"),
+    Picture("versions", f"{L}/versions", "became champion"),
+    Picture("verdicts", f"{L}/verdicts", "▲ promote"),
+    Picture("verdict", f"{L}/verdicts/{{verdict}}", "Blocks by result"),
+    Picture("verdict-dark", f"{L}/verdicts/{{verdict}}", "Blocks by result", is_dark=True),
+    Picture("history", f"{L}/history", "promoted by the gate"),
+    Picture("traffic", f"{L}/traffic", "answers"),
+    Picture("matches", f"{L}/matches", r"#\d+"),
+    Picture("game", f"{L}/matches/{{verdict}}/0/0#5", "Step 5"),
+    Picture("play", PLAYED, "Your turn"),
+    Picture("play-dark", PLAYED, "Your turn", is_dark=True),
+    Picture("play-phone", PLAYED, "Your turn", is_phone=True),
+    Picture("evaluations", f"{L}/evaluations", "Start one"),
+    Picture("evaluation-new", f"{L}/evaluations/new", "Contestants: every version"),
+    Picture("run", f"{L}/runs/ppo-17", "entropy"),
+)
+
+
+@contextmanager
+def leagues(home: Path) -> Iterator[Registry]:
+    """Tic-tac-toe with twelve versions that come a night each, and connect four between scripts."""
+    registry = examples.registry(home, play=CONFIG.play.model_dump())
+    chance = Random(SEED)
+    for wins, blocks, centre in sorted(product((False, True), repeat=3)):
+        best = list(examples.CENTRE_FIRST if centre else examples.EDGES_FIRST)
+        for order in (chance.sample(best, 9), best) if wins or blocks else (best,):
+            examples.publish(registry, examples.graph(wins=wins, blocks=blocks, order=tuple(order)))
+            nightly(CONFIG, registry=registry)
+    evaluate(LEAGUE, registry=registry, blocks=8)
+    for name in (CONNECT_FOUR, EMPTY):
+        config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
+        registry.register(config, interface(config))
+    evaluate(CONNECT_FOUR, ["script:one_ply", "script:random"], registry=registry, blocks=4)
+    registry.set_traffic(LEAGUE, canary=Portion(2, 0.05), shadow=None, actor="release-bot", reason="try it")
+    _train(registry, chance)
+    compute(registry)
+    yield registry
+    registry.close()
+
+
+def _train(registry: Registry, chance: Random) -> None:
+    """A record of a training, such as trainings leave."""
+    run, target = "ppo-17", 4_000_000
+    registry.begin_run(LEAGUE, run, algorithm="ppo", settings={}, seed=17, target=target)
+    for number in range(1, 121):
+        curves: dict[str, float] = {}
+        for policy, pace in (("x", 30), ("o", 45)):
+            learned = 1 - math.exp(-number / pace)
+            curves |= {
+                f"{policy}/return": learned - 0.4 + chance.gauss(0, 0.05),
+                f"{policy}/entropy": 2.1 - 1.5 * learned + chance.gauss(0, 0.03),
+                f"{policy}/value_loss": 0.5 - 0.3 * learned + chance.gauss(0, 0.02),
+                f"{policy}/kl": abs(chance.gauss(0.012, 0.003)),
+            }
+        registry.record_point(LEAGUE, run, RunPoint(number * 25_000, curves, datetime.now(UTC)))
+
+
+def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], directory: Path) -> None:
+    """One picture, in few colours."""
+    size = PHONE if picture.is_phone else DESK
+    page = browser.new_page(
+        viewport=size,
+        color_scheme="dark" if picture.is_dark else "light",
+        device_scale_factor=2 if picture.is_phone else 1,
+        reduced_motion="reduce",
+    )
+    page.goto(url + picture.path.format(**names))
+    expect(page.locator("main")).to_contain_text(re.compile(picture.words), timeout=90_000)
+    for unfinished in (".loading", ".plot:not(:has(canvas))", ".screen:not(:has(img))"):
+        expect(page.locator(unfinished)).to_have_count(0, timeout=30_000)
+    path = directory / f"{picture.name}.png"
+    page.screenshot(path=path)
+    page.close()
+    with Image.open(path) as taken:
+        taken.convert("RGB").quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"{path} {path.stat().st_size // 1024} KiB")
+
+
+def main(directory: Path) -> None:
+    """Take them all."""
+    with TemporaryDirectory() as home, leagues(Path(home)) as registry, running(registry.storage, replicas=1) as url:
+        for league in (LEAGUE, CONNECT_FOUR):
+            answer("GET", f"{url}/v1/leagues/{league}/playable")
+        names = {"verdict": verdict_between_versions(registry).id}
+        with sync_playwright() as playwright:
+            path = which("chromium") or playwright.chromium.executable_path
+            browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+            for picture in PICTURES:
+                take(browser, url, picture, names, directory)
+            browser.close()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else IMAGES)

@@ -1,0 +1,141 @@
+"""Each page, with real results: it says what it is to say, in light and dark, on a phone, without a fault."""
+
+import re
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import expect
+
+from tests.browser.conftest import Served, Tab
+from tests.browser.leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
+from tests.evaluation.examples import LEAGUE
+
+L = f"/leagues/{LEAGUE}"
+PAGES = {
+    "/": (r"tictactoe", r"@3", r"two_step_game"),
+    "/leagues": (r"connect_four",),
+    L: (r"tictactoe@3\s*★\s*champion", r"script:random", r"95 % interval"),
+    f"/leagues/{EMPTY}": (r"none yet", r"Standings are not computed yet|Nobody has played yet"),
+    f"{L}/payoff": (r"always wins", r"script:random"),
+    f"{L}/versions": (r"tictactoe@1", r"became champion", r"Promote …"),
+    f"{L}/verdicts": (r"▲ promote", r"@2"),
+    f"{L}/verdicts/{{verdict}}": (r"tictactoe@\d against", r"It is the stronger one", r"Blocks by result"),
+    f"{L}/history": (r"rolled back", r"as it was", r"promoted by the gate"),
+    f"{L}/traffic": (r"answers 5\.0 %", r"is shown 100\.0 %"),
+    f"{L}/matches?first=tictactoe%403&second=tictactoe%401": (r"tictactoe@3 against tictactoe@1", r"#\d+"),
+    f"{L}/matches/{{schedule}}/0": (r"Watch 0", r"Watch 1"),
+    f"{L}/matches/{{schedule}}/0/0": (r"player_1", r"of \d"),
+    f"{L}/evaluations": (r"None was asked for yet|#\d",),
+    f"{L}/evaluations/new": (r"Contestants: every version", r"At most minutes"),
+    f"{L}/runs": (RUN, r"5\d %"),
+    f"{L}/runs/{RUN}": (r"2\d,000 of 40,000", r"entropy", r"More curves"),
+    f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your seat"),
+    f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
+    f"{L}/nothing": (r"There is no such page",),
+}
+
+
+@pytest.fixture(scope="module")
+def names(served: Served) -> dict[str, str]:
+    """What a path of a page may name."""
+    verdict = verdict_between_versions(served.registry)
+    return {"verdict": verdict.id, "schedule": verdict.schedule}
+
+
+@pytest.mark.parametrize(
+    "tab", [{"color_scheme": "light"}, {"color_scheme": "dark"}], indirect=True, ids=["light", "dark"]
+)
+@pytest.mark.parametrize("path", PAGES)
+def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
+    page = tab.open(path.format(**names))
+    for words in PAGES[path]:
+        expect(page.locator("body")).to_contain_text(re.compile(words))
+    expect(page.locator("h1")).to_have_count(1)
+    assert page.title().endswith("Policy League")
+    assert serious(tab) == []
+    page.set_viewport_size({"width": 360, "height": 740})
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "it scrolls sideways on a phone"
+
+
+def serious(tab: Tab) -> list[dict[str, Any]]:
+    """The serious and critical faults that axe finds."""
+    found = Axe().run(tab.page).response["violations"]
+    return [
+        {
+            "rule": each["id"],
+            "at": [node["html"][:200] + str(node.get("failureSummary"))[:300] for node in each["nodes"]],
+        }
+        for each in found
+        if each["impact"] in ("serious", "critical")
+    ]
+
+
+def test_a_dialog(tab: Tab) -> None:
+    page = tab.open(L)
+    page.get_by_role("button", name="Roll back …").click()
+    expect(page.get_by_role("dialog")).to_contain_text("becomes the champion again, instead of")
+    assert serious(tab) == []
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    expect(page.get_by_role("button", name="Roll back …")).to_be_focused()
+
+
+def test_an_unknown_league(tab: Tab) -> None:
+    page = tab.open("/leagues/chess/verdicts")
+    expect(page.get_by_role("heading", level=1)).to_have_text("There is no league chess")
+    tab.forgive(404)
+
+
+def test_the_first_paint_waits_for_no_data(tab: Tab) -> None:
+    """Nothing of the API answers, and there is a page all the same."""
+    tab.page.route("**/v1/**", lambda route: None)
+    page = tab.open(L)
+    expect(page.get_by_role("heading", level=1)).to_have_text(LEAGUE)
+    expect(page.get_by_role("navigation", name=re.compile("Pages"))).to_be_visible()
+
+
+def test_colours_are_chosen_and_kept(tab: Tab) -> None:
+    page = tab.open("/")
+    paper = "getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(paper)
+    switch = page.get_by_role("button", name="Colours")
+    switch.click()  # light
+    switch.click()  # dark
+    expect(switch).to_have_accessible_name("Colours: dark")
+    dark = page.evaluate(paper)
+    page.reload()
+    assert page.evaluate(paper) == dark != light
+
+
+def test_a_phone_shows_the_present_tab(tab: Tab) -> None:
+    tab.page.set_viewport_size({"width": 360, "height": 740})
+    page = tab.open(f"{L}/play")
+    expect(page.get_by_role("link", name="Play", exact=True)).to_be_in_viewport(ratio=0.9)
+
+
+def test_everything_is_reached_by_keyboard(tab: Tab) -> None:
+    page = tab.open("/")
+    expect(page.get_by_role("link", name=LEAGUE, exact=True)).to_be_visible()
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="To the content")).to_be_focused()
+    page.get_by_role("link", name=LEAGUE, exact=True).focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", level=1)).to_have_text(LEAGUE)
+    page.get_by_role("link", name="Who beats whom").focus()
+    page.keyboard.press("Enter")
+    cell = page.get_by_role("link", name=re.compile("tictactoe@3 scores .* against script:random"))
+    cell.focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", level=2)).to_contain_text("against script:random")
+    page.go_back()
+    expect(page.get_by_role("heading", level=2)).to_have_text("Who beats whom")
+
+
+def test_a_long_list_is_shown_page_by_page(tab: Tab) -> None:
+    page = tab.open(f"{L}/matches")
+    rows = page.locator("tbody tr")
+    expect(rows).to_have_count(50)
+    page.get_by_role("button", name="Show more").click()
+    expect(rows).to_have_count(100)
+    assert len(set(page.locator("tbody th a").evaluate_all("links => links.map(link => link.href)"))) == 100

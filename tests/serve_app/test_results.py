@@ -1,0 +1,319 @@
+"""What pages read of a league: standings, verdicts, matches, training runs, the history of its aliases."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jsonschema import Draft202012Validator
+from starlette.testclient import TestClient
+
+from evaluation.snapshots import refresh
+from league.registry.registry import Registry
+from league.settings import Storage
+from serve_app.openapi.document import document
+from tests.evaluation import examples
+from tests.evaluation.pages import leagues
+from tests.serve_app.conftest import QUICK, replica
+from tests.serve_app.leagues import everything, promote
+from tests.serve_app.results import LOST, PENDING, RANKED, SCHEDULE, WON, record
+
+BOARD = "/v1/leagues/board"
+DESCRIBED = document(QUICK, [])
+
+
+@pytest.fixture(scope="module")
+def storage(tmp_path_factory: pytest.TempPathFactory) -> Storage:
+    storage = Storage.at(tmp_path_factory.mktemp("results"))
+    registry = everything(storage)
+    record(registry)
+    registry.close()
+    return storage
+
+
+@pytest.fixture(scope="module")
+def reader(storage: Storage) -> Iterator[TestClient]:
+    with replica(storage) as client:
+        yield client
+
+
+def get(reader: TestClient, path: str, schema: str, **query: Any) -> dict[str, Any]:
+    """What is answered, which is as it is described."""
+    reply = reader.get(path, params=query)
+    assert reply.status_code == 200, reply.text
+    described = {"$ref": f"#/components/schemas/{schema}", "components": DESCRIBED["components"]}
+    Draft202012Validator(described).validate(reply.json())
+    return dict(reply.json())
+
+
+def pages(reader: TestClient, path: str, schema: str, name: str, **query: Any) -> list[list[Any]]:
+    """All pages of a list."""
+    found, before = [], {}
+    while before is not None:
+        page = get(reader, path, schema, **query, **before)
+        found.append(page[name])
+        before = None if page["next"] is None else {"before": page["next"]}
+    return found
+
+
+def test_the_leagues_say_what_goes_on_in_each(reader: TestClient) -> None:
+    leagues = {each["league"]: each for each in get(reader, "/v1/leagues", "Leagues")["leagues"]}
+    board = leagues["board"]
+    assert (board["champion"], board["versions"], board["games"], board["matches"]) == (2, 3, 12, 6)
+    verdict = {name: board["last_verdict"][name] for name in ("verdict", "outcome", "promoted", "candidate")}
+    assert verdict == {"verdict": WON, "outcome": "promote", "promoted": True, "candidate": "board@2"}
+    assert (board["running_evaluations"], board["running_runs"], board["requests"]) == (0, 1, 0)
+    empty = leagues["empty"]
+    assert (empty["champion"], empty["versions"], empty["games"], empty["last_verdict"]) == (None, 0, None, None)
+
+
+def test_leagues_are_read_by_pages(reader: TestClient) -> None:
+    every = [each["league"] for each in get(reader, "/v1/leagues", "Leagues")["leagues"]]
+    split = pages(reader, "/v1/leagues", "Leagues", "leagues", limit=3)
+    assert [len(page) for page in split] == [3, 3, 1]
+    assert [each["league"] for page in split for each in page] == every
+    assert reader.get("/v1/leagues", params={"limit": 0}).json()["code"] == "invalid_input"
+
+
+def test_a_league_says_when_its_standings_were_computed(reader: TestClient) -> None:
+    board = get(reader, BOARD, "League")
+    assert (board["summary"]["games"], board["up_to_date"]) == (12, True)
+    assert datetime.fromisoformat(board["computed_at"]) <= datetime.now(UTC)
+    assert board["traffic"]["canary"] is None
+    memory = get(reader, "/v1/leagues/memory", "League")
+    assert (memory["summary"], memory["computed_at"], memory["up_to_date"]) == (None, None, False)
+
+
+def test_what_was_played_since_is_told(client: TestClient, registry: Registry) -> None:
+    record(registry)
+    assert client.get(BOARD).json()["up_to_date"]
+    promote(registry, "board", 3)
+    assert not client.get(BOARD).json()["up_to_date"]
+
+
+def test_standings_are_read_by_place(reader: TestClient) -> None:
+    page = get(reader, f"{BOARD}/standings", "Standings", limit=3)
+    assert [(each["rank"], each["ref"]) for each in page["standings"]] == list(enumerate(RANKED[:3], 1))
+    assert (page["total"], page["sides"], page["side"]) == (4, ["player_0", "player_1"], None)
+    rest = get(reader, f"{BOARD}/standings", "Standings", limit=3, offset=3)
+    assert [(each["rank"], each["ref"]) for each in rest["standings"]] == [(4, RANKED[3])]
+    assert get(reader, f"{BOARD}/standings", "Standings", offset=9)["standings"] == []
+
+
+def test_standings_on_one_side(reader: TestClient) -> None:
+    page = get(reader, f"{BOARD}/standings", "Standings", side="player_0")
+    assert ([each["ref"] for each in page["standings"]], page["total"]) == (list(RANKED[:2]), 2)
+    assert get(reader, f"{BOARD}/standings", "Standings", side="player_1")["total"] == 0
+
+
+def test_where_nothing_was_computed_there_is_nothing(reader: TestClient) -> None:
+    memory = "/v1/leagues/memory"
+    standings = get(reader, f"{memory}/standings", "Standings")
+    assert (standings["computed_at"], standings["standings"], standings["sides"]) == (None, [], [])
+    refused = reader.get(f"{memory}/standings", params={"side": "agent_shared"})
+    assert "no side of memory has standings of its own" in refused.json()["message"]
+    assert get(reader, f"{memory}/payoff", "PayoffTable")["payoff"] is None
+    assert get(reader, f"{memory}/ratings", "Ratings")["versions"] == []
+    for name, schema in (("verdicts", "Verdicts"), ("matches", "Matches"), ("runs", "Runs")):
+        assert get(reader, f"{memory}/{name}", schema)[name] == []
+
+
+def test_payoff_and_ratings_are_what_was_computed(reader: TestClient) -> None:
+    assert get(reader, f"{BOARD}/payoff", "PayoffTable")["payoff"]["score"] == [[None, 0.75], [0.25, None]]
+    assert [each["number"] for each in get(reader, f"{BOARD}/ratings", "Ratings")["versions"]] == [1, 2, 3]
+
+
+def test_verdicts_are_listed_newest_first(reader: TestClient) -> None:
+    (verdicts,) = pages(reader, f"{BOARD}/verdicts", "Verdicts", "verdicts")
+    assert [each["verdict"] for each in verdicts] == [PENDING, WON, LOST]
+    assert [(each["outcome"], each["promoted"]) for each in verdicts] == [
+        ("open", False),
+        ("promote", True),
+        ("reject", False),
+    ]
+    assert [each["llr"] for each in verdicts] == [None, 2.97, -3.0]
+    assert verdicts[1]["reason"] == "It is the stronger one."
+    split = pages(reader, f"{BOARD}/verdicts", "Verdicts", "verdicts", limit=2)
+    assert [[each["verdict"] for each in page] for page in split] == [[PENDING, WON], [LOST]]
+
+
+def test_a_verdict_has_its_curve_once_that_is_computed(reader: TestClient) -> None:
+    won = get(reader, f"{BOARD}/verdicts/{WON}", "Verdict")
+    assert (won["outcome"], won["curve"][-1], won["counts"][-1]) == ("promote", [41, 0.07 * 41], 15)
+    assert won["reason"] == "It is the stronger one."
+    pending = get(reader, f"{BOARD}/verdicts/{PENDING}", "Verdict")
+    assert (pending["outcome"], pending["computed_at"], pending["reason"]) == ("open", None, None)
+
+
+def test_a_reason_that_was_true_before_the_verdict_fell_is_not_told(reader: TestClient) -> None:
+    lost = get(reader, f"{BOARD}/verdicts/{LOST}", "Verdict")
+    assert (lost["outcome"], lost["reason"]) == ("reject", None)
+    (verdicts,) = pages(reader, f"{BOARD}/verdicts", "Verdicts", "verdicts")
+    assert verdicts[2]["reason"] is None
+
+
+def test_matches_are_listed_as_they_were_played_newest_first(reader: TestClient) -> None:
+    every = pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=3)
+    assert [len(page) for page in every] == [3, 3, 1]
+    matches = [match for page in every for match in page]
+    assert [match["match"] for match in matches[1:]] == [SCHEDULE.match_id(at) for at in reversed(range(6))]
+    assert (matches[0]["kind"], matches[0]["counts"]) == ("gauntlet", False)
+    newest = matches[1]
+    assert newest["contestants"] == ["board@2", "script:random"]
+    assert (newest["scores"], newest["returns"], newest["games"]) == ([1.5, 0.5], None, 2)
+    assert (matches[2]["returns"], matches[2]["counts"]) == ([1.25, -0.75], True)
+
+
+def test_matches_of_two_are_found_whoever_is_named_first(reader: TestClient) -> None:
+    ways = [{"first": "board@1", "second": "board@2"}, {"first": "board@2", "second": "board@1"}]
+    found = [pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=2, **way) for way in ways]
+    assert found[0] == found[1]
+    assert [match["contestants"] for page in found[0] for match in page] == [["board@1", "board@2"]] * 3
+    assert get(reader, f"{BOARD}/matches", "Matches", first="board@1", second="nobody")["matches"] == []
+
+
+def test_a_match_has_its_games(reader: TestClient) -> None:
+    match = get(reader, f"{BOARD}/matches/{SCHEDULE.id}/5", "Match")
+    assert (match["contestants"], match["kind"]) == (["board@2", "script:random"], "round_robin")
+    first, second = match["games"]
+    assert first["sides"] == {"player_0": "board@2", "player_1": "script:random"}
+    assert second["sides"] == {"player_0": "script:random", "player_1": "board@2"}
+    assert (first["scores"], first["returns"], first["opening"], first["actions"]) == ([1.0, 0.0], [1.0, -1.0], 2, 3)
+    assert first["forfeits"] == [{"ref": "script:random", "agent": "player_1", "reason": "illegal_action"}]
+    assert second["forfeits"] == []
+
+
+def test_runs_are_listed_newest_first(reader: TestClient) -> None:
+    every = pages(reader, f"{BOARD}/runs", "Runs", "runs", limit=1)
+    assert [[each["run"] for each in page] for page in every] == [["second"], ["first"]]
+    first = every[1][0]
+    assert (first["state"], first["error"], first["steps"]) == ("failed", "the environment raised", 200)
+    assert first["curves"] == {"return": 0.2, "shared/entropy": 1.5}
+
+
+def test_a_run_has_its_curves(reader: TestClient) -> None:
+    run = get(reader, f"{BOARD}/runs/first", "Run")
+    assert [(point["steps"], point["curves"]["return"]) for point in run["points"]] == [(100, 0.1), (200, 0.2)]
+    assert (run["settings"], run["seconds"], run["target"]) == ({"lr": 0.001}, 20.0, 1000)
+
+
+def test_the_history_says_who_was_champion_when(reader: TestClient, storage: Storage) -> None:
+    path = f"{BOARD}/aliases/champion/history"
+    (events,) = pages(reader, path, "History", "history")
+    assert [(event["version"], event["verdict"], event["actor"]) for event in events] == [
+        (2, WON, "league nightly"),
+        (1, None, "test"),
+    ]
+    assert [len(page) for page in pages(reader, path, "History", "history", limit=1)] == [1, 1]
+    moved, first = (datetime.fromisoformat(event["at"]) for event in events)
+    for instant, expected in (
+        (moved, [2]),
+        (moved - timedelta(microseconds=1), [1]),
+        (datetime.now(UTC) + timedelta(days=1), [2]),
+        (first - timedelta(microseconds=1), []),
+    ):
+        found = get(reader, path, "History", at=instant.isoformat())
+        assert ([event["version"] for event in found["history"]], found["next"]) == (expected, None)
+    assert get(reader, f"{BOARD}/aliases/candidate/history", "History")["history"] == []
+
+
+def test_versions_are_read_by_pages_newest_first(reader: TestClient) -> None:
+    every = pages(reader, f"{BOARD}/versions", "Versions", "versions", limit=2)
+    assert [[each["version"] for each in page] for page in every] == [[3, 2], [1]]
+    assert [each["version"] for each in get(reader, f"{BOARD}/versions", "Versions")["versions"]] == [1, 2, 3]
+
+
+def test_there_are_no_more_rows_than_the_largest_page(reader: TestClient) -> None:
+    for name in ("standings", "verdicts", "matches", "runs", "aliases/champion/history"):
+        assert reader.get(f"{BOARD}/{name}", params={"limit": 200}).status_code == 200
+        assert reader.get(f"{BOARD}/{name}", params={"limit": 201}).json()["code"] == "invalid_input"
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("standings?limit=0", "limit must be a number from 1 to 200, got '0'"),
+        ("standings?offset=-1", "offset must be a number from 0"),
+        ("standings?side=nobody", "side must be one of player_0, player_1, got 'nobody'"),
+        ("standings?side=", "side must be 1 to 300 printable characters"),
+        ("verdicts?limit=x", "limit"),
+        ("verdicts?before=nothing", "before: league board has no verdict 'nothing'"),
+        ("matches?before=nothing", "before: league board has no match 'nothing'"),
+        ("matches?before=%00", "before must be 1 to 300 printable characters"),
+        ("matches?first=board@1", "first and second go together"),
+        ("runs?before=nothing", "before: league board has no training run 'nothing'"),
+        ("versions?before=x", "before must be a number from 1"),
+        ("aliases/champion/history?before=0", "before must be a number from 1"),
+        ("aliases/champion/history?at=yesterday", "at must be an instant with its time zone"),
+        ("aliases/champion/history?at=2026-03-03T14:00:00", "at must be an instant with its time zone"),
+        ("aliases/champion/history?at=0001-01-01T00:00:00%2B05:00", "at must be an instant"),
+        ("aliases/champion/history?at=2026-03-03T14:00:00Z&before=3", "contradict"),
+        ("aliases/7/history", "7"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused_in_a_sentence(reader: TestClient, query: str, words: str) -> None:
+    reply = reader.get(f"{BOARD}/{query}")
+    assert reply.status_code == 400, reply.text
+    assert words in reply.json()["message"]
+
+
+@pytest.mark.parametrize(
+    ("path", "code"),
+    [
+        ("/v1/leagues/nobody/standings", "unknown_league"),
+        ("/v1/leagues/nobody/payoff", "unknown_league"),
+        ("/v1/leagues/nobody/ratings", "unknown_league"),
+        ("/v1/leagues/nobody/verdicts", "unknown_league"),
+        (f"/v1/leagues/nobody/verdicts/{WON}", "unknown_league"),
+        ("/v1/leagues/nobody/matches", "unknown_league"),
+        (f"/v1/leagues/nobody/matches/{SCHEDULE.id}/0", "unknown_league"),
+        ("/v1/leagues/nobody/runs", "unknown_league"),
+        ("/v1/leagues/nobody/runs/first", "unknown_league"),
+        ("/v1/leagues/nobody/aliases/champion/history", "unknown_league"),
+        (f"{BOARD}/verdicts/nothing", "unknown_verdict"),
+        (f"{BOARD}/verdicts/%00", "unknown_verdict"),
+        (f"{BOARD}/matches/nothing/0", "unknown_match"),
+        (f"{BOARD}/matches/{SCHEDULE.id}/6", "unknown_match"),
+        (f"{BOARD}/matches/{SCHEDULE.id}/x", "unknown_match"),
+        (f"{BOARD}/matches/{SCHEDULE.id}/99999999999999999999", "unknown_match"),
+        (f"{BOARD}/runs/nothing", "unknown_run"),
+        (f"{BOARD}/runs/%00", "unknown_run"),
+    ],
+)
+def test_what_is_not_there(reader: TestClient, path: str, code: str) -> None:
+    reply = reader.get(path)
+    assert (reply.status_code, reply.json()["code"]) == (404, code)
+
+
+@pytest.mark.parametrize(
+    "path", [f"verdicts/{WON}", f"matches/{SCHEDULE.id}/0", "runs/first"], ids=["verdict", "match", "run"]
+)
+def test_what_is_another_leagues_is_not_shown(reader: TestClient, path: str) -> None:
+    """A key may be for one league alone."""
+    reply = reader.get(f"/v1/leagues/memory/{path}")
+    assert reply.status_code == 404, reply.text
+
+
+def test_what_a_night_brings_and_the_studio_computes_of_it_is_as_described(tmp_path: Path) -> None:
+    with leagues.of_a_night(tmp_path / "home") as registry:
+        refresh(registry, examples.LEAGUE)
+        verdicts = [row.id for row in registry.verdicts(examples.LEAGUE)]
+        storage = registry.storage
+    league = f"/v1/leagues/{examples.LEAGUE}"
+    with replica(storage) as night:
+        assert get(night, league, "League")["up_to_date"]
+        assert get(night, f"{league}/standings", "Standings")["total"] > 2
+        assert get(night, f"{league}/payoff", "PayoffTable")["payoff"]["contestants"]
+        assert get(night, f"{league}/ratings", "Ratings")["versions"]
+        assert any(event["verdict"] for event in get(night, f"{league}/aliases/champion/history", "History")["history"])
+        (listed,) = pages(night, f"{league}/verdicts", "Verdicts", "verdicts")
+        assert [each["verdict"] for each in listed] == verdicts[::-1]
+        for each in listed:
+            verdict = get(night, f"{league}/verdicts/{each['verdict']}", "Verdict")
+            assert verdict["curve"]
+            assert verdict["reason"] == each["reason"]
+            assert {name: verdict[name] for name in each} == each
+        match = get(night, f"{league}/matches", "Matches", limit=1)["matches"][0]
+        games = get(night, f"{league}/matches/{match['match']}", "Match")["games"]
+        assert [list(game["sides"].values()) for game in games] == [match["contestants"], match["contestants"][::-1]]
