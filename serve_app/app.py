@@ -51,6 +51,7 @@ from serve_app.routes.events import EventRoutes
 from serve_app.routes.games import GameRoutes
 from serve_app.routes.health import HealthRoutes
 from serve_app.routes.history import HistoryRoutes
+from serve_app.routes.key import KeyRoute
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.matches import MatchRoutes
 from serve_app.routes.metrics import MetricsRoute
@@ -230,6 +231,7 @@ class Server:
                 Route(f"{GAME}/film.gif", self.games.film),
                 Route("/v1/leagues/{league}/playable", self.games.table),
                 Route("/v1/leagues/{league}/play", self.games.play, methods=["POST"]),
+                Route("/v1/key", KeyRoute(self.doors).key),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
                 Route("/metrics", MetricsRoute(self.models).metrics),

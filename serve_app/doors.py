@@ -32,6 +32,7 @@ READ_HERE = cross_site.READ | {b"authorization", b"x-api-key", b"x-request-timeo
 DENIAL = "websocket.http.response"
 """ASGI's extension by which a WebSocket that is refused learns why."""
 POLICY_VIOLATION = 1008
+UNKNOWN = "this API key is unknown, revoked or expired"
 
 
 class Doors:
@@ -80,6 +81,14 @@ class Doors:
         elif not self._keyring.holds(key):
             raise Unauthenticated(f"the API key {key.name} was revoked, or has expired")
 
+    def key_of(self, headers: Iterable[tuple[bytes, bytes]]) -> Key | None:
+        """The key that a request shows, None without. Raises Unauthenticated if it is none, or valid no longer."""
+        token = _shown(headers).token
+        key = None if token is None else self._keyring.find(token)
+        if token is not None and key is None:
+            raise Unauthenticated(UNKNOWN)
+        return key
+
     def lets_read_all(self, headers: Iterable[tuple[bytes, bytes]]) -> bool:
         """Whether a request that needs no key may be told of all leagues, by the key that it shows."""
         try:
@@ -110,7 +119,7 @@ class Doors:
             return f"this needs an API key, and there is none yet: league keys create NAME --scope {need.scope}"
         if token is None:
             return "this needs an API key: Authorization: Bearer plk_…"
-        return "this API key is unknown, revoked or expired"
+        return UNKNOWN
 
 
 class Guarded:

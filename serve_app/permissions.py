@@ -5,14 +5,15 @@ read     GET (HEAD) of anything else; the index of models
 evaluate POST and DELETE of evaluations, even where no other request needs a key
 promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
          thought of is not the one that is open
-nothing  health; the description of the server and the pages, which tell strangers nothing of a league
+nothing  health; the description of the server and the pages, which tell strangers nothing of a league; what a key
+         may do
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 HEALTH = ("/v1/health/", "/v2/health/")
-DESCRIPTION = ("/docs", "/openapi.json", "/", "/leagues")
+DESCRIPTION = ("/docs", "/openapi.json", "/", "/leagues", "/v1/key")
 PAGES = ("/leagues/", "/pages/")
 ALIASES = ("aliases", "rollback", "traffic")
 

@@ -1,7 +1,7 @@
 // What components read: answers of the server that are fetched again when something says that they have changed.
 
 import { createContext, useCallback, useContext, useEffect, useRef, useState } from "./vendor/preact-htm.js";
-import { ask, follow, query } from "./api.js";
+import { ask, follow, key, query } from "./api.js";
 
 const PAGE = 50;
 const LARGEST = 100;
@@ -47,6 +47,14 @@ function useFetched(path, mark, load) {
   }, [path, mark, round]);
   const again = useCallback(() => setRound((was) => was + 1), []);
   return state.path === path ? { ...state, again } : { data: null, fault: null, again };
+}
+
+/** Why the key that was entered may not do this in a league, in a sentence; null if it may, or none was: then one is asked for. */
+export function useRefusal(scope, league) {
+  const shown = key.get();
+  const own = useData(shown ? "/v1/key" : null, shown ?? "").data?.key;
+  if (!own || (own.scopes.includes(scope) && (own.leagues?.includes(league) ?? true))) return null;
+  return `The key ${own.name} may not ${scope} in ${league}.`;
 }
 
 /** Follow a stream of events while a component is there. */

@@ -2,15 +2,17 @@
 
 import { html, useState } from "./vendor/preact-htm.js";
 import { ask, of } from "./api.js";
-import { useData, useList, useMark } from "./data.js";
+import { useData, useList, useMark, useRefusal } from "./data.js";
 import { Await, Empty, Form, league as at, More, Progress, State, Table, useTitle, When } from "./parts.js";
 import { go } from "./router.js";
 import { tail } from "./words.js";
 
 export function Evaluations({ league }) {
   const evaluations = useList(of(league, "evaluations"), "evaluations", useMark("evaluation", "evaluations"));
+  const refusal = useRefusal("evaluate", league);
   return html`<section aria-labelledby="heading">
-    <div class="head"><h2 id="heading">Evaluations</h2><a class="button primary" href=${at(league, "evaluations", "new")}>Start one …</a></div>
+    <div class="head"><h2 id="heading">Evaluations</h2>${refusal ? html`<p class="soft">${refusal}</p>`
+      : html`<a class="button primary" href=${at(league, "evaluations", "new")}>Start one …</a>`}</div>
     <${Await} of=${evaluations}>${evaluations.items && (evaluations.items.length
       ? html`<${Table} caption="Evaluations, newest first" head=${[["Evaluation"], ["State"], ["What"], ["How far"], ["By"], ["Reason"], ["Asked"]]} cls="full">
           ${evaluations.items.map((each) => html`<${Row} key=${each.evaluation} league=${league} of=${each} />`)}<//>`

@@ -2,15 +2,16 @@
 
 import { html, useState } from "./vendor/preact-htm.js";
 import { ask, of } from "./api.js";
-import { useData, useMark } from "./data.js";
+import { useData, useMark, useRefusal } from "./data.js";
 import { Await, Dialog, Form, notify, sentence, Trouble, When } from "./parts.js";
 
 /** The buttons of a league's title. */
 export function Promotions({ league, champion }) {
   const [open, setOpen] = useState(null);
+  const refusal = useRefusal("promote", league);
   return html`<div class="actions">
-    <button type="button" onClick=${() => setOpen("promote")}>Promote …</button>
-    <button type="button" onClick=${() => setOpen("rollback")} disabled=${champion == null}>Roll back …</button>
+    <button type="button" onClick=${() => setOpen("promote")} disabled=${refusal} title=${refusal}>Promote …</button>
+    <button type="button" onClick=${() => setOpen("rollback")} disabled=${refusal || champion == null} title=${refusal}>Roll back …</button>
     ${open === "promote" && html`<${Promote} league=${league} champion=${champion} onClose=${() => setOpen(null)} />`}
     ${open === "rollback" && html`<${RollBack} league=${league} champion=${champion} onClose=${() => setOpen(null)} />`}
   </div>`;

@@ -50,6 +50,21 @@ def test_a_promotion_and_a_rollback_change_the_leaderboard_without_reload(tab: T
     assert page.evaluate("window.isTheSame"), "the page was not loaded again"
 
 
+def test_what_a_key_may_not_do_is_not_offered(tab: Tab, served: Served) -> None:
+    page = tab.open(f"{L}/versions")
+    expect(page.get_by_role("button", name=f"Promote {LEAGUE}@1")).to_be_enabled()
+    page.get_by_role("button", name=re.compile("^Key")).click()
+    enter_key(page, served.keys["evaluator"])
+    for name in ("Promote …", "Roll back …", f"Promote {LEAGUE}@1"):
+        expect(page.get_by_role("button", name=name, exact=True)).to_be_disabled()
+    expect(page.get_by_title(f"The key evaluator may not promote in {LEAGUE}.").first).to_be_visible()
+    page.get_by_role("button", name=re.compile("^Key")).click()
+    enter_key(page, served.keys["reader"])
+    page.get_by_role("link", name="Evaluations").click()
+    expect(page.get_by_text(f"The key reader may not evaluate in {LEAGUE}.")).to_be_visible()
+    expect(page.get_by_role("link", name="Start one …")).to_have_count(0)
+
+
 def test_a_promotion_by_others_is_seen(tab: Tab, served: Served) -> None:
     page = tab.open(L)
     leader(page, 3)
@@ -75,13 +90,13 @@ def test_a_champion_that_moved_meanwhile_is_not_replaced(tab: Tab, served: Serve
 
 def test_a_key_that_may_not_is_told_so(tab: Tab, served: Served) -> None:
     page = tab.open(L)
-    page.get_by_role("button", name=re.compile("^Key")).click()
-    enter_key(page, served.keys["reader"])
     page.get_by_role("button", name="Roll back …").click()
     dialog = page.get_by_role("dialog", name=f"Roll {LEAGUE} back")
     dialog.get_by_label("Reason").fill("may I?")
     dialog.get_by_role("button", name="Roll back to").click()
+    enter_key(page, served.keys["reader"])
     expect(dialog.get_by_role("alert")).to_contain_text("This needs a key of scope promote: reader is for read")
+    tab.forgive(401)
     tab.forgive(403)
 
 

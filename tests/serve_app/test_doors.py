@@ -74,6 +74,15 @@ def test_the_first_key_locks_and_its_revocation_does_not_unlock(client: TestClie
     assert client.post(ACTION, json=BODY).status_code == 401
 
 
+def test_what_a_key_may_do_is_told_to_whoever_shows_it(client: TestClient, registry: Registry) -> None:
+    assert client.get("/v1/key").json() == {"key": None, "is_needed": False}
+    _, token = registry.create_key("night-owl", ["read", "evaluate"], only_leagues=["board"])
+    told = {"name": "night-owl", "scopes": ["evaluate", "read"], "leagues": ["board"]}
+    until(lambda: client.get("/v1/key").json() == {"key": None, "is_needed": True})
+    assert client.get("/v1/key", headers=bearer(token)).json() == {"key": told, "is_needed": True}
+    refused(client.get("/v1/key", headers=bearer("plk_none")), 401, "unauthenticated", "unknown")
+
+
 def test_health_stays_open(registry: Registry) -> None:
     with served(registry, require_keys="always") as client:
         for path in ("/v1/health/live", "/v1/health/ready", "/v2/health/live", "/v2/health/ready"):

@@ -52,6 +52,8 @@ from tests.serve_app.conftest import QUICK
         ("POST", "/v1/leagues/evaluations", Need("promote", "evaluations")),
         ("GET", "/v1/health/ready", NOTHING),
         ("GET", "/v2/health/live", NOTHING),
+        ("GET", "/v1/key", NOTHING),
+        ("POST", "/v1/key", Need("promote", None, True)),
         ("POST", "/v2/health/live", Need("promote", None, True)),
         ("GET", "/anything", Need("read", None, True)),
         ("DELETE", "/v1/leagues/board", Need("promote", "board")),
@@ -91,7 +93,7 @@ def test_every_route_but_health_the_description_and_the_pages_needs_something(re
         for method in getattr(route, "methods", None) or ("GET",):
             need = of_request(kind, method, route.path.replace("{", "").replace("}", ""))
             is_page = not getattr(route, "include_in_schema", True)
-            is_open = is_page or "/health/" in route.path or route.path in ("/docs", "/openapi.json")
+            is_open = is_page or "/health/" in route.path or route.path in ("/docs", "/openapi.json", "/v1/key")
             assert (need.scope is None) == is_open, route.path
             if "{league}" in route.path or "{model}" in route.path:
                 assert need.league in ("league", "model"), route.path
