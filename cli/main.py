@@ -18,7 +18,7 @@ from cli.serving import act, serve
 from cli.traffic import traffic
 from cli.training import sweep, train
 from cli.verdicts import verify, void
-from cli.versions import history, promote, rollback, versions
+from cli.versions import history, note, promote, rollback, versions
 from league.errors import InvalidInput, LeagueError, NotFound
 
 app = typer.Typer(
@@ -39,6 +39,7 @@ for command in (
     train,
     sweep,
     versions,
+    note,
     evaluate,
     nightly,
     verify,

@@ -1,4 +1,4 @@
-"""`league versions`, `promote`, `rollback` and `history`."""
+"""`league versions`, `note`, `promote`, `rollback` and `history`."""
 
 import getpass
 from dataclasses import asdict
@@ -16,6 +16,7 @@ from league.registry.rows import AliasEvent, VersionRow
 
 LeagueName = Annotated[str, typer.Argument(metavar="LEAGUE", help="The league's name, such as connect_four.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of a table.")]
+Ref = Annotated[str, typer.Argument(metavar="REF", help="Which version, such as connect_four@3.")]
 Reason = Annotated[str, typer.Option(help="Why; kept in the history.")]
 Actor = Annotated[str | None, typer.Option(help="Who; kept in the history. Default: you.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Return when every live replica serves it; exit 1 if one does not.")]
@@ -40,7 +41,7 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
         say(f"{league} has no version yet: league train CONFIG")
         return
     table(
-        ("version", "aliases", "rating", "games", "steps", "parent", "made"),
+        ("version", "aliases", "rating", "games", "steps", "parent", "made", "note"),
         [
             (
                 row.number,
@@ -50,6 +51,7 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
                 row.steps,
                 row.parent,
                 row.created_at,
+                row.note and row.note.text,
             )
             for row, document in zip(rows, documents, strict=True)
         ],
@@ -67,11 +69,25 @@ def _document(row: VersionRow, standing: Any) -> dict[str, Any]:
         "parent": row.parent,
         "sha256": row.sha256,
         "created_at": row.created_at,
+        "note": row.note and asdict(row.note),
     }
 
 
+def note(
+    ref: Ref,
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="What people shall know of it; '' takes the note away.")],
+    actor: Actor = None,
+) -> None:
+    """Write of a version what was tried in it, or came of it: `league versions` and the pages show that.
+
+    It takes the place of what was written before.
+    """
+    row = Registry.open().note(CheckpointRef.parse(ref), text, actor=actor or getpass.getuser())
+    say(f"{row.ref}: {row.note.text if row.note else 'there is no note any more'}")
+
+
 def promote(
-    ref: Annotated[str, typer.Argument(metavar="REF", help="Which version, such as connect_four@3.")],
+    ref: Ref,
     alias: Annotated[str, typer.Option(help="The alias to move.")] = CHAMPION,
     expected: Annotated[
         str | None,

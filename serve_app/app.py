@@ -55,6 +55,7 @@ from serve_app.routes.key import KeyRoute
 from serve_app.routes.leagues import LeagueRoutes
 from serve_app.routes.matches import MatchRoutes
 from serve_app.routes.metrics import MetricsRoute
+from serve_app.routes.notes import NoteRoutes
 from serve_app.routes.pages import PageRoutes
 from serve_app.routes.promotion import PromotionRoutes
 from serve_app.routes.runs import RunRoutes
@@ -194,6 +195,7 @@ class Server:
         runs = RunRoutes(self.models)
         history = HistoryRoutes(self.models)
         promotion = PromotionRoutes(self.models, self.settings)
+        notes = NoteRoutes(self.models, self.settings)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
         health = HealthRoutes(self.watcher, self.replica)
         events = EventRoutes(self.events, self.doors)
@@ -207,6 +209,7 @@ class Server:
                 Route("/v1/leagues", leagues.leagues),
                 Route("/v1/leagues/{league}", leagues.league),
                 Route("/v1/leagues/{league}/versions", leagues.versions),
+                Route("/v1/leagues/{league}/versions/{version}/note", notes.put, methods=["PUT"]),
                 Route("/v1/leagues/{league}/standings", standings.standings),
                 Route("/v1/leagues/{league}/payoff", standings.payoff),
                 Route("/v1/leagues/{league}/ratings", standings.ratings),

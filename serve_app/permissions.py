@@ -3,8 +3,8 @@
 act      POST …/action, …/infer, …/play; a stream
 read     GET (HEAD) of anything else; the index of models
 evaluate POST and DELETE of evaluations, even where no other request needs a key
-promote  what changes an alias, even where no other request needs a key; and whatever else, so that a path that nobody
-         thought of is not the one that is open
+promote  what changes an alias or what is written of a version, even where no other request needs a key; and whatever
+         else, so that a path that nobody thought of is not the one that is open
 nothing  health; the description of the server and the pages, which tell strangers nothing of a league; what a key
          may do
 """
@@ -15,7 +15,8 @@ from typing import NamedTuple
 HEALTH = ("/v1/health/", "/v2/health/")
 DESCRIPTION = ("/docs", "/openapi.json", "/", "/leagues", "/v1/key")
 PAGES = ("/leagues/", "/pages/")
-ALIASES = ("aliases", "rollback", "traffic")
+SIGNED = ("aliases", "rollback", "traffic", "versions")
+"""What below a league is changed in somebody's name."""
 
 
 class Need(NamedTuple):
@@ -27,7 +28,7 @@ class Need(NamedTuple):
     is_of_all: bool = False
     """Whether it is about all leagues."""
     is_change: bool = False
-    """Whether it changes what is served, or what is played: that needs a key, and so somebody's name, always."""
+    """Whether it changes what is served, played or written: that needs a key, and so somebody's name, always."""
 
 
 NOTHING = Need(None, None)
@@ -40,7 +41,7 @@ def of_request(kind: str, method: str, path: str) -> Need:
         return NOTHING
     league = league_of(path)
     scope = _scope(kind, method, path)
-    is_change = scope == "evaluate" or (scope == "promote" and _is_below_league(path, ALIASES))
+    is_change = scope == "evaluate" or (scope == "promote" and _is_below_league(path, SIGNED))
     return Need(scope, league, league is None and path != "/v2", is_change)
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from league.registry import acknowledgements, aliases, evaluations, rows, runs
-from league.registry.tables import READY, AliasEvent, Evaluation, Snapshot, TrafficEvent, Verdict, Version
+from league.registry.tables import READY, AliasEvent, Evaluation, Snapshot, TrafficEvent, Verdict, Version, VersionNote
 
 OPEN = "open"
 
@@ -24,6 +24,7 @@ def take(session: Session, league: str, since: timedelta) -> rows.Pulse:
         aliases=aliases.current(session, league),
         event=session.scalar(select(func.max(AliasEvent.id)).filter_by(league=league)),
         version=session.scalar(select(func.max(Version.number)).filter_by(league=league, state=READY)),
+        note=session.scalar(select(func.max(VersionNote.id)).filter_by(league=league)),
         traffic=session.scalar(select(func.max(TrafficEvent.id)).filter_by(league=league)),
         serving=dict(sorted(serving.items())),
         verdicts={outcome or OPEN: count for outcome, count in session.execute(outcomes)},

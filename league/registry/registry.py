@@ -19,6 +19,7 @@ from league.registry import (
     keys,
     leagues,
     nights,
+    notes,
     publishing,
     pulse,
     reports,
@@ -150,6 +151,16 @@ class Registry:
         """One version. Raises UnknownLeague or UnknownVersion."""
         with self.database.read() as session:
             return versions.get(session, league, number)
+
+    def note(self, ref: CheckpointRef, text: str, *, actor: str) -> VersionRow:
+        """Write of a version what people shall know, in place of what was written before; empty: nothing any more.
+
+        Raises UnknownLeague, UnknownVersion, UnknownAlias or InvalidInput.
+        """
+        with self.database.write() as session:
+            version = versions.resolve(session, ref)
+            notes.write(session, version.league, version.number, text, actor)
+            return versions.get(session, version.league, version.number)
 
     def resolve(self, ref: CheckpointRef | str) -> VersionRow:
         """The version that a reference names now.

@@ -23,6 +23,15 @@ class LeagueRow:
 
 
 @dataclass(frozen=True, slots=True)
+class Note:
+    """What somebody wrote of a version."""
+
+    text: str
+    actor: str
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
 class VersionRow:
     """A whole, published checkpoint version."""
 
@@ -34,6 +43,7 @@ class VersionRow:
     """The digest of manifest.json, and so of the version."""
     manifest: Manifest
     aliases: tuple[str, ...]
+    note: Note | None
 
     @property
     def ref(self) -> str:
@@ -291,6 +301,8 @@ class Pulse:
     """The newest movement of an alias."""
     version: int | None
     """The newest."""
+    note: int | None
+    """The newest that was written of one of its versions."""
     traffic: int | None
     """The setting of canary and shadow."""
     serving: dict[int, int]

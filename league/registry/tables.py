@@ -102,6 +102,24 @@ class Version(Table):
     """The digest of manifest.json, which holds the digests of all other files."""
 
 
+class VersionNote(Table):
+    """What somebody wrote of a version. Never changed; the newest is its note, an empty one takes it away."""
+
+    __tablename__ = "version_notes"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
+        Index("ix_version_notes_league_version_id", "league", "version", "id"),
+        Index("ix_version_notes_league_id", "league", "id"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    league: Mapped[str] = mapped_column(String(255))
+    version: Mapped[int]
+    text: Mapped[str] = mapped_column(Text)
+    actor: Mapped[str] = mapped_column(Text)
+    at: Mapped[datetime] = mapped_column(Utc)
+
+
 class AliasEvent(Table):
     """One movement of an alias: who, when, why, on which verdict. Never changed."""
 

@@ -5,9 +5,9 @@ from sqlalchemy.orm import Session
 
 from league.errors import UnknownAlias, UnknownVersion
 from league.refs import CheckpointRef
-from league.registry import leagues
+from league.registry import leagues, notes
 from league.registry.manifest import Manifest
-from league.registry.rows import VersionRow
+from league.registry.rows import Note, VersionRow
 from league.registry.tables import READY, Alias, Version
 
 
@@ -85,10 +85,11 @@ def _rows(session: Session, league: str, versions: list[Version]) -> list[Versio
     names: dict[int, list[str]] = {}
     for alias in session.scalars(select(Alias).filter_by(league=league).order_by(Alias.name)):
         names.setdefault(alias.version, []).append(alias.name)
-    return [_row(version, tuple(names.get(version.number, ()))) for version in versions]
+    written = notes.current(session, league, [version.number for version in versions])
+    return [_row(version, tuple(names.get(version.number, ())), written.get(version.number)) for version in versions]
 
 
-def _row(version: Version, aliases: tuple[str, ...]) -> VersionRow:
+def _row(version: Version, aliases: tuple[str, ...], note: Note | None) -> VersionRow:
     assert version.manifest is not None, "a version is ready with its manifest"
     assert version.sha256 is not None, "and its digest"
     manifest = Manifest.from_json(version.manifest, source=f"the manifest of {version.league}@{version.number}")
@@ -99,4 +100,5 @@ def _row(version: Version, aliases: tuple[str, ...]) -> VersionRow:
         sha256=version.sha256,
         manifest=manifest,
         aliases=aliases,
+        note=note,
     )

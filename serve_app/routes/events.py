@@ -94,6 +94,7 @@ def _pulse(pulse: Pulse) -> Document:
         "aliases": pulse.aliases,
         "event": pulse.event,
         "version": pulse.version,
+        "note": pulse.note,
         "traffic": pulse.traffic,
         "serving": {str(version): replicas for version, replicas in pulse.serving.items()},
         "verdicts": pulse.verdicts,

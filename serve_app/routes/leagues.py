@@ -52,7 +52,7 @@ class LeagueRoutes:
         def question(registry: Registry) -> dict[str, Any]:
             rows = registry.newest_versions(league, before=before, limit=limit + 1)
             page, more = queries.paged(rows, limit, lambda row: row.number)
-            return {"league": league, "versions": list(map(_version, page)), "next": more}
+            return {"league": league, "versions": list(map(version_document, page)), "next": more}
 
         return await looked_up(self._models, question)
 
@@ -129,10 +129,11 @@ def _replica(said: Acknowledgement) -> dict[str, Any]:
 
 
 def _all_versions(registry: Registry, league: str) -> dict[str, Any]:
-    return {"league": league, "versions": list(map(_version, registry.versions(league))), "next": None}
+    return {"league": league, "versions": list(map(version_document, registry.versions(league))), "next": None}
 
 
-def _version(row: VersionRow) -> dict[str, Any]:
+def version_document(row: VersionRow) -> dict[str, Any]:
+    """A version as JSON."""
     return {
         "version": row.number,
         "aliases": list(row.aliases),
@@ -142,4 +143,5 @@ def _version(row: VersionRow) -> dict[str, Any]:
         "algorithm": row.manifest.algorithm,
         "policies": list(row.manifest.policies),
         "created_at": row.created_at.isoformat(),
+        "note": row.note and {"text": row.note.text, "actor": row.note.actor, "at": row.note.at.isoformat()},
     }

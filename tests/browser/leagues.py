@@ -11,6 +11,7 @@ import httpx
 from evaluation.snapshots import refresh
 from league.config import LeagueConfig
 from league.environments.building import interface
+from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.rows import Portion, RunPoint, VerdictRow
 from tests.evaluation.examples import LEAGUE
@@ -31,6 +32,7 @@ def of_every_page(home: Path) -> Iterator[Registry]:
             config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
             registry.register(config, interface(config))
         registry.set_traffic(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
+        registry.note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
         registry.begin_run(LEAGUE, RUN, algorithm="ppo", settings={"note": HOSTILE}, seed=17, target=40_000)
         for number in range(20):
             record(registry, 1000 * (number + 1))

@@ -4,6 +4,7 @@ import re
 
 from playwright.sync_api import Page, Route, expect
 
+from league.refs import CheckpointRef
 from tests.browser.conftest import Served, Tab
 from tests.browser.leagues import EMPTY, RUN, record
 from tests.evaluation.examples import LEAGUE
@@ -195,11 +196,11 @@ def test_curves_grow_while_a_run_is_on(tab: Tab, served: Served) -> None:
 
 def test_hostile_words_stay_words(tab: Tab, served: Served) -> None:
     tab.page.on("dialog", lambda dialog: tab.complaints.append(f"a dialog was opened: {dialog.message}"))
-    for path in (L, f"{L}/history", f"{L}/traffic", f"{L}/evaluations", f"{L}/runs/{RUN}"):
+    for path in (L, f"{L}/versions", f"{L}/history", f"{L}/traffic", f"{L}/evaluations", f"{L}/runs/{RUN}"):
         page = tab.open(path)
         expect(page.get_by_role("heading", level=2)).to_be_visible()
         expect(page.locator("img:not(.brand img, .picture img), section script")).to_have_count(0)
-    for path in (f"{L}/history", f"{L}/traffic"):
+    for path in (f"{L}/versions", f"{L}/history", f"{L}/traffic"):
         expect(tab.open(path).locator("section")).to_contain_text(HOSTILE)
     for name in ("<img src=x onerror=alert(1)>", "'\"><b>", "..%2F..", "%00"):
         page = tab.open(f"/leagues/{name.replace('/', '%2F') if '%' not in name else name}")
@@ -207,6 +208,26 @@ def test_hostile_words_stay_words(tab: Tab, served: Served) -> None:
         expect(page.locator("main b, main img")).to_have_count(0)
     tab.forgive(400)
     tab.forgive(404)
+
+
+def test_a_note_is_written_seen_by_others_and_taken_away(tab: Tab, served: Served) -> None:
+    page = tab.open(f"{L}/versions")
+    row = page.get_by_role("row").filter(has=page.get_by_role("button", name=f"Promote {LEAGUE}@1"))
+    row.get_by_role("button", name=f"Write a note of {LEAGUE}@1").click()
+    dialog = page.get_by_role("dialog", name=f"Note of {LEAGUE}@1")
+    dialog.get_by_label("Note").fill("twice the entropy")
+    dialog.get_by_role("button", name="Keep it").click()
+    enter_key(page, served.keys["everything"])
+    expect(row).to_contain_text("twice the entropy")
+    tab.forgive(401)
+    served.registry.note(CheckpointRef(LEAGUE, 1), "half the entropy", actor="cli")
+    expect(row).to_contain_text("half the entropy")
+    row.get_by_role("button", name=f"Change the note of {LEAGUE}@1").click()
+    expect(dialog.get_by_label("Note")).to_have_value("half the entropy")
+    dialog.get_by_label("Note").fill("")
+    dialog.get_by_role("button", name="Keep it").click()
+    expect(row.get_by_role("button", name=f"Write a note of {LEAGUE}@1")).to_be_visible()
+    assert served.registry.version(LEAGUE, 1).note is None
 
 
 def test_who_was_champion_then(tab: Tab, served: Served) -> None:

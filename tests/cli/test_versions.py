@@ -19,6 +19,15 @@ def test_versions_as_a_table(league: League, registry: Registry) -> None:
     assert len(lines) == 4
 
 
+def test_notes_are_written_shown_and_taken_away(league: League, registry: Registry) -> None:
+    assert league("note", "tictactoe@2", "[bold]entropy", "--actor", "ada").out == "tictactoe@2: [bold]entropy\n"
+    assert league("versions", "tictactoe").out.splitlines()[2].endswith("[bold]entropy")
+    notes = [version["note"] for version in league("versions", "tictactoe", "--json").json["versions"]]
+    assert [note and (note["text"], note["actor"]) for note in notes] == [None, ("[bold]entropy", "ada"), None]
+    assert league("note", "tictactoe@2", "").out == "tictactoe@2: there is no note any more\n"
+    assert registry.version("tictactoe", 2).note is None
+
+
 def test_promote_roll_back_and_the_history_of_both(league: League, registry: Registry) -> None:
     assert "now version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
     assert "now version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out

@@ -32,6 +32,7 @@ from tests.serve_app.conftest import QUICK
         ("GET", "/leaguesque", Need("read", None, True)),
         ("GET", "/v1/leagues", Need("read", None, True)),
         ("GET", "/v1/leagues/board/versions", Need("read", "board")),
+        ("PUT", "/v1/leagues/board/versions/3/note", Need("promote", "board", is_change=True)),
         ("HEAD", "/v1/leagues/board", Need("read", "board")),
         ("POST", "/v1/leagues/board/aliases/champion", Need("promote", "board", is_change=True)),
         ("POST", "/v1/leagues/board/rollback", Need("promote", "board", is_change=True)),

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 import pytest
 
 from league.errors import UnknownLeague
+from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.rows import Portion, RunPoint
@@ -20,6 +21,7 @@ CHANGES: list[Callable[[Registry], object]] = [
     lambda registry: publish(registry, "run/1"),
     lambda registry: registry.set_alias(LEAGUE, "champion", 1, expected=ANY, actor="test", reason="test"),
     lambda registry: registry.set_alias(LEAGUE, "candidate", 1, expected=ANY, actor="test", reason="test"),
+    lambda registry: registry.note(CheckpointRef(LEAGUE, 1), "a try", actor="test"),
     lambda registry: registry.set_traffic(LEAGUE, shadow=Portion(1, 0.5), actor="test", reason="test"),
     lambda registry: registry.acknowledge("replica-1", LEAGUE, 1, "0" * 64),
     lambda registry: registry.acknowledge("replica-2", LEAGUE, 1, "0" * 64),

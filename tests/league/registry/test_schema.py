@@ -98,7 +98,7 @@ def test_matches_of_before_are_found_by_their_contestants(storage: Storage) -> N
         for table, columns in (("schedules", ("kind",)), ("matches", ("league", "first", "second"))):
             for column in columns:
                 operations.drop_column(table, column)
-        for table in ("snapshots", "run_points", "runs"):
+        for table in ("snapshots", "run_points", "runs", "version_notes"):
             operations.drop_table(table)
         connection.execute(text("UPDATE alembic_version SET version_num = '0005'"))
     registry.close()
