@@ -97,7 +97,19 @@ def evaluate(
     if as_json:
         emit(report.to_json())
         return
-    say(f"{league}: {report.games} games, {report.distinct_games} of them different{_ENDS[report.stopped_by]}\n")
+    _show(report)
+
+
+_ENDS = {
+    "schedule": "",
+    "games": "; the games are used up",
+    "minutes": "; cut short, as the time was up",
+    "precision": "; the ratings are precise enough",
+}
+
+
+def _show(report: EvaluationReport) -> None:
+    say(f"{report.league}: {report.games} games, {report.distinct_games} of them different{_ENDS[report.stopped_by]}\n")
     if report.cross_play is not None:
         _show_cross_play(report.cross_play)
         return
@@ -110,14 +122,6 @@ def evaluate(
         errors.print(f"{ref} forfeited {lost} games: it had no legal action to give", markup=False, soft_wrap=True)
     if report.population is not None:
         _show_population(report.payoff.contestants, report.population)
-
-
-_ENDS = {
-    "schedule": "",
-    "games": "; the games are used up",
-    "minutes": "; cut short, as the time was up",
-    "precision": "; the ratings are precise enough",
-}
 
 
 def show_standings(standings: tuple[Standing, ...]) -> None:
