@@ -21,10 +21,10 @@ export function Runs({ league }) {
   </section>`;
 }
 
+/** Of its steps or its time, whichever ends it sooner. */
 function Share({ of: run }) {
-  if (!run.target) return html`<span class="soft">–</span>`;
-  const share = Math.min(1, (run.steps ?? 0) / run.target);
-  return html`<span class="progress"><progress max="1" value=${share} aria-label="Steps of ${run.run}"></progress> <span class="soft">${Math.floor(100 * share)} %</span></span>`;
+  const share = Math.min(1, Math.max(run.steps / run.target, run.minutes ? run.seconds / (60 * run.minutes) : 0));
+  return html`<span class="progress"><progress max="1" value=${share} aria-label="How far ${run.run} is"></progress> <span class="soft">${Math.floor(100 * share)} %</span></span>`;
 }
 
 export function Run({ league, run }) {
@@ -36,7 +36,8 @@ export function Run({ league, run }) {
     <${Await} of=${found}>${about && html`
       <div class="head"><h2 id="heading" class="words">${run}</h2><${State} of=${about.state} /></div>
       <${Facts} of=${[
-        ["Steps", html`${count(about.steps)}${about.target ? html` <small>of ${count(about.target)}</small>` : ""}`],
+        ["Steps", html`${count(about.steps)} <small>of ${count(about.target)}</small>`],
+        about.minutes && ["Minutes", html`${count(Math.floor(about.seconds / 60))} <small>of ${about.minutes}</small>`],
         ["How far", html`<${Share} of=${about} />`],
         ["Algorithm", about.algorithm],
         ["Seed", count(about.seed)],

@@ -56,6 +56,7 @@ def _listed(row: RunRow) -> dict[str, Any]:
         "error": row.error,
         "steps": row.steps,
         "target": row.target,
+        "minutes": row.settings.get("minutes"),
         "seconds": row.seconds,
         "seed": row.seed,
         "parent": row.parent,

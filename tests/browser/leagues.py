@@ -33,7 +33,9 @@ def of_every_page(home: Path) -> Iterator[Registry]:
             registry.register(config, interface(config))
         registry.set_traffic(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
         registry.note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
-        registry.begin_run(LEAGUE, RUN, algorithm="ppo", settings={"note": HOSTILE}, seed=17, target=40_000)
+        registry.begin_run(
+            LEAGUE, RUN, algorithm="ppo", settings={"note": HOSTILE, "minutes": 10}, seed=17, target=40_000
+        )
         for number in range(20):
             record(registry, 1000 * (number + 1))
         compute(registry)
@@ -49,7 +51,7 @@ def compute(registry: Registry) -> None:
 def record(registry: Registry, steps: int) -> None:
     """The run gets further."""
     curves = {"player/return": steps / 40_000, "player/entropy": 2 - steps / 40_000, "time/sampling": 1.5}
-    registry.record_point(LEAGUE, RUN, RunPoint(steps, curves, datetime.now(UTC)))
+    registry.record_point(LEAGUE, RUN, RunPoint(steps, curves, datetime.now(UTC)), seconds=0.0225 * steps)
 
 
 def verdict_between_versions(registry: Registry) -> VerdictRow:

@@ -187,6 +187,8 @@ def test_curves_grow_while_a_run_is_on(tab: Tab, served: Served) -> None:
     page = tab.open(f"{L}/runs/{RUN}")
     expect(page.locator("canvas").first).to_be_visible()
     expect(page.locator("section")).to_contain_text("20,000 of 40,000")
+    expect(page.locator("section")).to_contain_text("7 of 10")
+    expect(page.locator("section")).to_contain_text("75 %")  # the sooner of the two: half of its steps are done
     record(served.registry, 21_000)
     expect(page.locator("section")).to_contain_text("21,000 of 40,000")
     expect(page.get_by_role("img", name=re.compile("^return over 21,000 steps"))).to_be_visible()

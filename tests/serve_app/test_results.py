@@ -195,7 +195,7 @@ def test_runs_are_listed_newest_first(reader: TestClient) -> None:
 def test_a_run_has_its_curves(reader: TestClient) -> None:
     run = get(reader, f"{BOARD}/runs/first", "Run")
     assert [(point["steps"], point["curves"]["return"]) for point in run["points"]] == [(100, 0.1), (200, 0.2)]
-    assert (run["settings"], run["seconds"], run["target"]) == ({"lr": 0.001}, 20.0, 1000)
+    assert (run["settings"], run["seconds"], run["target"], run["minutes"]) == ({"lr": 0.001}, 20.0, 1000, None)
 
 
 def test_the_history_says_who_was_champion_when(reader: TestClient, storage: Storage) -> None:
