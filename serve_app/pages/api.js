@@ -68,7 +68,7 @@ export async function ask(path, { method = "GET", body, signal, whole = false, r
 }
 
 /** Whether it may be otherwise in a moment: a server that is starting, moving, or busy. */
-function passes(fault, repeatable) {
+export function passes(fault, repeatable) {
   return fault.code === "network" || [502, 503, 504].includes(fault.status) || (repeatable && fault.status === 429);
 }
 

@@ -1,10 +1,11 @@
 // What components read: answers of the server that are fetched again when something says that they have changed.
 
 import { createContext, useCallback, useContext, useEffect, useRef, useState } from "./vendor/preact-htm.js";
-import { ask, follow, key, query } from "./api.js";
+import { ask, Fault, follow, key, passes, query } from "./api.js";
 
 const PAGE = 50;
 const LARGEST = 100;
+const LATER = 10000; // milliseconds until what could not be read is tried anew: nobody may sit before the page
 
 /** {data, fault, again}. `path` null: nothing is asked. When `mark` changes, the old data stays until the new is there. */
 export function useData(path, mark = "") {
@@ -46,6 +47,10 @@ function useFetched(path, mark, load) {
     return () => closed.abort();
   }, [path, mark, round]);
   const again = useCallback(() => setRound((was) => was + 1), []);
+  useEffect(() => {
+    const timer = state.fault instanceof Fault && passes(state.fault, true) && setTimeout(again, LATER);
+    return () => clearTimeout(timer);
+  }, [state.fault]);
   return state.path === path ? { ...state, again } : { data: null, fault: null, again };
 }
 

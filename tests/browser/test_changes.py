@@ -246,6 +246,18 @@ def test_who_was_champion_then(tab: Tab, served: Served) -> None:
     expect(page.locator(".then")).to_contain_text(f"{LEAGUE}@3")
 
 
+def test_a_page_that_nobody_sits_before_recovers_with_the_server(tab: Tab) -> None:
+    page = tab.open(L)
+    leader(page, 3)
+    tab.page.route("**/v1/**/standings*", lambda route: route.abort())
+    page.goto(f"{tab.url}{L}")
+    expect(page.get_by_role("alert").first).to_contain_text("The server does not answer")
+    tab.page.unroute("**/v1/**/standings*")
+    leader(page, 3)
+    expect(page.get_by_role("alert")).to_have_count(0)
+    tab.complaints = [each for each in tab.complaints if "net::ERR_FAILED" not in each]
+
+
 def test_a_server_that_is_busy_for_a_moment_is_asked_again(tab: Tab) -> None:
     answers = iter([503, 429])
 
