@@ -28,7 +28,7 @@ PAGES = {
     f"{L}/matches/{{schedule}}/0/0": (r"player_1", r"of \d"),
     f"{L}/evaluations": (r"None was asked for yet|#\d",),
     f"{L}/evaluations/new": (r"Contestants: every version", r"At most minutes"),
-    f"{L}/runs": (RUN, r"5\d %"),
+    f"{L}/runs": (RUN, r"7\d %"),
     f"{L}/runs/{RUN}": (r"2\d,000 of 40,000", r"entropy", r"More curves"),
     f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your seat"),
     f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
@@ -79,6 +79,13 @@ def test_a_dialog(tab: Tab) -> None:
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     expect(page.get_by_role("button", name="Roll back …")).to_be_focused()
+
+
+def test_the_dialog_of_a_note(tab: Tab) -> None:
+    page = tab.open(f"{L}/versions")
+    page.get_by_role("button", name=f"Change the note of {LEAGUE}@2").click()
+    expect(page.get_by_role("dialog", name=f"Note of {LEAGUE}@2")).to_contain_text("Without a word it is taken away")
+    assert serious(tab) == []
 
 
 def test_an_unknown_league(tab: Tab) -> None:
