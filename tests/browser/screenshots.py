@@ -3,13 +3,11 @@
 python -m tests.browser.screenshots [DIRECTORY]
 """
 
-import math
 import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 from random import Random
@@ -23,19 +21,22 @@ from evaluation.nightly import nightly
 from evaluation.tournament import evaluate
 from league.config import LeagueConfig
 from league.environments.building import interface
+from league.refs import CheckpointRef
 from league.registry.registry import Registry
-from league.registry.rows import Portion, RunPoint
+from league.registry.rows import Portion
 from serve_app.launch import running
 from tests.browser.conftest import ARGUMENTS
 from tests.browser.leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
 from tests.evaluation import examples
 from tests.evaluation.examples import LEAGUE
+from training.run import train
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 CONFIG = examples.config(play={"opening_plies": 2, "copies": 8})
 SEED = 4
 COLORS = 160
 DESK, PHONE = {"width": 1180, "height": 780}, {"width": 390, "height": 780}
+TRAINED = "tictactoe_ppo"
 L = f"/leagues/{LEAGUE}"
 PLAYED = f"/leagues/{CONNECT_FOUR}/play#opponent=script:one_ply&agent=player_0&seed=3&actions=3,2,4,2"
 
@@ -70,7 +71,7 @@ PICTURES = (
     Picture("play-phone", PLAYED, "Your turn", is_phone=True),
     Picture("evaluations", f"{L}/evaluations", "Start one"),
     Picture("evaluation-new", f"{L}/evaluations/new", "Contestants: every version"),
-    Picture("run", f"{L}/runs/ppo-17", "entropy"),
+    Picture("run", f"/leagues/{TRAINED}/runs/{{run}}", "entropy"),
 )
 
 
@@ -90,27 +91,17 @@ def leagues(home: Path) -> Iterator[Registry]:
         registry.register(config, interface(config))
     evaluate(CONNECT_FOUR, ["script:one_ply", "script:random"], registry=registry, blocks=4)
     registry.set_traffic(LEAGUE, canary=Portion(2, 0.05), shadow=None, actor="release-bot", reason="try it")
-    _train(registry, chance)
+    registry.note(CheckpointRef(LEAGUE, 11), "takes the centre first", actor="ada")
+    _train(registry)
     compute(registry)
     yield registry
     registry.close()
 
 
-def _train(registry: Registry, chance: Random) -> None:
-    """A record of a training, such as trainings leave."""
-    run, target = "ppo-17", 4_000_000
-    registry.begin_run(LEAGUE, run, algorithm="ppo", settings={}, seed=17, target=target)
-    for number in range(1, 121):
-        curves: dict[str, float] = {}
-        for policy, pace in (("x", 30), ("o", 45)):
-            learned = 1 - math.exp(-number / pace)
-            curves |= {
-                f"{policy}/return": learned - 0.4 + chance.gauss(0, 0.05),
-                f"{policy}/entropy": 2.1 - 1.5 * learned + chance.gauss(0, 0.03),
-                f"{policy}/value_loss": 0.5 - 0.3 * learned + chance.gauss(0, 0.02),
-                f"{policy}/kl": abs(chance.gauss(0.012, 0.003)),
-            }
-        registry.record_point(LEAGUE, run, RunPoint(number * 25_000, curves, datetime.now(UTC)))
+def _train(registry: Registry) -> None:
+    """A minute of self-play, in a league of its own."""
+    config = LeagueConfig.load(CONFIGS / "tictactoe.yaml").model_copy(update={"league": TRAINED})
+    train(config.with_training(runners=1, checkpoint_every=None), registry=registry)
 
 
 def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], directory: Path) -> None:
@@ -139,7 +130,7 @@ def main(directory: Path) -> None:
     with TemporaryDirectory() as home, leagues(Path(home)) as registry, running(registry.storage, replicas=1) as url:
         for league in (LEAGUE, CONNECT_FOUR):
             answer("GET", f"{url}/v1/leagues/{league}/playable")
-        names = {"verdict": verdict_between_versions(registry).id}
+        names = {"verdict": verdict_between_versions(registry).id, "run": registry.runs(TRAINED)[0].id}
         with sync_playwright() as playwright:
             path = which("chromium") or playwright.chromium.executable_path
             browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
