@@ -12,8 +12,8 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 def test_the_commands_are_those_of_the_mission() -> None:
     assert set(COMMANDS) == {
-        "doctor", "check-env", "train", "sweep", "versions", "evaluate", "promote", "rollback", "history", "nightly",
-        "replay", "serve", "act", "demo", "keys", "traffic", "verify", "void", "report",
+        "doctor", "check-env", "train", "sweep", "versions", "note", "evaluate", "promote", "rollback", "history",
+        "nightly", "replay", "serve", "act", "demo", "keys", "traffic", "verify", "void", "report",
     }  # fmt: skip
 
 
