@@ -1,5 +1,6 @@
 """What the commands print: tables and sentences for people, JSON for programs."""
 
+import re
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from typing import Any
@@ -10,6 +11,8 @@ from rich.table import Table
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
+CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""What a terminal obeys instead of showing it. Names, reasons and notes come from other people."""
 
 
 def emit(document: Any) -> None:
@@ -19,7 +22,7 @@ def emit(document: Any) -> None:
 
 def say(sentence: str = "") -> None:
     """Print a sentence. Square brackets in it are text, not markup."""
-    console.print(sentence, markup=False, soft_wrap=True)
+    console.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -45,7 +48,7 @@ def text(value: Any) -> str:
             return f"{value:.3f}"
         case tuple() | list():
             return ", ".join(text(item) for item in value)
-    return str(value).replace("[", r"\[")
+    return CONTROL.sub("�", str(value)).replace("[", r"\[")
 
 
 def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:

@@ -24,7 +24,7 @@ from sqlalchemy.exc import (
 from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from league.errors import ConfigError, StorageError
+from league.errors import ConfigError, InvalidInput, StorageError
 from league.registry import schema
 from league.registry.faults import disk_faults
 from league.registry.tables import Table
@@ -101,9 +101,11 @@ def _dialect(session: Session) -> ModuleType:
 
 @contextmanager
 def translated(engine: Engine) -> Iterator[None]:
-    """Turn a fault of the database itself into a StorageError of one line."""
+    """Turn a fault of the database itself into a StorageError of one line, and what is no text into InvalidInput."""
     try:
         yield
+    except UnicodeEncodeError as error:
+        raise InvalidInput(f"{error.object[:100]!r} is no text: it cannot be written as UTF-8") from error
     except DBAPIError as error:
         if type(error) not in STORAGE_FAULTS:
             raise

@@ -15,10 +15,16 @@ LONGEST = 2000
 
 
 def write(session: Session, league: str, version: int, text: str, actor: str) -> None:
-    """Put a note in place of the one before; an empty one takes it away. Raises InvalidInput."""
+    """Put a note in place of the one before; an empty one takes it away, the same again is the one that is there.
+
+    Raises InvalidInput.
+    """
     text = text.strip()
     if len(text) > LONGEST or "\0" in text:
         raise InvalidInput(f"a note must be at most {LONGEST} characters without a zero byte, got {len(text)}")
+    before = current(session, league, [version]).get(version)
+    if text == (before.text if before else ""):
+        return
     session.add(VersionNote(league=league, version=version, text=text, actor=actor, at=datetime.now(UTC)))
     session.flush()
 

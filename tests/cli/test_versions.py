@@ -28,6 +28,30 @@ def test_notes_are_written_shown_and_taken_away(league: League, registry: Regist
     assert registry.version("tictactoe", 2).note is None
 
 
+def test_words_that_a_terminal_would_obey_are_shown(league: League, registry: Registry) -> None:
+    hostile = "\x1b]0;owned\x07 \x9b31m\r"
+    shown = [
+        league("note", "tictactoe@2", hostile).out,
+        league("promote", "tictactoe@2", "--reason", hostile, "--actor", hostile).out,
+        league("versions", "tictactoe").out,
+        league("history", "tictactoe").out,
+    ]
+    for out in shown:
+        assert not set(out) & {"\x1b", "\x07", "\x9b", "\r"}, out
+    assert "�]0;owned�" in shown[2]
+    assert "�]0;owned�" in shown[3]
+
+
+def test_what_is_no_text_is_refused_in_a_line(league: League, registry: Registry) -> None:
+    for arguments in (("note", "tictactoe@2", "a\udcff"), ("promote", "tictactoe@2", "--reason", "a\udcff")):
+        outcome = league(*arguments)
+        assert outcome.code == 2
+        assert outcome.err.startswith("league: ")
+        assert "is no text" in outcome.err
+    assert registry.aliases("tictactoe") == {}
+    assert registry.version("tictactoe", 2).note is None
+
+
 def test_promote_roll_back_and_the_history_of_both(league: League, registry: Registry) -> None:
     assert "now version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
     assert "now version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out

@@ -41,6 +41,14 @@ def test_an_empty_one_takes_it_away(versioned: Registry) -> None:
     assert texts(versioned) == [None, "again", None]
 
 
+def test_the_same_again_changes_nothing(versioned: Registry) -> None:
+    first = versioned.note(CheckpointRef(LEAGUE, 2), "a try", actor="ada").note
+    seen = versioned.pulse(LEAGUE)
+    assert versioned.note(CheckpointRef(LEAGUE, 2), "a try ", actor="bob").note == first
+    assert versioned.note(CheckpointRef(LEAGUE, 1), "", actor="bob").note is None
+    assert versioned.pulse(LEAGUE) == seen
+
+
 def test_an_alias_names_the_version_that_it_points_at_now(versioned: Registry) -> None:
     versioned.set_alias(LEAGUE, "champion", 3, expected=ANY, actor="test", reason="test")
     assert versioned.note(CheckpointRef(LEAGUE, "champion"), "won", actor="ada").number == 3
@@ -53,6 +61,7 @@ def test_what_cannot_be_written_leaves_what_was(versioned: Registry) -> None:
     for ref, text, error in (
         (CheckpointRef(LEAGUE, 1), "x" * (LONGEST + 1), InvalidInput),
         (CheckpointRef(LEAGUE, 1), "a\0b", InvalidInput),
+        (CheckpointRef(LEAGUE, 1), "a\udcffb", InvalidInput),
         (CheckpointRef(LEAGUE, 9), "x", UnknownVersion),
         (CheckpointRef(LEAGUE, "candidate"), "x", UnknownAlias),
         (CheckpointRef("nobody", 1), "x", UnknownLeague),
