@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.output import elo, emit, errors, say, table
+from cli.output import complain, elo, emit, say, table
 from cli.watching import difference, watched
 from evaluation.report import CrossPlay, Estimate, EvaluationReport, Population, Standing
 from league.refs import check_slug
@@ -119,7 +119,7 @@ def _show(report: EvaluationReport) -> None:
         show_standings(standings)
     _show_payoff(report)
     for ref, lost in report.forfeits.items():
-        errors.print(f"{ref} forfeited {lost} games: it had no legal action to give", markup=False, soft_wrap=True)
+        complain(f"{ref} forfeited {lost} games: it had no legal action to give")
     if report.population is not None:
         _show_population(report.payoff.contestants, report.population)
 

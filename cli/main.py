@@ -11,7 +11,7 @@ from cli.environments import check_env
 from cli.evaluation import evaluate
 from cli.keys import app as keys
 from cli.nightly import nightly
-from cli.output import errors
+from cli.output import complain
 from cli.replay import replay
 from cli.report import report
 from cli.serving import act, serve
@@ -66,7 +66,7 @@ def run() -> None:
     try:
         app()
     except LeagueError as error:
-        errors.print(f"league: {' '.join(str(error).split())}", markup=False, soft_wrap=True)
+        complain(f"league: {' '.join(str(error).split())}")
         sys.exit(CALLERS_MISTAKE if isinstance(error, InvalidInput | NotFound) else FAULT)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from cli.evaluation import CORES, Address, AsJson, Workers, show_standings
-from cli.output import emit, errors, say
+from cli.output import complain, emit, say
 from cli.watching import difference, watched
 from evaluation.report import Confirmation, NightReport
 from league.config import LeagueConfig
@@ -56,7 +56,7 @@ def nightly(
             sentence = f"{config.league}: {' '.join(str(error).split())}"
             busy |= isinstance(error, AlreadyRunning)
             faults += [] if isinstance(error, AlreadyRunning) else [sentence]
-            errors.print(f"league: {sentence}", markup=False, soft_wrap=True)
+            complain(f"league: {sentence}")
             continue
         reports.append(report)
         faults += [f"{config.league}: {fault}" for fault in report.faults]
@@ -84,7 +84,7 @@ def hold_night(config: LeagueConfig, workers: int = CORES, quiet: bool = False) 
         page.parent.mkdir(exist_ok=True)
     write(league_report(registry, config.league), page)
     for fault in report.faults:
-        errors.print(f"{config.league}: {fault}", markup=False, soft_wrap=True)
+        complain(f"{config.league}: {fault}")
     if not quiet:
         if not report.verdicts:
             say(f"{config.league}: no new version to judge.")

@@ -25,6 +25,11 @@ def say(sentence: str = "") -> None:
     console.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
 
 
+def complain(sentence: str) -> None:
+    """Say on stderr what is wrong."""
+    errors.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
+
+
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Print rows under column heads; numbers to the right."""
     sheet = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
