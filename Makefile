@@ -3,7 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: setup demo test check fix bench protocol clean
+PROCESSES ?= 2
+
+.PHONY: setup demo test test-slow check fix bench docs generate protocol clean
 .DEFAULT_GOAL := setup
 
 setup: $(INSTALLED)
@@ -11,20 +13,30 @@ setup: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Policy League needs Python 3.11 or newer: make PYTHON=python3.11 …")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,environments]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,docs,environments]"
 	@touch $@
 
 demo: setup
 	$(BIN)/league demo $(DEMO)
 
+# Tests start many processes, which share compiled modules.
+test test-slow: export PYTHONDONTWRITEBYTECODE =
+
+# Every few minutes of work: all that is not slow by nature, in $(PROCESSES) processes. TESTS=tests/league runs a part.
 test: setup
-	$(BIN)/python -m pytest $(TESTS)
+	$(BIN)/python -m pytest -m "not slow" -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
+
+# Learning to a level, every environment, kills and clusters: one after another, since they use all cores.
+test-slow: setup
+	$(BIN)/python -m pytest -m slow $(PYTEST) $(TESTS)
 
 check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/generate_sync_client.py --check
+	$(BIN)/python scripts/generate_module_index.py --check
 
 fix: setup
 	$(BIN)/ruff format .
@@ -32,6 +44,15 @@ fix: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks $(BENCH)
+
+# The documentation as a site, in build/site. Fails on a broken link.
+docs: setup
+	$(BIN)/python scripts/generate_module_index.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+generate: setup protocol
+	$(BIN)/python scripts/generate_sync_client.py
+	$(BIN)/python scripts/generate_module_index.py
 
 # The messages of gRPC, in a descriptor pool of their own: a process may hold others of the same names (tritonclient's).
 PROTOCOL := serve_app/inference_protocol

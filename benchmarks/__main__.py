@@ -1,4 +1,4 @@
-"""`make bench`: run the benchmarks named in BENCH, or all; what follows their names is passed on (`--quick`)."""
+"""`make bench`: run the benchmarks named in BENCH, or all; options such as `--quick` are passed on to them."""
 
 import subprocess
 import sys
@@ -26,11 +26,12 @@ ORDER = (
     "calibration",
     "evaluation",
     "crowded_league",
+    "startup",
 )
 
 
 def main() -> int:
-    """Run each in a process of its own, so that none inherits another's Ray; 1 if any failed."""
+    """Run each benchmark in a subprocess, so that each has its own Ray; 1 if any failed."""
     names = [argument for argument in sys.argv[1:] if not argument.startswith("-")]
     options = [argument for argument in sys.argv[1:] if argument.startswith("-")]
     unknown = [name for name in names if name not in ORDER]

@@ -1,10 +1,11 @@
 """Does the adaptive schedule, with a quarter of the games, rank as well as a full round robin?
 
-Simulated: 64 contestants on a ladder, 25 Elo from one to the next; every game is drawn by the logistic model. The round
-robin plays `--matches` matches of two games between each pair (32 is the default of `league evaluate`), the adaptive
-schedule a quarter of that in all. Both are rated as the league rates, and Kendall's τ of the ratings against the truth
-is compared, seed by seed. A second ladder has uneven steps: 25 Elo on average, each one exponentially distributed.
-Target: at least the round robin's τ at the default number of matches; fewer matches are printed.
+Simulation: 64 contestants in steps of 25 Elo; each game is drawn from the logistic model. The round robin plays
+`--matches` matches of two games between each pair (32 is the default of `league evaluate`), the adaptive schedule a
+quarter of that in total. Both are rated like the league, and Kendall's τ of the ratings and the true strengths is
+compared for each seed. A second ladder has uneven steps: 25 Elo on average, exponentially distributed.
+
+Target: at least the round robin's τ at the default number of matches; results for fewer matches are printed.
 """
 
 import argparse
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from scipy.stats import kendalltau
 
-from evaluation.adaptive import choose, ring, round_size
-from evaluation.course import ADAPTIVE_SHARE, DEFAULT_BLOCKS
-from evaluation.ratings import bradley_terry
+from evaluation.schedules.adaptive_pairing import choose, ring, round_size
+from evaluation.schedules.tournament_plan import ADAPTIVE_SHARE, DEFAULT_BLOCKS
+from evaluation.statistics.bradley_terry import bradley_terry
 from league.results.records import GAMES_PER_BLOCK
 
 CONTESTANTS = 64
@@ -41,11 +42,11 @@ Floats = NDArray[np.float64]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print a line for each ladder and length; 1 if the target was missed."""
+    """Print a line for each ladder and number of matches; 1 if the target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="10 seeds of the default length: shows that it works")
+    parser.add_argument("--quick", action="store_true", help="smoke test: 10 seeds of the default length")
     parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--matches", type=int, action="append", help="of each pair; may be repeated")
+    parser.add_argument("--matches", type=int, action="append", help="matches of each pair; may be repeated")
     options = parser.parse_args(argv)
     if options.quick:
         return run(quick=True)
@@ -53,34 +54,34 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(quick: bool = False) -> int:
-    """The benchmark with its usual settings."""
+    """Run the benchmark with its usual settings."""
     return compare([DEFAULT_BLOCKS] if quick else [4, 10, DEFAULT_BLOCKS], seeds=10 if quick else 200)
 
 
 def compare(lengths: Sequence[int], seeds: int) -> int:
-    """Simulate tournaments of all lengths on both ladders."""
+    """Simulate tournaments with each number of matches on both ladders."""
     print(" | ".join(HEADER), flush=True)
     met = True
     for name, ladder in LADDERS.items():
         for matches in lengths:
-            met &= _tell(name, ladder, matches, seeds) or matches != DEFAULT_BLOCKS
+            met &= _report(name, ladder, matches, seeds) or matches != DEFAULT_BLOCKS
     return int(not met)
 
 
-def _tell(name: str, ladder: Callable[[np.random.Generator], Floats], matches: int, seeds: int) -> bool:
+def _report(name: str, ladder: Callable[[np.random.Generator], Floats], matches: int, seeds: int) -> bool:
     pairs = CONTESTANTS * (CONTESTANTS - 1) // 2
-    few = matches * pairs // ADAPTIVE_SHARE
+    adaptive_matches = matches * pairs // ADAPTIVE_SHARE
     taus, slowest = np.zeros((seeds, 2)), 0.0
     for seed in range(seeds):
         truth = ladder(np.random.default_rng([seed, 0]))
         taus[seed, 0] = _tau(_round_robin(truth, matches, np.random.default_rng([seed, 1])), truth)
-        played, seconds = _adaptive(truth, few, np.random.default_rng([seed, 2]))
+        played, seconds = _adaptive(truth, adaptive_matches, np.random.default_rng([seed, 2]))
         taus[seed, 1] = _tau(played, truth)
         slowest = max(slowest, seconds)
     full, adaptive, difference = (_mean(each) for each in (*taus.T, taus[:, 1] - taus[:, 0]))
     met = bool((taus[:, 1] - taus[:, 0]).mean() >= 0)
     target = ("met" if met else "MISSED (≥ 0)") if matches == DEFAULT_BLOCKS else "–"
-    games = f"{pairs * matches * GAMES_PER_BLOCK:,}, {few * GAMES_PER_BLOCK:,}"
+    games = f"{pairs * matches * GAMES_PER_BLOCK:,}, {adaptive_matches * GAMES_PER_BLOCK:,}"
     print(
         f"{name} | {matches} | {games} | {full} | {adaptive} | {difference} | {slowest:.3f} | {target}",
         flush=True,
@@ -99,7 +100,7 @@ def _uneven(rng: np.random.Generator) -> Floats:
 LADDERS = {"even": _even, "uneven": _uneven}
 
 Table = tuple[Floats, Floats]
-"""points[i, j] of i against j, games[i, j]"""
+"""points[i, j]: score of i against j; games[i, j]"""
 
 
 def _round_robin(truth: Floats, matches: int, rng: np.random.Generator) -> Table:
@@ -113,7 +114,7 @@ def _round_robin(truth: Floats, matches: int, rng: np.random.Generator) -> Table
 
 
 def _adaptive(truth: Floats, matches: int, rng: np.random.Generator) -> tuple[Table, float]:
-    """What was played, and the seconds that the slowest choice of a round took."""
+    """The played games, and the duration of the slowest choice of a round in seconds."""
     points, games = np.zeros((2, CONTESTANTS, CONTESTANTS))
     played, slowest = 0, 0.0
     while played < matches:
@@ -130,7 +131,7 @@ def _adaptive(truth: Floats, matches: int, rng: np.random.Generator) -> tuple[Ta
 
 
 def _tau(table: Table, truth: Floats) -> float:
-    """Of the league's ratings: Bradley–Terry with one virtual draw for each pair that has played."""
+    """Kendall's τ of the league's ratings: Bradley–Terry with one virtual draw for each pair that has played."""
     points, games = table
     first, second = np.nonzero(np.triu(games))
     pairs = np.column_stack([first, second])

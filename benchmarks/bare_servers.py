@@ -1,7 +1,7 @@
-"""Peers without Ray: `python -m benchmarks.bare_servers KIND HOME PORT` serves until its standard input ends.
+"""Peers without Ray: `python -m benchmarks.bare_servers KIND HOME PORT` serves until its standard input is closed.
 
-handler: the application of a replica of ours, with the same policy, on uvicorn as it comes. fastapi: what one would
-write in an afternoon: FastAPI, pydantic and torch on uvicorn, the network that ours has, one torch thread.
+handler: our application with the same policy on a standard uvicorn. fastapi: a simple server with FastAPI, pydantic and
+torch on uvicorn, with the same network and one torch thread.
 """
 
 import sys
@@ -16,14 +16,14 @@ def handler(home: Path) -> Any:
     """Our ASGI application, following the registry of `home`."""
     from league.registry.registry import Registry
     from league.settings import Storage
-    from serve_app.app import Server
+    from serve_app.app import Replica
     from serve_app.settings import ServeSettings
 
-    return Server(Registry.open(Storage.at(home)), ServeSettings(), "bare").application()
+    return Replica(Registry.open(Storage.at(home)), ServeSettings(), "bare").application()
 
 
 def fastapi(_: Path) -> Any:
-    """An endpoint that takes the same body."""
+    """An endpoint with the same request body."""
     import torch
     from fastapi import FastAPI
     from pydantic import BaseModel

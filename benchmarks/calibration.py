@@ -1,6 +1,8 @@
-"""Are the verdicts what they promise? Simulations of gates, years, traps and intervals, and gates through real play.
+"""Do verdicts have their nominal error rates? Simulations of gates, years, anchors and intervals, and gates with real
+games.
 
-Every part prints what was measured beside what is asked for. All are seeded: the same numbers come out anywhere.
+Each part prints measured values beside their targets. All parts are seeded, so that the numbers are reproducible on any
+machine.
 """
 
 from __future__ import annotations
@@ -20,19 +22,17 @@ from benchmarks import coverage, golden, null_play
 from benchmarks.shuffled_order import verdicts_of_shuffled_completion
 from benchmarks.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulated_years import boundary, chance, walk
-from evaluation.findings import Anchored, found
-from evaluation.gate import Decision, decide
-from evaluation.sequential import expected_games
-from evaluation.spending import NIGHTS, spent_by
+from evaluation.gating.gate import NIGHTS, AnchorResult, Decision, alpha_per_verdict, combine_results, decide
+from evaluation.statistics.sequential import expected_games
 from league.config import GateConfig
-from tests.evaluation import examples
+from tests.support import tictactoe
 
 CANDIDATES = 8
 SINGLE = GateConfig(elo0=0, elo1=60, max_blocks=1000, nights=None)
 
 
 def gates(quick: bool) -> bool:
-    """20,000 gates at each hypothesis, for three kinds of games."""
+    """20,000 gates for each hypothesis and three kinds of games."""
     number, met = 1_000 if quick else 20_000, True
     theory = expected_games(SINGLE.elo0, SINGLE.elo1, SINGLE.elo0, SINGLE.alpha, SINGLE.beta)
     for kind, shares in EQUALS.items():
@@ -50,8 +50,8 @@ def gates(quick: bool) -> bool:
 
 
 def years(quick: bool) -> bool:
-    """Years of 365 nights with 8 candidates that are no better, and one that is, on night 300."""
-    alpha = spent_by(CANDIDATES, 0.05)
+    """Years of 365 nights with 8 equally strong candidates, and one that is stronger on night 300."""
+    alpha = alpha_per_verdict(CANDIDATES, 0.05)
     settings = SINGLE.of_one_verdict(alpha)
     null, better = (np.asarray(p)[[0, 2, 4]] for p in (EQUALS["decisive"], stronger(EQUALS["decisive"], 60)))
     ends = boundary(settings, [null, better])
@@ -81,16 +81,16 @@ def years(quick: bool) -> bool:
 
 
 def traps(quick: bool) -> bool:
-    """Challengers that beat the champion by 100 Elo and lose to an anchor by 100 Elo beyond the margin."""
+    """Challengers that beat the champion by 100 Elo and lose to an anchor by 100 Elo more than the margin."""
     number, margin, rng = 100 if quick else 1_000, 50.0, np.random.default_rng(4)
-    settings = GateConfig(elo0=0, elo1=30, max_blocks=4000, margin=margin).of_one_verdict(spent_by(1, 0.05))
+    settings = GateConfig(elo0=0, elo1=30, max_blocks=4000, margin=margin).of_one_verdict(alpha_per_verdict(1, 0.05))
     against_champion = stronger(EQUALS["decisive"], 100)
     against_anchor = stronger(EQUALS["decisive"], -margin - 100)
     beaten = promoted = 0
     for _ in range(number):
         champion = _decided(settings, against_champion, rng)
         anchor = _decided(settings.against_anchor(None), against_anchor, rng)
-        seen = found(champion, [Anchored("trap@1", margin, "s", anchor)], asked=1, forfeits=0)
+        seen = combine_results(champion, [AnchorResult("trap@1", margin, "s", anchor)], planned_anchors=1, forfeits=0)
         beaten += champion.outcome == "promote"
         promoted += seen.outcome == "promote"
     print(f"  {number} traps: {beaten} beat the champion, {promoted} promoted (0)")
@@ -105,23 +105,27 @@ def _decided(settings: GateConfig, shares: np.ndarray, rng: np.random.Generator)
 
 
 def play(quick: bool) -> bool:
-    """Gates through real play between equals."""
+    """Gates with real games between equally strong versions."""
     number, met = 20 if quick else 200, True
-    for same, words in ((True, "one policy under two numbers"), (False, "one policy, and the same on a turned board")):
+    for same, description in (
+        (True, "one policy under two numbers"),
+        (False, "one policy, and the same on a turned board"),
+    ):
         with tempfile.TemporaryDirectory() as home:
-            registry = examples.registry(Path(home), play={"opening_plies": 2, "copies": 100})
+            registry = tictactoe.registry(Path(home), play={"opening_plies": 2, "num_envs": 100})
             promoted = null_play.promoted(registry, same, number)
             registry.close()
         low, high = binomtest(promoted, number).proportion_ci(0.95)
         print(
-            f"  {number} gates, {words}: {promoted} promoted, {promoted / number:.1%} [{low:.1%}, {high:.1%}] (≤ 5 %)"
+            f"  {number} gates, {description}: {promoted} promoted, "
+            f"{promoted / number:.1%} [{low:.1%}, {high:.1%}] (≤ 5 %)"
         )
         met &= low <= 0.05
     return met
 
 
 def order(quick: bool) -> bool:
-    """Games whose durations depend on their outcome, on workers that finish them in any order."""
+    """Games whose duration depends on their result, on workers that finish them in any order."""
     number = 100 if quick else 1_000
     found = verdicts_of_shuffled_completion(number)
     print(f"  {number} orders of completion, durations by outcome: {len(found)} different verdict(s) (1): {found}")
@@ -129,7 +133,7 @@ def order(quick: bool) -> bool:
 
 
 def intervals(quick: bool) -> bool:
-    """Nominal 95 % intervals, at fixed length."""
+    """Nominal 95 % intervals with a fixed number of blocks."""
     number, met = 500 if quick else 5_000, True
     parts: dict[str, Callable[[int, int], float]] = {
         "Elo, 200 blocks": coverage.elo,
@@ -157,9 +161,9 @@ PARTS: dict[str, Callable[[bool], bool]] = {
 
 
 def main() -> int:
-    """Print each part; 1 if any missed what is asked of it."""
+    """Print each part; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a twentieth of the simulations, for a look")
+    parser.add_argument("--quick", action="store_true", help="a twentieth of the simulations")
     parser.add_argument("--only", choices=PARTS, help="one part")
     options = parser.parse_args()
     missed = []

@@ -1,7 +1,8 @@
-"""What callers see while a server is hurt: half of them our client, half a client that tries each request once.
+"""The calls of clients during faults: half of them with our client, half with a client without retries.
 
-`python -m benchmarks.callers URL FILE` asks for actions until standard input ends, then writes what every call saw to
-FILE (an array, see `Seen`). It is a process of its own, so that it shares no interpreter with what hurts the server.
+`python -m benchmarks.callers URL FILE` requests actions until standard input is closed, then writes the results of all
+calls to FILE (an array, see `CallLog`). It is a separate process, so that fault injection does not affect the
+measurement.
 """
 
 import asyncio
@@ -26,39 +27,39 @@ from league.errors import LeagueError
 
 ROOT = Path(__file__).parent.parent
 CALLERS = 4
-"""Of each kind. Each calls again as soon as it is answered."""
-OURS, ONCE = 0.0, 1.0
-"""The kinds: our client, which tries again, and one that tries once."""
+"""Callers of each kind. Each calls again as soon as it has an answer."""
+WITH_RETRIES, WITHOUT_RETRIES = 0.0, 1.0
+"""The kinds of clients: ours, which retries, and one that does not."""
 
 
 @dataclass
-class Seen:
-    """What the callers of one run saw.
+class CallLog:
+    """The calls of one run.
 
-    calls: (n, 4): kind, when it was made, when it ended, by `time.perf_counter`; 1 if it was answered, else 0.
-    errors: what our client raised → how often. Both are there once the callers have stopped.
+    calls: (n, 4): kind, start and end by `time.perf_counter`; 1 if it was answered, else 0. errors: exceptions of our
+    client → count. Both are available after the callers have stopped.
     """
 
     calls: NDArray = field(default_factory=lambda: np.zeros((0, 4)))
     errors: dict[str, int] = field(default_factory=dict)
 
     def failed(self, kind: float) -> NDArray:
-        """When the calls of a kind failed."""
+        """The end times of the failed calls of a kind."""
         times: NDArray = self.calls[(self.calls[:, 0] == kind) & (self.calls[:, 3] == 0), 2]
         return times
 
     def p99(self, kind: float) -> float:
-        """Milliseconds that all but 1 % of the answered calls took, with all attempts and pauses."""
+        """99th percentile of the duration of answered calls in milliseconds, including retries and delays."""
         answered = self.calls[(self.calls[:, 0] == kind) & (self.calls[:, 3] == 1)]
         return float(np.percentile(answered[:, 2] - answered[:, 1], 99) * 1e3) if len(answered) else float("nan")
 
 
 @contextmanager
-def calling(url: str, scratch: Path) -> Iterator[Seen]:
-    """Call in another process while the context lasts, which begins with the first answer."""
+def calling(url: str, scratch: Path) -> Iterator[CallLog]:
+    """Call in a subprocess while the context lasts, which starts with the first answer."""
     file = scratch / "calls.npy"
     command = [sys.executable, "-m", "benchmarks.callers", url, str(file)]
-    seen = Seen()
+    seen = CallLog()
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as callers:
         assert callers.stdin is not None
         assert callers.stdout is not None
@@ -67,12 +68,12 @@ def calling(url: str, scratch: Path) -> Iterator[Seen]:
             yield seen
         finally:
             callers.stdin.close()
-            told = callers.stdout.read()
-    seen.calls, seen.errors = np.load(file), json.loads(told)
+            output = callers.stdout.read()
+    seen.calls, seen.errors = np.load(file), json.loads(output)
 
 
 def main() -> None:
-    """Call until standard input ends."""
+    """Call until standard input is closed."""
     import uvloop
 
     url, file = sys.argv[1:]
@@ -88,16 +89,16 @@ async def _call(url: str, stop: threading.Event) -> tuple[list[tuple[float, ...]
     errors: Counter[str] = Counter()
     observation = {"observation": PLANES, "action_mask": np.ones(7, np.int8)}
 
-    def saw(kind: float, sent_at: float, is_answered: bool) -> None:
+    def record(kind: float, sent_at: float, is_answered: bool) -> None:
         if not calls:
             print("answered", flush=True)
         calls.append((kind, sent_at, time.perf_counter(), float(is_answered)))
 
     def on_reply(status: int, _: bytes, sent_at: float) -> bool:
-        saw(ONCE, sent_at, status == 200)
+        record(WITHOUT_RETRIES, sent_at, status == 200)
         return not stop.is_set()
 
-    async def patient() -> None:
+    async def call_with_retries() -> None:
         async with AsyncClient(url) as client:
             while not stop.is_set():
                 sent_at = time.perf_counter()
@@ -105,12 +106,12 @@ async def _call(url: str, stop: threading.Event) -> tuple[list[tuple[float, ...]
                     await client.act(LEAGUE, observation)
                 except LeagueError as error:
                     errors[f"{type(error).__name__}: {str(error)[:120]}"] += 1
-                    saw(OURS, sent_at, False)
+                    record(WITH_RETRIES, sent_at, False)
                 else:
-                    saw(OURS, sent_at, True)
+                    record(WITH_RETRIES, sent_at, True)
 
     once = drive(f"{url}/v1/policies/{LEAGUE}/action", BODY, CALLERS, on_reply, lambda: not stop.is_set())
-    await asyncio.gather(once, *(patient() for _ in range(CALLERS)))
+    await asyncio.gather(once, *(call_with_retries() for _ in range(CALLERS)))
     return calls, errors
 
 

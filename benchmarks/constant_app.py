@@ -1,7 +1,7 @@
-"""The floor of a policy server on Ray Serve: reads the body of a request and answers a constant.
+"""The lower bound of a policy server on Ray Serve: reads the request body and answers with a constant.
 
-`build_app` is deployed with the settings of deploy.yaml in the place of serve_app's: through HAProxy and Ray Serve's
-own handling of a request. `build_short` goes past that handling, as serve_app does with actions.
+`build_app` is deployed with the settings of deploy.yaml in place of serve_app: through HAProxy and Ray Serve's request
+handling. `build_short` bypasses that handling, like serve_app for actions.
 """
 
 from typing import Any
@@ -14,17 +14,18 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
-from serve_app.middleware import shorten
+from serve_app.runtime.ray_serve import replica_id
+from serve_app.runtime.serve_bypass import install
 
 ANSWER = b'{"action":3,"model":"connect_four","version":1,"sha256":"' + b"0" * 64 + b'"}'
 
 
 class Constant:
-    """One replica."""
+    """A replica."""
 
     def __init__(self, short: bool) -> None:
         self._short = short
-        self._replica = serve.get_replica_context().replica_id.unique_id
+        self._replica = replica_id()
 
     def __serve_build_asgi_app__(self) -> Starlette:
         async def ready(_: Request) -> Response:
@@ -33,12 +34,12 @@ class Constant:
         action = Route("/v1/policies/{model}/action", Answer(), methods=["POST"])
         application = Starlette(routes=[action, Route("/v1/health/ready", ready)])
         if self._short:
-            shorten(application)
+            install(application)
         return application
 
 
 class Answer:
-    """An ASGI application that reads all of the body, and answers."""
+    """An ASGI application that reads the complete body and answers."""
 
     async def __call__(self, _: Scope, receive: Receive, send: Send) -> None:
         while (await receive()).get("more_body", False):
@@ -54,7 +55,7 @@ def build_app(_: Any) -> Application:
 
 
 def build_short(_: Any) -> Application:
-    """The same, past Serve's handling of a request."""
+    """The same without Serve's request handling."""
     return _deployment().bind(short=True)
 
 

@@ -1,13 +1,13 @@
-"""Do nominal 95 % intervals cover the truth 95 % of the time? Fixed length, by simulation."""
+"""Do nominal 95 % intervals cover the true value 95 % of the time? Simulations with a fixed number of blocks."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from benchmarks.simulated_gates import CELLS, EQUALS, stronger
-from evaluation.improvement import iqm, probability_of_improvement, stratified_bootstrap
-from evaluation.ratings import rate
-from evaluation.sequential import elo_estimate, elo_of
+from evaluation.statistics.bradley_terry import rate
+from evaluation.statistics.improvement import iqm, probability_of_improvement, stratified_bootstrap
+from evaluation.statistics.sequential import elo_estimate, elo_of
 from league.results.records import BlockResult
 
 BLOCKS = 200
@@ -18,7 +18,7 @@ RESAMPLES = 400
 
 
 def elo(simulations: int, seed: int) -> float:
-    """Of `elo_estimate`, logistic, after 200 blocks of two."""
+    """Coverage of `elo_estimate`, logistic, after 200 blocks of two games."""
     shares = stronger(EQUALS["drawish"], TRUTH, "logistic")
     truth = float(elo_of(float(shares @ CELLS)))
     counts = np.random.default_rng(seed).multinomial(BLOCKS, shares, size=simulations)
@@ -30,7 +30,7 @@ def _estimate(counts: np.ndarray) -> object:
 
 
 def rating(simulations: int, seed: int) -> float:
-    """Of Bradley–Terry ratings, by the Bayesian bootstrap: three contestants, 200 blocks of each pair."""
+    """Coverage of Bradley–Terry ratings with the Bayesian bootstrap: three contestants, 200 blocks per pair."""
     rng = np.random.default_rng(seed)
     truth = {"a": 0.0, "b": 40.0, "c": 90.0}
     covered = []
@@ -53,8 +53,9 @@ def _blocks(pair: str, truth: dict[str, float], rng: np.random.Generator) -> lis
 
 
 def interquartile_mean(simulations: int, seed: int) -> float:
-    """Of the IQM of 40 runs on 5 tasks (200 scores), by the stratified bootstrap. Scores are uniform around a mean of
-    each task; the truth is the IQM of ten million draws."""
+    """Coverage of the IQM of 40 runs on 5 tasks (200 scores) with the stratified bootstrap. Scores are uniform around a
+    mean of each task; the true value is the IQM of ten million draws.
+    """
     rng = np.random.default_rng(seed)
     truth = iqm(_scores(rng, 2_000_000))
     covered = 0
@@ -65,9 +66,9 @@ def interquartile_mean(simulations: int, seed: int) -> float:
 
 
 def improvement(simulations: int, seed: int) -> float:
-    """Of the probability of improvement of one such set of runs over another that is 0.1 worse."""
+    """Coverage of the probability of improvement of such a set of runs over another one that is 0.1 worse."""
     rng = np.random.default_rng(seed)
-    # Of X + 0.1 > Y for uniform X and Y: 1 - (1 - 0.1)² / 2.
+    # P(X + 0.1 > Y) for uniform X and Y is 1 - (1 - 0.1)² / 2.
     truth = 1 - 0.9**2 / 2
     covered = 0
     for number in range(simulations):

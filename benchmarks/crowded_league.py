@@ -1,11 +1,12 @@
-"""A league of connect four after 200 nights: 200 versions and 100,000 matches, verdicts, promotions and training runs.
+"""A league of connect four after 200 nightly runs: 200 versions and 100,000 matches, verdicts, promotions and training
+runs.
 
-Who wins is drawn by the logistic model from strengths that grow night by night. The games themselves were played: each
-is of `script:random` against `script:one_ply`, handed out by its result, so that it can be replayed. The one policy
-behind all versions is of random weights.
+Results are drawn from the logistic model with strengths that increase with each version. The games are real games of
+`script:random` against `script:one_ply`, selected by their result, so that they can be replayed. All versions have the
+same policy with random weights.
 
-Run by itself, it tells how long the reads take that pages are made of, on SQLite, and what the snapshots of such a
-league take. Targets: 50 ms for a read, once the file is in memory.
+The benchmark measures the duration of the reads of the web pages, on SQLite, and of computing the snapshots of such a
+league. Target: 50 ms per read, with the file in memory.
 """
 
 from __future__ import annotations
@@ -27,24 +28,24 @@ import numpy as np
 from sqlalchemy import Executable, delete, update
 
 from benchmarks.served_league import builder
-from evaluation import children
-from evaluation.gate import judge
-from evaluation.schedule import gauntlet, round_robin
-from evaluation.snapshots import refresh
-from evaluation.tournament import evaluate
-from evaluation.verdicts import conclude, gate_of, open_verdict
+from evaluation.gating.gate import decide_matches
+from evaluation.gating.verdicts import conclude, gate_of, open_verdict
+from evaluation.matches.tournament import evaluate
+from evaluation.schedules.builders import gauntlet, round_robin
+from evaluation.service.snapshots import refresh
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.registry import tables
-from league.registry.database import insert
-from league.registry.manifest import Manifest
 from league.registry.registry import Registry
-from league.registry.rows import RunState
 from league.registry.snapshots import SUMMARY
-from league.results.admission import admit
+from league.registry.storage import tables
+from league.registry.storage.database import insert
+from league.registry.storage.manifest import Manifest
+from league.registry.storage.rows import RunState
 from league.results.ledger import Ledger, row
 from league.results.records import Game, Match, Schedule
+from league.results.scoring import admit
 from league.settings import Storage
+from league.subprocesses import Subprocess
 
 CONFIG = LeagueConfig.load(Path(__file__).parent.parent / "configs" / "connect_four.yaml")
 CONFIG = CONFIG.model_copy(
@@ -54,29 +55,29 @@ CONFIG = CONFIG.model_copy(
         )
     }
 )
-"""Nights of some hundred blocks, and nothing that would have to be played."""
+"""Nightly runs of some hundred blocks, without anything that requires real games."""
 LEAGUE = CONFIG.league
 READ_MS = 50.0
-"""The target of a read."""
+"""The target for a read, in milliseconds."""
 NEIGHBOURS = 10
-"""Versions before it that a new one is rated against."""
+"""Number of previous versions that a new one plays against."""
 LAST = 40
-"""Versions that have all met: a whole payoff table."""
-TOLD = 600
-"""Points of a training run."""
+"""Number of versions that have all played each other, for a complete payoff table."""
+RUN_POINTS = 600
+"""Number of points of a training run."""
 
 
 def crowd(home: Path, versions: int = 200, matches: int = 100_000) -> Registry:
-    """A registry in `home` with such a league, its snapshots up to date."""
+    """A registry in `home` with such a league and current snapshots."""
     registry = Registry.open(Storage.at(home))
-    registry.register(CONFIG, interface(CONFIG))
-    _Crowd(registry, versions, matches).live()
+    registry.leagues.register(CONFIG, interface(CONFIG))
+    _Crowd(registry, versions, matches).simulate()
     refresh(registry, LEAGUE)
     return registry
 
 
 class _Crowd:
-    """One night for each version, the last one tonight."""
+    """One nightly run for each version, the last one today."""
 
     def __init__(self, registry: Registry, versions: int, matches: int) -> None:
         self._registry, self._ledger = registry, Ledger(registry)
@@ -89,7 +90,7 @@ class _Crowd:
         self._began = datetime.now(UTC) - timedelta(days=versions)
         self._written = 0
 
-    def live(self) -> None:
+    def simulate(self) -> None:
         with tempfile.TemporaryDirectory() as scratch:
             publish = self._publisher(Path(scratch))
             for number in range(1, self._versions + 1):
@@ -112,19 +113,19 @@ class _Crowd:
                 made = {"version": version, "parent": parent, "steps": 500_000 * version}
                 return template.model_copy(update=made | {"created_at": self._evening(number)})
 
-            return self._registry.publish(LEAGUE, build, source=f"crowd/{number}", parent=parent)
+            return self._registry.publisher.publish(LEAGUE, build, source=f"crowd/{number}", parent=parent)
 
         return publish
 
     def _night(self, number: int) -> None:
-        """A verdict, and a gauntlet of as many matches as there are left for this night."""
-        league, new = self._registry.league(LEAGUE), f"{LEAGUE}@{number}"
-        champion = self._registry.aliases(LEAGUE).get("champion")
+        """A verdict, and a gauntlet with the remaining matches of this night."""
+        league, new = self._registry.leagues.get(LEAGUE), f"{LEAGUE}@{number}"
+        champion = self._registry.aliases.current(LEAGUE).get("champion")
         verdict = open_verdict(
             self._registry, league, number, f"{LEAGUE}@{champion}" if champion else "script:random", alpha=0.05
         )
         drawn = list(self._drawn(self._ledger.schedule(verdict.schedule), CONFIG.gate.max_blocks))
-        self._write(drawn[: judge(gate_of(verdict), drawn, new).blocks], number, hour=1)
+        self._write(drawn[: decide_matches(gate_of(verdict), drawn, new).blocks], number, hour=1)
         conclude(self._registry, verdict)
         self._date(verdict.id, number)
         opponents = [f"{LEAGUE}@{n}" for n in range(max(1, number - NEIGHBOURS), number)]
@@ -134,11 +135,11 @@ class _Crowd:
         self._write(list(self._drawn(self._ledger.open(schedule), schedule.length)), number, hour=3)
 
     def _round_robin(self) -> None:
-        """What is left of the matches, between the last versions."""
+        """The remaining matches, between the last versions."""
         last = [f"{LEAGUE}@{n}" for n in range(max(1, self._versions - LAST + 1), self._versions + 1)]
         pairs = len(last) * (len(last) - 1) // 2
         blocks = max(1, -(-(self._matches - self._written) // pairs))
-        schedule = round_robin(CONFIG, self._registry.league(LEAGUE).interface, last, blocks)
+        schedule = round_robin(CONFIG, self._registry.leagues.get(LEAGUE).interface, last, blocks)
         self._write(list(self._drawn(self._ledger.open(schedule), schedule.length)), self._versions, hour=5)
 
     def _drawn(self, schedule: Schedule, length: int) -> Iterator[Match]:
@@ -157,22 +158,24 @@ class _Crowd:
         began = self._evening(night) + timedelta(hours=hour)
         rows = [row(match) | {"played_at": began + timedelta(seconds=number)} for number, match in enumerate(matches)]
         with self._registry.database.write() as session:
-            self._written += insert(session, tables.Match, rows)
+            self._written += insert(session, tables.MatchTable, rows)
 
     def _date(self, verdict: str, night: int) -> None:
-        """Verdict and promotion were that night, not just now."""
+        """Set the dates of a verdict and its promotion to that night."""
         opened, closed = self._evening(night) + timedelta(hours=1), self._evening(night) + timedelta(hours=2)
         with self._registry.database.write() as session:
-            of_verdict = tables.Verdict.id == verdict
-            session.execute(update(tables.Verdict).where(of_verdict).values(opened_at=opened, closed_at=closed))
-            session.execute(update(tables.AliasEvent).where(tables.AliasEvent.verdict == verdict).values(at=closed))
+            of_verdict = tables.VerdictTable.id == verdict
+            session.execute(update(tables.VerdictTable).where(of_verdict).values(opened_at=opened, closed_at=closed))
+            session.execute(
+                update(tables.AliasEventTable).where(tables.AliasEventTable.verdict == verdict).values(at=closed)
+            )
 
     def _evening(self, night: int) -> datetime:
         return self._began + timedelta(days=night - 1)
 
     def _run(self, number: int, state: RunState) -> None:
         name = f"{self._evening(number + 1):%Y%m%d-%H%M%S}-{number:06x}"
-        self._registry.begin_run(
+        self._registry.runs.begin(
             LEAGUE,
             name,
             algorithm=CONFIG.training.algorithm,
@@ -181,7 +184,7 @@ class _Crowd:
             target=CONFIG.training.steps,
             parent=number or None,
         )
-        walk = np.cumsum(self._rng.normal(0.002, 0.02, (TOLD, len(CURVES))), axis=0)
+        walk = np.cumsum(self._rng.normal(0.002, 0.02, (RUN_POINTS, len(CURVES))), axis=0)
         began = self._evening(number + 1)
         points = [
             {
@@ -193,12 +196,12 @@ class _Crowd:
             }
             for at, values in enumerate(walk)
         ]
-        newest = {"steps": points[-1]["steps"], "curves": points[-1]["curves"], "seconds": 10.0 * TOLD}
+        newest = {"steps": points[-1]["steps"], "curves": points[-1]["curves"], "seconds": 10.0 * RUN_POINTS}
         with self._registry.database.write() as session:
-            insert(session, tables.RunPoint, points)
-            session.execute(update(tables.Run).where(tables.Run.id == name).values(began_at=began, **newest))
+            insert(session, tables.RunPointTable, points)
+            session.execute(update(tables.RunTable).where(tables.RunTable.id == name).values(began_at=began, **newest))
         if state != "running":
-            self._registry.end_run(LEAGUE, name, state, "the power was cut" if state == "failed" else None)
+            self._registry.runs.end(LEAGUE, name, state, "the power was cut" if state == "failed" else None)
 
 
 RUNS: tuple[RunState, ...] = ("ended", "failed", "stopped", "ended", "running")
@@ -209,14 +212,14 @@ CURVES = (
 
 
 class _Pool:
-    """Blocks that were played, by their results: (1.0, 0.0) if contestant 0 won the first game and lost the second."""
+    """Played blocks by their results: (1.0, 0.0) if contestant 0 won the first game and lost the second."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._blocks: defaultdict[tuple[float, ...], list[tuple[Game, ...]]] = defaultdict(list)
         with tempfile.TemporaryDirectory() as scratch:
             registry = Registry.open(Storage.at(Path(scratch)))
-            registry.register(CONFIG, interface(CONFIG))
+            registry.leagues.register(CONFIG, interface(CONFIG))
             evaluate(
                 LEAGUE,
                 ["script:random"],
@@ -226,7 +229,7 @@ class _Pool:
                 blocks=600,
             )
             for match in Ledger(registry).matches(league=LEAGUE):
-                for games in (match.games, _turned(match.games)):
+                for games in (match.games, _exchanged(match.games)):
                     self._blocks[tuple(game.scores[0] or 0.0 for game in games)].append(games)
             registry.close()
 
@@ -237,8 +240,8 @@ class _Pool:
         return schedule.match(position, [replace(game, seed=seed) for game in games])
 
 
-def _turned(games: Sequence[Game]) -> tuple[Game, ...]:
-    """The same block with its contestants named the other way round."""
+def _exchanged(games: Sequence[Game]) -> tuple[Game, ...]:
+    """The same block with exchanged contestants."""
     return tuple(
         replace(
             game,
@@ -251,55 +254,57 @@ def _turned(games: Sequence[Game]) -> tuple[Game, ...]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print what it takes to make such a league, to compute its snapshots, and to read; 1 if a target was missed."""
+    """Print the durations of creating such a league, of its snapshots, and of reads; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="20 versions and 5,000 matches: shows that it works")
+    parser.add_argument("--quick", action="store_true", help="smoke test: 20 versions and 5,000 matches")
     return run(parser.parse_args(argv).quick)
 
 
 def run(quick: bool = False) -> int:
-    """The benchmark with its usual settings."""
+    """Run the benchmark with its usual settings."""
     versions, matches = (20, 5_000) if quick else (200, 100_000)
     with tempfile.TemporaryDirectory() as scratch:
         began = time.perf_counter()
         registry = crowd(Path(scratch), versions, matches)
         seconds, size = time.perf_counter() - began, (Path(scratch) / "league.db").stat().st_size
         print(f"{versions} versions, {matches:,} matches: made in {seconds:.0f} s, {size / 1e6:.0f} MB", flush=True)
-        _tell_snapshots(registry)
-        met = _tell_reads(registry)
+        _report_snapshots(registry)
+        met = _report_reads(registry)
         registry.close()
     return int(not met)
 
 
-def _tell_snapshots(registry: Registry) -> None:
-    """As the studio has them computed: by a process of its own at the lowest priority, its start included."""
+def _report_snapshots(registry: Registry) -> None:
+    """Compute the snapshots like the evaluation service: in a low-priority subprocess, including its start."""
     print("\nsnapshots | seconds | memory")
     storage = registry.storage
     os.environ |= {"LEAGUE_HOME": str(storage.home), "LEAGUE_DATABASE_URL": storage.database_url}
     stale: dict[str, Executable] = {
-        "after one match more": update(tables.Snapshot).where(tables.Snapshot.part == SUMMARY).values(mark=""),
-        "from nothing": delete(tables.Snapshot),
+        "after one match more": update(tables.SnapshotTable)
+        .where(tables.SnapshotTable.part == SUMMARY)
+        .values(mark=""),
+        "from nothing": delete(tables.SnapshotTable),
     }
     for what, change in stale.items():
         with registry.database.write() as session:
             session.execute(change)
         began = time.perf_counter()
-        process, peak = children.start("evaluation.snapshots", LEAGUE), 0
-        while process.poll() is None:
+        process, peak = Subprocess("evaluation.service.snapshots", LEAGUE), 0
+        while process.is_running:
             peak = max(peak, _memory(process.pid))
             time.sleep(0.01)
-        assert children.bury(process) == 0
+        assert process.reap() == 0
         print(f"{what} | {time.perf_counter() - began:.1f} | {peak / 1024:.0f} MB", flush=True)
-    assert registry.stale_snapshots() == []
+    assert registry.snapshots.stale() == []
 
 
 def _memory(process: int) -> int:
-    """The most that a process has held so far, in KiB; 0 when it has ended."""
+    """The peak memory of a process in KiB; 0 after it has ended."""
     found = re.search(r"^VmHWM:\s*(\d+) kB", Path(f"/proc/{process}/status").read_text(), re.M)
     return int(found[1]) if found else 0
 
 
-def _tell_reads(registry: Registry) -> bool:
+def _report_reads(registry: Registry) -> bool:
     print("\nread | median ms | slowest ms | target")
     met = True
     for what, read in _reads(registry).items():
@@ -311,8 +316,8 @@ def _tell_reads(registry: Registry) -> bool:
             took.append(1000 * (time.perf_counter() - began))
         middle, slowest = statistics.median(took), max(took)
         met &= middle <= READ_MS
-        told = "met" if middle <= READ_MS else f"MISSED (≤ {READ_MS:g})"
-        print(f"{what} | {middle:.1f} | {slowest:.1f} | {told}", flush=True)
+        outcome = "met" if middle <= READ_MS else f"MISSED (≤ {READ_MS:g})"
+        print(f"{what} | {middle:.1f} | {slowest:.1f} | {outcome}", flush=True)
     return met
 
 
@@ -321,7 +326,7 @@ def _reads(registry: Registry) -> dict[str, Callable[[], object]]:
     newest = ledger.page(LEAGUE, limit=50)
     pair = newest[-1].result.contestants[0], newest[-1].result.contestants[1]
     old = f"{ledger.schedules(LEAGUE)[0].id}/0"
-    verdict, (training, *_) = registry.newest_verdicts(LEAGUE, limit=1)[0].id, registry.runs(LEAGUE)
+    verdict, (training, *_) = registry.verdicts.newest(LEAGUE, limit=1)[0].id, registry.runs.newest(LEAGUE)
     return {
         "the newest 50 matches": lambda: ledger.page(LEAGUE, limit=50),
         "50 matches from the middle": lambda: ledger.page(LEAGUE, before=newest[-1].id, limit=50),
@@ -329,18 +334,18 @@ def _reads(registry: Registry) -> dict[str, Callable[[], object]]:
         "50 matches of two": lambda: ledger.page(LEAGUE, contestants=pair, limit=50),
         "no match of two": lambda: ledger.page(LEAGUE, contestants=("script:random", "script:first")),
         "a match with its moves": lambda: (ledger.match(newest[0].id), ledger.entry(newest[0].id)),
-        "50 versions": lambda: registry.newest_versions(LEAGUE, limit=50),
-        "50 verdicts": lambda: registry.newest_verdicts(LEAGUE, limit=50),
-        "the last verdict of each league": registry.last_verdicts,
-        "the champion's history": lambda: registry.history(LEAGUE, limit=50),
-        "summaries of all leagues": lambda: registry.snapshots(SUMMARY),
-        "standings": lambda: registry.snapshot(LEAGUE, "standings"),
-        "the payoff table": lambda: registry.snapshot(LEAGUE, "payoff"),
-        "ratings": lambda: registry.snapshot(LEAGUE, "ratings"),
-        "a verdict with its curve": lambda: registry.snapshot(LEAGUE, f"verdict/{verdict}"),
-        "training runs": lambda: registry.runs(LEAGUE),
-        "a training run's points": lambda: registry.run_points(LEAGUE, training.id),
-        "whether anything is new": registry.marks,
+        "50 versions": lambda: registry.versions.newest(LEAGUE, limit=50),
+        "50 verdicts": lambda: registry.verdicts.newest(LEAGUE, limit=50),
+        "the last verdict of each league": registry.verdicts.last_closed,
+        "the champion's history": lambda: registry.aliases.history(LEAGUE, limit=50),
+        "summaries of all leagues": lambda: registry.snapshots.of_part(SUMMARY),
+        "leaderboard": lambda: registry.snapshots.get(LEAGUE, "leaderboard"),
+        "the payoff table": lambda: registry.snapshots.get(LEAGUE, "payoff"),
+        "ratings": lambda: registry.snapshots.get(LEAGUE, "ratings"),
+        "a verdict with its curve": lambda: registry.snapshots.get(LEAGUE, f"verdict/{verdict}"),
+        "training runs": lambda: registry.runs.newest(LEAGUE),
+        "a training run's points": lambda: registry.runs.points(LEAGUE, training.id),
+        "whether anything is new": registry.snapshots.current_marks,
     }
 
 

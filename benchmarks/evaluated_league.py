@@ -1,4 +1,4 @@
-"""A league to evaluate: configs/connect_four.yaml, and versions with its network, untrained, each of its own seed."""
+"""A league for evaluation: configs/connect_four.yaml, and untrained versions with its network and different seeds."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -8,25 +8,25 @@ import torch
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.registry.manifest import Manifest, Parity, PolicyManifest
 from league.registry.registry import Registry
-from league.registry.rows import LeagueRow
+from league.registry.storage.manifest import Manifest, Parity, PolicyManifest
+from league.registry.storage.rows import LeagueRow
 from league.settings import Storage
 from training.algorithms.ppo import module_spec
-from training.export import export_policy, graph_tensors
+from training.export.onnx_export import export_policy, graph_tensors
 from training.modules.actor_critic import ActorCritic
 
 CONFIG = LeagueConfig.load(Path(__file__).parent.parent / "configs" / "connect_four.yaml")
 
 
 def publish(home: Path, versions: int) -> tuple[Registry, list[ActorCritic]]:
-    """A registry in `home` with so many versions, and the modules that they were exported from."""
+    """A registry in `home` with this number of versions, and the modules that they were exported from."""
     registry = Registry.open(Storage.at(home))
-    registry.register(CONFIG, interface(CONFIG))
-    row = registry.league(CONFIG.league)
+    registry.leagues.register(CONFIG, interface(CONFIG))
+    row = registry.leagues.get(CONFIG.league)
     modules = [_module(row, seed) for seed in range(versions)]
     for seed, module in enumerate(modules):
-        registry.publish(CONFIG.league, _builder(row, module, seed), source=f"untrained/{seed}", parent=None)
+        registry.publisher.publish(CONFIG.league, _builder(row, module, seed), source=f"untrained/{seed}", parent=None)
     return registry, modules
 
 

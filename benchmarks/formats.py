@@ -1,9 +1,10 @@
-"""In which form are actions fetched the fastest: HTTP or a stream, JSON or binary, one or many, REST or gRPC?
+"""Which request format is the fastest: HTTP or a stream, JSON or binary, single or batched, REST or gRPC?
 
 One replica behind HAProxy, the 2×256 network for connect four, and pistonball's convolutional network. HTTP with 32
-connections against a stream with 16, each with one request in flight; a batch of 256 in binary; the same request over
-REST and gRPC, by the stock tritonclient; one picture as JSON, PNG and binary, beside the time that inference alone
-takes in this process. Rounds alternate between what is compared, and the medians of the rounds are told.
+connections is compared with a stream with 16, each with one request in flight; a batch of 256 in binary; the same
+request over REST and gRPC, with the unmodified tritonclient; one image as JSON, PNG and binary, beside the time of
+inference alone in this process. Compared measurements alternate within a round, and the medians over the rounds are
+reported.
 """
 
 import argparse
@@ -25,24 +26,24 @@ from benchmarks import load, stream_load
 from benchmarks.learned import local_ray
 from benchmarks.parity import CONFIGS, prepare, situations
 from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
-from league.client.encoding import encoded
+from league.client.requests import encode
 from league.policies import load as load_policy
-from league.registry.manifest import TRAINING
 from league.registry.registry import Registry
-from league.registry.rows import VersionRow
-from serve_app import haproxy
-from serve_app.launch import running
-from serve_app.stream_framing import request
-from training.publish import load_modules
+from league.registry.storage.manifest import TRAINING
+from league.registry.storage.rows import VersionRow
+from serve_app.inference.stream_codec import encode_request
+from serve_app.runtime import haproxy
+from serve_app.runtime.launch import running
+from training.export.publish import load_modules
 
 CONNECTIONS, STREAMS = 32, 16
 BATCH = 256
 FASTER, SOONER = 2.5, 0.6
-"""The stream's rate and its latency, against HTTP's."""
+"""Ratios of the stream's rate and latency to HTTP's."""
 ACTIONS = 150_000
-"""A second, in batches of 256."""
+"""Actions per second, in batches of 256."""
 BESIDE_INFERENCE = 1.3
-"""Times the time of inference alone, for a picture in binary."""
+"""Ratio to the time of inference alone, for an image in binary."""
 BINARY = {"Content-Type": "application/octet-stream"}
 STREAM = "stream, binary"
 MNIH: dict[str, object] = {
@@ -58,11 +59,11 @@ DATATYPES = {"int8": "INT8", "uint8": "UINT8"}
 
 
 def main() -> int:
-    """Print what was measured; 1 if a target was missed."""
+    """Print the measurements; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=4.0)
-    parser.add_argument("--quick", action="store_true", help="one short round: shows that it works, no more")
+    parser.add_argument("--quick", action="store_true", help="smoke test: one short round")
     options = parser.parse_args()
     rounds, seconds = (1, 1.0) if options.quick else (options.rounds, options.seconds)
     with tempfile.TemporaryDirectory() as scratch:
@@ -70,15 +71,15 @@ def main() -> int:
         with local_ray(1):
             small = prepare(CONFIGS / "pistonball.yaml", registry, updates=0)
             large = prepare(CONFIGS / "pistonball.yaml", registry, updates=0, source="parity/2", **MNIH)
-        picture = _picture(registry, large)
+        image = _image(registry, large)
         (grpc_port,) = haproxy.free_ports(1, "127.0.0.1")
         with running(registry.storage, replicas=1, grpc_port=grpc_port) as url:
             met = [
                 _streams(url, rounds, seconds),
                 _batches(url, rounds, seconds),
                 _protocols(url.removeprefix("http://"), f"127.0.0.1:{grpc_port}", rounds, seconds),
-                _pictures(url, registry, small, picture, rounds, seconds, wanted=False),
-                _pictures(url, registry, large, picture, rounds, seconds, wanted=True),
+                _images(url, registry, small, image, rounds, seconds, has_target=False),
+                _images(url, registry, large, image, rounds, seconds, has_target=True),
             ]
         registry.close()
     return int(not all(met))
@@ -86,21 +87,21 @@ def main() -> int:
 
 def _streams(url: str, rounds: int, seconds: float) -> bool:
     policy = f"{url}/v1/policies/{LEAGUE}"
-    message = request([PLANES[None], np.ones((1, 7), np.int8)], 1)
-    asks: dict[str, Callable[[int], load.Load | stream_load.StreamLoad]] = {
+    message = encode_request([PLANES[None], np.ones((1, 7), np.int8)], 1)
+    measurements: dict[str, Callable[[int], load.Load | stream_load.StreamLoad]] = {
         "HTTP, JSON": lambda n: load.measure(f"{policy}/action", BODY, connections=n, seconds=seconds),
         "stream, JSON": lambda n: stream_load.measure(
             f"{policy}/stream", BODY, is_text=True, streams=n, seconds=seconds
         ),
         STREAM: lambda n: stream_load.measure(f"{policy}/stream", message, is_text=False, streams=n, seconds=seconds),
     }
-    rates: dict[str, list[float]] = {name: [] for name in asks}
-    latencies: dict[str, list[float]] = {name: [] for name in asks}
+    rates: dict[str, list[float]] = {name: [] for name in measurements}
+    latencies: dict[str, list[float]] = {name: [] for name in measurements}
     for _ in range(rounds):
-        for name, ask in asks.items():
+        for name, ask in measurements.items():
             rates[name].append(ask(CONNECTIONS if name.startswith("HTTP") else STREAMS).rate)
             latencies[name].append(ask(1).p50)
-    for name in asks:
+    for name in measurements:
         print(f"{name}: {median(rates[name]):,.0f}/s, p50 with one connection {median(latencies[name]):.3f} ms")
     http, best = "HTTP, JSON", STREAM
     faster = median(own / other for own, other in zip(rates[best], rates[http], strict=True))
@@ -114,7 +115,7 @@ def _batches(url: str, rounds: int, seconds: float) -> bool:
     boards = np.repeat(PLANES[None], BATCH, axis=0)
     body, headers = binary({"observation": boards, "action_mask": np.ones((BATCH, 7), np.int8)})
     infer = f"{url}/v2/models/{LEAGUE}/infer"
-    message = request([boards, np.ones((BATCH, 7), np.int8)], BATCH)
+    message = encode_request([boards, np.ones((BATCH, 7), np.int8)], BATCH)
     rest, stream = [], []
     for _ in range(rounds):
         rest.append(load.measure(infer, body, connections=4, seconds=seconds, headers=headers).rate * BATCH)
@@ -129,14 +130,14 @@ def _batches(url: str, rounds: int, seconds: float) -> bool:
 
 def _protocols(rest: str, grpc: str, rounds: int, seconds: float) -> bool:
     for rows in (1, BATCH):
-        told = []
+        texts = []
         for module, address in ((over_http, rest), (over_grpc, grpc)):
             with module.InferenceServerClient(address) as client:
                 inputs = _inputs(module, rows)
                 times = [_p50(lambda c=client, i=inputs: c.infer(LEAGUE, i), seconds) for _ in range(rounds)]
-            told.append(median(times))
-        print(f"tritonclient, {rows} rows: REST binary {told[0]:.2f} ms, gRPC {told[1]:.2f} ms", end="")
-        print(f", gRPC over REST: {told[1] / told[0]:.2f}×", flush=True)
+            texts.append(median(times))
+        print(f"tritonclient, {rows} rows: REST binary {texts[0]:.2f} ms, gRPC {texts[1]:.2f} ms", end="")
+        print(f", gRPC over REST: {texts[1] / texts[0]:.2f}×", flush=True)
     return True
 
 
@@ -151,7 +152,7 @@ def _inputs(module: object, rows: int) -> list[object]:
 
 
 def _p50(call: Callable[[], object], seconds: float) -> float:
-    """Milliseconds."""
+    """Median duration of a call, in milliseconds."""
     for _ in range(20):
         call()
     times, stop = [], time.perf_counter() + seconds
@@ -168,35 +169,35 @@ class _Form:
     headers: Mapping[str, str]
 
 
-def _pictures(
-    url: str, registry: Registry, version: VersionRow, picture: NDArray, rounds: int, seconds: float, wanted: bool
+def _images(
+    url: str, registry: Registry, version: VersionRow, image: NDArray, rounds: int, seconds: float, has_target: bool
 ) -> bool:
-    """One picture in each form, with one connection. wanted: whether the target is this network's."""
+    """One image in each format, with one connection. has_target: whether the target applies to this network."""
     policy = load_policy(version.ref, None, registry)
-    body, headers = binary({"observation": picture[None]})
+    body, headers = binary({"observation": image[None]})
     action = f"/v1/policies/{version.league}/action?version={version.number}"
     forms = {
-        "JSON": _Form(action, _document(picture.tolist()), load.JSON),
-        "PNG": _Form(action, _document(encoded(picture, "png")), load.JSON),
-        "base64": _Form(action, _document(encoded(picture, "base64")), load.JSON),
+        "JSON": _Form(action, _document(image.tolist()), load.JSON),
+        "PNG": _Form(action, _document(encode(image, "png")), load.JSON),
+        "base64": _Form(action, _document(encode(image, "base64")), load.JSON),
         "binary": _Form(f"/v2/models/{version.league}/versions/{version.number}/infer", body, headers),
     }
     streamed = f"{url}/v1/policies/{version.league}/stream?version={version.number}"
-    message = request([picture[None]], 1)
+    message = encode_request([image[None]], 1)
     times: dict[str, list[float]] = {name: [] for name in (*forms, STREAM)}
     inference: list[float] = []
     for _ in range(rounds):
-        inference.append(_p50(lambda: policy.act({"observation": picture[None]}), seconds))
+        inference.append(_p50(lambda: policy.act({"observation": image[None]}), seconds))
         for name, form in forms.items():
             seen = load.measure(url + form.path, form.body, connections=1, seconds=seconds, headers=form.headers)
             assert not seen.failed, f"{name}: {seen.statuses}"
             times[name].append(seen.p50)
         answered = stream_load.measure(streamed, message, is_text=False, streams=1, seconds=seconds)
-        assert not answered.refused
+        assert not answered.failures
         times[STREAM].append(answered.p50)
     alone = median(inference)
     sizes = {name: len(form.body) for name, form in forms.items()} | {STREAM: len(message)}
-    print(f"a picture of {picture.shape}, network of {_megabytes(registry, version):.1f} MB, ", end="")
+    print(f"a picture of {image.shape}, network of {_megabytes(registry, version):.1f} MB, ", end="")
     print(f"inference alone: {alone:.2f} ms")
     for name, taken in times.items():
         share = alone / median(taken)
@@ -204,9 +205,9 @@ def _pictures(
     met = True
     for name in ("binary", STREAM):
         beside = median(own / other for own, other in zip(times[name], inference, strict=True))
-        told = f"   (at most {BESIDE_INFERENCE:g}×)" if wanted and name == "binary" else ""
-        print(f"{name} over inference alone: {beside:.2f}×{told}", flush=True)
-        met = met and not (told and beside > BESIDE_INFERENCE)
+        limit = f"   (at most {BESIDE_INFERENCE:g}×)" if has_target and name == "binary" else ""
+        print(f"{name} over inference alone: {beside:.2f}×{limit}", flush=True)
+        met = met and not (limit and beside > BESIDE_INFERENCE)
     return met
 
 
@@ -215,9 +216,9 @@ def _megabytes(registry: Registry, version: VersionRow) -> float:
     return sum(path.stat().st_size for path in directory.glob("*.onnx")) / 1e6
 
 
-def _picture(registry: Registry, version: VersionRow) -> NDArray:
-    """What a piston sees in play: (84, 84, 4) uint8."""
-    row = registry.league(version.league)
+def _image(registry: Registry, version: VersionRow) -> NDArray:
+    """The observation of a piston during play: (84, 84, 4) uint8."""
+    row = registry.leagues.get(version.league)
     modules = load_modules(
         registry.artifacts.path(version.league, version.number) / TRAINING, row.config, row.interface
     )
@@ -236,8 +237,8 @@ def binary(arrays: Mapping[str, NDArray], outputs: Sequence[str] = ("action",)) 
         }
         for name, array in arrays.items()
     ]
-    wanted = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
-    head = orjson.dumps({"inputs": inputs, "outputs": wanted})
+    has_target = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
+    head = orjson.dumps({"inputs": inputs, "outputs": has_target})
     body = head + b"".join(array.tobytes() for array in arrays.values())
     return body, BINARY | {"Inference-Header-Content-Length": str(len(head))}
 

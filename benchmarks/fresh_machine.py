@@ -1,7 +1,7 @@
-"""How long from a machine with Python and nothing installed to a promoted endpoint that answers?
+"""How long does it take from a machine with only Python to a promoted endpoint that answers?
 
-Clones the committed state, runs `make demo` in the clone without pip's cache, and asks the endpoint for actions until
-it answers. Target: 10 minutes, of which training takes at most 5. Then plays the champion that came of it against the
+Clones the committed state, runs `make demo` in the clone without pip's cache, and requests actions from the endpoint
+until it answers. Target: 10 minutes, of which training takes at most 5. Then plays the resulting champion against the
 scripts (`benchmarks.strength`).
 """
 
@@ -17,8 +17,8 @@ from pathlib import Path
 import httpx
 
 ROOT = Path(__file__).parent.parent
-PROMISE = 600.0
-TRAINING_PROMISE = 300.0
+TARGET = 600.0
+TRAINING_TARGET = 300.0
 OBSERVATION = {"observation": [[[0, 0]] * 7] * 6, "action_mask": [1] * 7}
 PHASES = (
     ("set-up", "Policy League demo"),
@@ -26,14 +26,14 @@ PHASES = (
     ("league", "Step 3"),
     ("serving", "Step 4"),
 )
-"""What has just ended when a line with this text appears."""
+"""The phase that has ended when a line with this text appears."""
 
 
 def main() -> None:
-    """Print each phase's seconds and the total as a share of what is promised."""
+    """Print the seconds of each phase, and the total as a fraction of the target."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, default=8000)
-    parser.add_argument("--quick", action="store_true", help="half a minute of training: shows that it works, no more")
+    parser.add_argument("--quick", action="store_true", help="smoke test: half a minute of training")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="policy-league-") as folder:
         clone = Path(folder) / "policy-league"
@@ -51,8 +51,8 @@ def main() -> None:
             print(f"{phase:>10}: {marks[phase] - previous:6.1f} s")
             previous = marks[phase]
     training = marks["training"] - marks["set-up"]
-    print(f"training / 300 s: {training / TRAINING_PROMISE:.2f}   (at most 1)")
-    print(f"promoted endpoint answers after {answered:.1f} s; / 600 s: {answered / PROMISE:.2f}   (at most 1)")
+    print(f"training / 300 s: {training / TRAINING_TARGET:.2f}   (at most 1)")
+    print(f"promoted endpoint answers after {answered:.1f} s; / 600 s: {answered / TARGET:.2f}   (at most 1)")
 
 
 def _run(clone: Path, arguments: str, url: str) -> tuple[dict[str, float], float]:
@@ -94,7 +94,7 @@ def _read(demo: "subprocess.Popen[str]", start: float, marks: dict[str, float]) 
 
 
 def _answer(url: str, start: float, demo: "subprocess.Popen[str]") -> float:
-    """Seconds from `start` until the champion answers. Raises RuntimeError if the demo ends before it does."""
+    """Seconds from `start` until the champion answers. Raises RuntimeError if the demo ends before."""
     while demo.poll() is None:
         try:
             reply = httpx.post(f"{url}/v1/policies/connect_four/action", json={"observation": OBSERVATION})

@@ -1,10 +1,10 @@
-"""What becomes of a replica that is sent 10,000 bodies which nobody should send?
+"""How does a replica handle 10,000 invalid request bodies?
 
-Four tenths are made up from the server's own OpenAPI document by schemathesis, keeping to it or breaking it, for every
-route; four tenths are right requests with bytes changed, cut out or put in, for actions and inferences, in JSON and
-binary, plain and compressed; two tenths are such messages of a stream. All go to one replica over loopback. Counts
-answers by status, and the replica's memory before and after. Target: no 5xx, no dropped connection, the same process
-answers at the end, and its memory has grown by at most 5 % since the first tenth.
+Four tenths are generated from the server's OpenAPI document by schemathesis, valid and invalid, for each route; four
+tenths are valid requests with bytes changed, removed or inserted, for actions and inferences, in JSON and binary, plain
+and compressed; two tenths are such messages of a stream. All are sent to one replica over loopback. Counts responses by
+status, and the replica's memory before and after. Target: no 5xx, no dropped connection, the same process answers at
+the end, and its memory has grown by at most 5 % since the first tenth.
 """
 
 import argparse
@@ -31,31 +31,48 @@ from schemathesis import GenerationMode
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from benchmarks.processes import of_replicas
+from benchmarks.processes import replica_processes
 from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
-from serve_app.launch import running
-from serve_app.stream_framing import request as message_of
+from serve_app.inference.stream_codec import encode_request as message_of
+from serve_app.runtime.launch import running
 
 GROWTH = 0.05
-"""Of the replica's memory, at most."""
+"""Maximum growth of the replica's memory."""
 ROUTES = ("/v1/policies/{model}/action", "/v2/models/{model}/infer")
-NASTY = [None, True, -1, 2**63, 1e308, "", "\x00", "🎲", [], {}, [[]], {"b64": ""}, {"png": ""}, [None], {"": 0}, "NaN"]
+INVALID_VALUES = [
+    None,
+    True,
+    -1,
+    2**63,
+    1e308,
+    "",
+    "\x00",
+    "🎲",
+    [],
+    {},
+    [[]],
+    {"b64": ""},
+    {"png": ""},
+    [None],
+    {"": 0},
+    "NaN",
+]
 Request = tuple[str, bytes, dict[str, str]]
 """Path, body, headers."""
 
 
 def main() -> int:
-    """Print what was counted; 1 if a target was missed."""
+    """Print the counts; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bodies", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="500 bodies: shows that it works, no more")
+    parser.add_argument("--quick", action="store_true", help="smoke test: 500 bodies")
     options = parser.parse_args()
     bodies = 500 if options.quick else options.bodies
     with tempfile.TemporaryDirectory() as scratch:
         registry = publish(Path(scratch) / "home", versions=2)
         with running(registry.storage, replicas=1) as url, httpx.Client(base_url=url, timeout=30) as client:
-            (replica,) = of_replicas()
+            (replica,) = replica_processes()
             statuses: Counter[str] = Counter()
             _warm_up(client, statuses, bodies // 10, options.seed)
             before = replica.memory_info().rss
@@ -64,7 +81,7 @@ def main() -> int:
             _stream(url, statuses, bodies * 2 // 10, options.seed)
             answers = client.post(f"/v1/policies/{LEAGUE}/action", content=BODY).status_code == 200
             registry.close()
-            return _report(statuses, before, replica, is_well=answers and of_replicas() == [replica])
+            return _report(statuses, before, replica, is_well=answers and replica_processes() == [replica])
 
 
 def _report(statuses: Counter[str], before: int, replica: psutil.Process, is_well: bool) -> int:
@@ -83,7 +100,7 @@ def _report(statuses: Counter[str], before: int, replica: psutil.Process, is_wel
 
 
 def _warm_up(client: httpx.Client, statuses: Counter[str], count: int, number: int) -> None:
-    """The first tenth: memory that is taken once, for whatever is asked, is taken now."""
+    """The first tenth, in which memory is allocated once."""
     for _ in range(200):
         client.post(f"/v1/policies/{LEAGUE}/action", content=BODY)
     client.get("/openapi.json")
@@ -112,7 +129,7 @@ def _from_document(client: httpx.Client, statuses: Counter[str], count: int, num
         named = (
             {each.name: names[each.name] for each in operation.path_parameters} if data.draw(st.booleans()) else None
         )
-        with suppress(schemathesis.errors.SchemathesisError):  # nothing to break where nothing is asked
+        with suppress(schemathesis.errors.SchemathesisError):  # an operation without parameters cannot be violated
             case = data.draw(operation.as_strategy(data.draw(st.sampled_from(GenerationMode)), path_parameters=named))
             case.method = operation.method.upper()
             made = requests.Request(**case.as_transport_kwargs(base_url=str(client.base_url))).prepare()
@@ -128,9 +145,9 @@ def _from_document(client: httpx.Client, statuses: Counter[str], count: int, num
 
 def _changed(client: httpx.Client, statuses: Counter[str], count: int, number: int) -> None:
     random = Random(number)
-    whole = list(_right_requests())
+    valid = list(_valid_requests())
     for _ in range(count):
-        path, body, headers = random.choice(whole)
+        path, body, headers = random.choice(valid)
         _send(client, statuses, "POST", path, _damaged(body, random), headers)
 
 
@@ -159,19 +176,19 @@ def _stream(url: str, statuses: Counter[str], count: int, number: int) -> None:
                 message = _damaged(whole, random)
                 status = "dropped"
                 try:
-                    status = _say(stream, message.decode("utf-8", "replace") if is_text else message)
+                    status = _exchange(stream, message.decode("utf-8", "replace") if is_text else message)
                 finally:
                     statuses[status] += 1
 
 
-def _say(stream: ClientConnection, message: str | bytes) -> str:
-    """The status of an answer, 200 where it says none."""
+def _exchange(stream: ClientConnection, message: str | bytes) -> str:
+    """The status of an answer, 200 if it has none."""
     stream.send(message)
     answer = stream.recv(timeout=30)
     return str(json.loads(answer).get("status", 200)) if isinstance(answer, str) else "200"
 
 
-def _right_requests() -> Iterator[Request]:
+def _valid_requests() -> Iterator[Request]:
     action, infer = (path.replace("{model}", LEAGUE) for path in ROUTES)
     board = {"observation": {"b64": b64encode(PLANES.tobytes()).decode()}, "action_mask": [1] * 7}
     for document in (
@@ -234,14 +251,14 @@ def _put(body: bytes, random: Random) -> bytes:
 
 
 def _swap(body: bytes, random: Random) -> bytes:
-    """Put something nasty in the place of one value of a JSON object, if it is one."""
+    """Replace one value of a JSON object by an invalid one, if the body is one."""
     with suppress(ValueError, RecursionError):
         document = json.loads(body)
         at = document
         while isinstance(at, dict | list) and at:
             key = random.choice(list(at) if isinstance(at, dict) else range(len(at)))
             if not isinstance(at[key], dict | list) or not at[key] or random.random() < 0.3:
-                at[key] = random.choice(NASTY)
+                at[key] = random.choice(INVALID_VALUES)
                 break
             at = at[key]
         return json.dumps(document).encode()

@@ -1,13 +1,13 @@
-"""Numbers that others computed, and ours beside them: fastchess, fishtest, OpenSpiel, evalica, rliable, confseq."""
+"""Published numbers beside ours: fastchess, fishtest, OpenSpiel, evalica, rliable, confseq."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from evaluation.improvement import iqm, probability_of_improvement
-from evaluation.payoff import alpha_rank, nash_averaging
-from evaluation.ratings import bradley_terry
-from evaluation.sequential import bernoulli_interval, bounds, elo_estimate, expected_games, gsprt_llr
+from evaluation.statistics.bradley_terry import bradley_terry
+from evaluation.statistics.improvement import iqm, probability_of_improvement
+from evaluation.statistics.population import alpha_rank, nash_averaging
+from evaluation.statistics.sequential import bernoulli_interval, bounds, elo_estimate, expected_games, gsprt_llr
 
 CYCLE = np.array([[0.5, 0.0, 1.0], [1.0, 0.5, 0.0], [0.0, 1.0, 0.5]])
 TRANSITIVE = np.array([[0.0, -1.0, -1.0], [1.0, 0.0, -1.0], [1.0, 1.0, 0.0]])
@@ -15,7 +15,7 @@ FOOD = {
     (0, 1): (1, 2), (0, 2): (1, 2), (0, 3): (4, 5), (0, 4): (4, 4), (1, 2): (4, 6),
     (1, 3): (1.5, 2), (1, 4): (0, 2), (2, 3): (0, 2), (2, 4): (3, 3), (3, 4): (0.5, 2),
 }  # fmt: skip
-"""evalica's food.csv: points of the first and games of each pair."""
+"""evalica's food.csv: score of the first contestant and games of each pair."""
 Row = tuple[str, float, float, float]
 
 
@@ -83,7 +83,7 @@ def _strengths(games: dict[tuple[int, int], tuple[float, float]], size: int) -> 
 
 
 def run() -> bool:
-    """Print each number beside ours; whether all agree."""
+    """Print each number beside ours; returns whether all agree."""
     met = True
     for name, theirs, ours, tolerance in [*_sequential(), *_tables()]:
         agrees = abs(ours - theirs) <= tolerance

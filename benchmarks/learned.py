@@ -1,4 +1,4 @@
-"""Training in one process, by the clock, and what came of it: shared by the parts of `benchmarks.learning`."""
+"""Training in one process with measured time, and its results: shared by the parts of `benchmarks.learning`."""
 
 import logging
 import math
@@ -25,16 +25,17 @@ from ray.rllib.utils.metrics import (
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from training.trial import build
+from training.runs.trial import build_algorithm
 
 Work, Result = TypeVar("Work"), TypeVar("Result")
 Z = 1.96
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class CurvePoint:
     """One update: actions and seconds of training so far; the episodes that ended in it, and their mean return per
-    agent of each policy."""
+    agent of each policy.
+    """
 
     steps: int
     seconds: float
@@ -43,14 +44,14 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
-    """What a training came to.
+class LearningCurve:
+    """The results of a training.
 
-    greedy, random: returns of agents in fresh episodes, in which the trained policies take their most probable actions,
-    and in which all act at random; (episodes · agents,). parameters: trained numbers, shared ones counted once.
+    greedy, random: returns of agents in new episodes with greedy actions of the trained policies, and with random
+    actions; (episodes · agents,). parameters: number of trained parameters, shared ones counted once.
     """
 
-    curve: list[Point]
+    curve: list[CurvePoint]
     greedy: NDArray
     random: NDArray
     parameters: int
@@ -63,7 +64,7 @@ class Learned:
 
 @contextmanager
 def local_ray(cpus: int) -> Iterator[None]:
-    """A Ray of this process's own, quiet."""
+    """A local Ray without log output."""
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
     ray.init(address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
@@ -80,21 +81,22 @@ def learn(
     seconds: float = math.inf,
     steps: float = math.inf,
     prepare: Callable[[Algorithm], None] | None = None,
-) -> Learned:
-    """Train for `seconds`, not counting what is not training, or for `steps` actions; then play `episodes` greedily and
-    as many at random."""
-    algorithm = build(league, interface(league))
+) -> LearningCurve:
+    """Train for `seconds` of training time, or for `steps` actions; then play `episodes` greedily and as many at
+    random.
+    """
+    algorithm = build_algorithm(league, interface(league))
     if prepare is not None:
         prepare(algorithm)
     try:
         curve = list(_updates(algorithm, seconds, steps))
         greedy, random = greedy_returns(algorithm, episodes), _returns(algorithm, episodes, random_actions=True)
-        return Learned(curve, greedy, random, _parameters(algorithm))
+        return LearningCurve(curve, greedy, random, _parameters(algorithm))
     finally:
         algorithm.stop()
 
 
-def _updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[Point]:
+def _updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[CurvePoint]:
     taken, spent = 0, 0.0
     while spent < seconds and taken < steps:
         began = time.perf_counter()
@@ -102,16 +104,16 @@ def _updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[Poi
         spent += time.perf_counter() - began
         taken += int(play[NUM_ENV_STEPS_SAMPLED])
         returns = {policy: float(value) for policy, value in play.get(EPISODE_MODULE_RETURN_MEAN, {}).items()}
-        yield Point(taken, spent, int(play.get(NUM_EPISODES, 0)), returns)
+        yield CurvePoint(taken, spent, int(play.get(NUM_EPISODES, 0)), returns)
 
 
 def greedy_returns(algorithm: Algorithm, episodes: int) -> NDArray:
-    """Of agents in so many fresh episodes, in which the policies take their most probable actions."""
+    """Returns of agents in this number of new episodes, with greedy actions."""
     return _returns(algorithm, episodes, random_actions=False)
 
 
 def _returns(algorithm: Algorithm, episodes: int, random_actions: bool) -> NDArray:
-    """Of the agents that the league's own policies play, in whole episodes."""
+    """Returns of the agents with the league's own policies, in complete episodes."""
     chunks = algorithm.env_runner_group.foreach_env_runner(
         lambda runner: runner.sample(
             num_episodes=episodes, explore=False, random_actions=random_actions, force_reset=True
@@ -128,24 +130,24 @@ def _parameters(algorithm: Algorithm) -> int:
 
 
 def two_at_once(work: Callable[[Work], Result], jobs: Sequence[Work]) -> list[Result]:
-    """Each job in a process of its own, the results in the order of the jobs."""
+    """Run each job in a subprocess, two at a time; returns the results in the order of the jobs."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
         return list(pool.map(work, jobs))
 
 
 def one_thread() -> None:
-    """Several processes learn at once, each on one core."""
+    """Use one thread: several processes learn at once, each on one core."""
     torch.set_num_threads(1)
 
 
 def interval(values: NDArray) -> tuple[float, float]:
-    """The two-sided 95 % interval of the mean of independent values, by the normal approximation."""
+    """The two-sided 95 % confidence interval of the mean of independent values, by the normal approximation."""
     mean, error = float(values.mean()), float(values.std(ddof=1) / len(values) ** 0.5)
     return mean - Z * error, mean + Z * error
 
 
-def told(what: str, target: str, met: bool) -> bool:
-    """Print whether a target is met."""
+def report_target(what: str, target: str, met: bool) -> bool:
+    """Print and return whether a target is met."""
     print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
     return met

@@ -1,9 +1,9 @@
-"""Do the shipped configurations learn? Each part trains one by the clock and measures what came of it.
+"""Do the shipped configurations learn? Each part trains one for a fixed time and measures the result.
 
 Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem, connect_four_dqn
-by DQN; two_step_game, simple_spread_qmix. Where several seeds or opponents are trained, two learn at once, each in a
-process of its own on one core. All seeds are printed, none is left out. Returns are per agent and episode, of policies
-that act greedily in fresh episodes, unless it says otherwise.
+by DQN; two_step_game, simple_spread_qmix. With several seeds or opponents, two trainings run at a time, each in a
+process with one core. All seeds are printed. Returns are per agent and episode, with greedy policies in new episodes,
+unless stated otherwise.
 """
 
 import argparse
@@ -17,7 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.learned import Learned, Point, interval, learn, local_ray, one_thread, told, two_at_once
+from benchmarks.learned import (
+    CurvePoint,
+    LearningCurve,
+    interval,
+    learn,
+    local_ray,
+    one_thread,
+    report_target,
+    two_at_once,
+)
 from benchmarks.truncation import as_rllib
 from benchmarks.two_step import two_step_game
 from benchmarks.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
@@ -27,16 +36,17 @@ from league.config import LeagueConfig
 CONFIGS = Path(__file__).parent.parent / "configs"
 SEEDS = range(5)
 SPREAD_STEPS, SPREAD_BETTER_BY = 1_000_000, 4.0
-"""As many actions for each seed, so that the ablation is compared with as much experience; about two of the ten minutes
-that the target allows."""
+"""Equal numbers of actions for each seed, so that the ablation has the same experience; about two of the ten minutes
+that the target allows.
+"""
 PISTON_SECONDS, PISTON_STEPS = 2700.0, 2_000_000
 NEAR_OPTIMUM = 0.95
-"""Share of the way from random play to the optimum."""
+"""Fraction of the distance from random play to the optimum."""
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One training: which configuration with which settings, and how long, by whichever limit comes first."""
+class LearningJob:
+    """One training: configuration, settings and limits."""
 
     name: str
     settings: dict[str, object]
@@ -45,8 +55,8 @@ class Job:
     truncation_as_rllib: bool = False
 
 
-def work(job: Job) -> Learned:
-    """Learn on this process's one core."""
+def work(job: LearningJob) -> LearningCurve:
+    """Learn on the single core of this process."""
     one_thread()
     league = LeagueConfig.load(CONFIGS / f"{job.name}.yaml").with_training(**job.settings, runners=0)
     with local_ray(cpus=1):
@@ -55,11 +65,11 @@ def work(job: Job) -> Learned:
 
 
 def rps(scale: float) -> bool:
-    """The best response to each fixed opponent is known: to win every round, or nothing against a random one."""
+    """The best response to each fixed opponent is known: it wins each round, or nothing against a random one."""
     rounds = 15.0
     best = {"script:first": rounds, "script:mirror": rounds, "script:random": 0.0}
     met = True
-    jobs = [Job("rps", {"opponents": [ref]}, 30 * scale) for ref in best]
+    jobs = [LearningJob("rps", {"opponents": [ref]}, 30 * scale) for ref in best]
     for (ref, value), learned in zip(best.items(), two_at_once(work, jobs), strict=True):
         low, high = interval(learned.greedy)
         met &= low <= value <= high or learned.greedy.mean() >= value
@@ -67,14 +77,14 @@ def rps(scale: float) -> bool:
             f"against {ref}: return {learned.greedy.mean():.2f} per episode of {rounds:g} rounds"
             f" (95 % interval {low:.2f} … {high:.2f}), best response {value:g}"
         )
-    return told("best-response value against each opponent", "reached", met)
+    return report_target("best-response value against each opponent", "reached", met)
 
 
 def cars_and_lights(scale: float) -> bool:
-    """Three seeds against the optimum, which the environment's own solver computes."""
+    """Three seeds compared with the optimum, computed by the environment's solver."""
     league = LeagueConfig.load(CONFIGS / "cars_and_lights.yaml")
     best = traffic.optimum(**league.environment.kwargs)
-    jobs = [Job("cars_and_lights", {"seed": seed}, 120 * scale) for seed in range(3)]
+    jobs = [LearningJob("cars_and_lights", {"seed": seed}, 120 * scale) for seed in range(3)]
     met = True
     for seed, learned in zip(range(3), two_at_once(work, jobs), strict=True):
         own, other = learned.greedy.mean(), learned.random.mean()
@@ -84,13 +94,13 @@ def cars_and_lights(scale: float) -> bool:
             f"seed {seed}: {learned.curve[-1].steps:,} actions; return {own:.3f}, random {other:.3f},"
             f" optimum {best:.3f}: {share:.1%} of the way"
         )
-    return told("way from random to the optimum", f"{NEAR_OPTIMUM:.0%}", met)
+    return report_target("way from random to the optimum", f"{NEAR_OPTIMUM:.0%}", met)
 
 
 def shared_encoder(scale: float) -> bool:
     """Five seeds with a shared encoder, five with separate networks."""
     settings = {"shared": {"shared_encoder": True}, "separate": {"shared_encoder": False}}
-    jobs = [Job("shared_encoder", own | {"seed": s}, 90 * scale) for own in settings.values() for s in SEEDS]
+    jobs = [LearningJob("shared_encoder", own | {"seed": s}, 90 * scale) for own in settings.values() for s in SEEDS]
     learned = two_at_once(work, jobs)
     means = {}
     for label, part in zip(settings, (learned[:5], learned[5:]), strict=True):
@@ -103,13 +113,15 @@ def shared_encoder(scale: float) -> bool:
         )
     low, high = stats.t.interval(0.95, len(SEEDS) - 1, means["separate"].mean(), stats.sem(means["separate"]))
     print(f"  95 % interval of the separate networks' mean: {low:.2f} … {high:.2f}")
-    return told("mean with a shared encoder", "within that interval or above", bool(means["shared"].mean() >= low))
+    return report_target(
+        "mean with a shared encoder", "within that interval or above", bool(means["shared"].mean() >= low)
+    )
 
 
 def simple_spread(scale: float) -> bool:
-    """Five seeds, and the same five with truncation taken for termination, as RLlib does."""
+    """Five seeds, and the same five with truncation treated as termination, as in RLlib."""
     jobs = [
-        Job("simple_spread", {"seed": seed}, steps=SPREAD_STEPS * scale, truncation_as_rllib=ablated)
+        LearningJob("simple_spread", {"seed": seed}, steps=SPREAD_STEPS * scale, truncation_as_rllib=ablated)
         for ablated in (False, True)
         for seed in SEEDS
     ]
@@ -129,12 +141,12 @@ def simple_spread(scale: float) -> bool:
     for label, part in (("bootstraps", learned[:5]), ("as RLlib", learned[5:])):
         finals = np.array([each.greedy.mean() for each in part])
         print(f"  truncation {label}: {finals.mean():.2f} ± {finals.std(ddof=1):.2f} over the seeds")
-    return told("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
+    return report_target("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
 
 
 def simple_spread_qmix(scale: float) -> bool:
     """Three seeds by QMIX, each with its curve."""
-    jobs = [Job("simple_spread_qmix", {"seed": seed}, steps=SPREAD_STEPS * scale) for seed in range(3)]
+    jobs = [LearningJob("simple_spread_qmix", {"seed": seed}, steps=SPREAD_STEPS * scale) for seed in range(3)]
     met = True
     for job, each in zip(jobs, two_at_once(work, jobs), strict=True):
         last, better = each.curve[-1], each.greedy.mean() - each.random.mean()
@@ -146,16 +158,16 @@ def simple_spread_qmix(scale: float) -> bool:
         for point in ended[:: max(1, len(ended) // 10)]:
             print(f"    {point.steps:>9,} actions: {point.returns['shared']:8.2f} while exploring")
         met &= bool(better >= SPREAD_BETTER_BY)
-    return told("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
+    return report_target("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
 
 
 def pistonball(scale: float) -> bool:
-    """45 minutes on both cores: a runner beside the learner."""
+    """45 minutes on both cores: a runner in addition to the learner."""
     league = LeagueConfig.load(CONFIGS / "pistonball.yaml")
     with local_ray(cpus=3):
         learned = learn(league, seconds=PISTON_SECONDS * scale, episodes=8)
     finals = last_episodes(learned.curve, 0.1)
-    # The pistons of an episode share most of their luck: an episode counts once.
+    # The returns of the pistons in an episode are strongly correlated: an episode counts once.
     random = interval(learned.random.reshape(-1, 20).mean(axis=1))
     low, high = interval(finals)
     last = learned.curve[-1]
@@ -170,10 +182,10 @@ def pistonball(scale: float) -> bool:
     print(f"  greedy: {learned.greedy.mean():.2f} over {len(learned.greedy) // 20} episodes")
     for point in learned.curve[:: max(1, len(learned.curve) // 20)]:
         print(f"    {point.steps:>9,} actions: {next(iter(point.returns.values()), float('nan')):8.2f}")
-    return told("its interval above random's", "yes", low > random[1])
+    return report_target("its interval above random's", "yes", low > random[1])
 
 
-def last_episodes(curve: Sequence[Point], share: float) -> NDArray:
+def last_episodes(curve: Sequence[CurvePoint], share: float) -> NDArray:
     """Mean returns of the updates in which the last `share` of all episodes ended."""
     ended = [point for point in curve if point.episodes]
     counts = np.cumsum([point.episodes for point in ended])
@@ -192,10 +204,10 @@ PARTS: dict[str, Callable[[float], bool]] = {
 
 
 def main() -> int:
-    """Run the parts that were asked for; 1 if a target is missed."""
+    """Run the requested parts; 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="a thirtieth of the time, for a look")
+    parser.add_argument("--quick", action="store_true", help="a thirtieth of the time")
     options = parser.parse_args()
     if unknown := [part for part in options.parts if part not in PARTS]:
         parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")

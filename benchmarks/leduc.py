@@ -1,9 +1,9 @@
-"""Leduc hold'em as PettingZoo plays it (RLCard's rules), small enough for an exact best response.
+"""Leduc hold'em with PettingZoo's (RLCard's) rules, small enough for an exact best response.
 
-RLCard's game is not that of the literature: blinds of 1 and 2 chips, drawn at random, the small one acting first;
-raises of 2 chips, then of 4, twice a round at most; folding is always legal; payoffs count in big blinds. A policy sees
-its card, the public one, and both players' chips, but not in which order they were bet. The best response remembers
-all.
+RLCard's game differs from that of the literature: blinds of 1 and 2 chips, assigned at random, the small one acting
+first; raises of 2 chips, then of 4, at most two per round; folding is always legal; payoffs are in big blinds. A policy
+observes its card, the public one, and both players' chips, but not the order of the bets. The best response remembers
+everything.
 """
 
 from collections.abc import Callable
@@ -16,31 +16,31 @@ from numpy.typing import NDArray
 from league.policies.policy import Policy
 
 CALL, RAISE, FOLD, CHECK = range(4)
-RANKS, COPIES, BIG_BLIND, MOST_RAISES = 3, 2, 2, 2
+RANKS, COPIES, BIG_BLIND, MAX_RAISES = 3, 2, 2, 2
 HIDDEN = None
 """The public card before the second round."""
 
-Acting = Callable[[NDArray, NDArray], NDArray]
+PolicyFunction = Callable[[NDArray, NDArray], NDArray]
 """Observation (36,) and mask (4,) → probabilities (4,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hand:
-    """What both players see. Player 0 has the small blind. bets: chips of this round; chips: of all."""
+    """The public state. Player 0 has the small blind. bets: chips of this round; chips: of all rounds."""
 
     chips: tuple[int, int] = (1, 2)
     bets: tuple[int, int] = (1, 2)
     turn: int = 0
     raises: int = 0
     settled: int = 0
-    """Players in a row who did not raise; the round ends with two."""
+    """Consecutive players without a raise; the round ends with two."""
     round: int = 0
     public: int | None = HIDDEN
     folded: int | None = None
 
     @property
     def awaits_card(self) -> bool:
-        """Whether the public card is to be dealt."""
+        """Whether the public card must be dealt."""
         return self.round == 1 and self.public is HIDDEN and self.folded is None
 
     @property
@@ -50,10 +50,10 @@ class Hand:
     def legal(self) -> NDArray:
         """(4,) of 0 and 1."""
         owes = self.bets[self.turn] < max(self.bets)
-        return np.array([owes, self.raises < MOST_RAISES, True, not owes], dtype=np.int8)
+        return np.array([owes, self.raises < MAX_RAISES, True, not owes], dtype=np.int8)
 
     def after(self, action: int) -> "Hand":
-        """The hand when the player whose turn it is has acted."""
+        """The hand after an action of the player to act."""
         if action == FOLD:
             return replace(self, folded=self.turn)
         paid = 0 if action == CHECK else max(self.bets) - self.bets[self.turn]
@@ -72,48 +72,48 @@ class Hand:
         return replace(hand, bets=(0, 0), raises=0, settled=0, round=self.round + 1)
 
     def observation(self, rank: int) -> NDArray:
-        """What the player whose turn it is sees, holding `rank`."""
-        seen = np.zeros(36, np.float32)
-        seen[rank] = 1
+        """The observation of the player to act with the card `rank`."""
+        observation = np.zeros(36, np.float32)
+        observation[rank] = 1
         if self.public is not HIDDEN:
-            seen[3 + self.public] = 1
-        seen[6 + self.chips[self.turn]] = seen[21 + self.chips[1 - self.turn]] = 1
-        return seen
+            observation[3 + self.public] = 1
+        observation[6 + self.chips[self.turn]] = observation[21 + self.chips[1 - self.turn]] = 1
+        return observation
 
     def payoff(self, player: int, ranks: tuple[int, int]) -> float:
-        """Of a hand that is over. ranks: what the players hold."""
+        """The payoff of a finished hand. ranks: the players' cards."""
         if self.folded is not None:
             won = -1 if self.folded == player else 1
         else:
-            # A pair with the public card wins, else the higher card.
+            # A pair with the public card wins, otherwise the higher card.
             strengths = [rank + RANKS * (rank == self.public) for rank in ranks]
             won = int(np.sign(strengths[player] - strengths[1 - player]))
         return won * (self.chips[1 - player] if won > 0 else self.chips[player]) / BIG_BLIND if won else 0.0
 
 
-def best_response(acting: Acting) -> float:
-    """What an opponent wins at most per hand against a policy, in big blinds; both have each blind equally often."""
-    known = cache(lambda hand, rank: acting(hand.observation(rank), hand.legal()))
+def best_response(policy_function: PolicyFunction) -> float:
+    """The maximum win of an opponent against a policy, per hand in big blinds; both have each blind equally often."""
+    known = cache(lambda hand, rank: policy_function(hand.observation(rank), hand.legal()))
     return float(np.mean([_dealt(known, player) for player in (0, 1)]))
 
 
 def uniform(_: NDArray, mask: NDArray) -> NDArray:
-    """All legal actions alike."""
+    """All legal actions with equal probability."""
     return mask / mask.sum()
 
 
-def greedy(policy: Policy) -> Acting:
-    """A policy as matches play it."""
+def greedy(policy: Policy) -> PolicyFunction:
+    """A policy with greedy actions, as in matches."""
 
-    def acting(observation: NDArray, mask: NDArray) -> NDArray:
-        seen = {"observation": observation[np.newaxis], "action_mask": mask[np.newaxis]}
-        return np.eye(4)[int(policy.act(seen).actions[0])]
+    def policy_function(observation: NDArray, mask: NDArray) -> NDArray:
+        inputs = {"observation": observation[np.newaxis], "action_mask": mask[np.newaxis]}
+        return np.eye(4)[int(policy.act(inputs).actions[0])]
 
-    return acting
+    return policy_function
 
 
 def _dealt(known: Callable[[Hand, int], NDArray], player: int) -> float:
-    """The best response's value in the role of `player`: for each card of its own, the opponent's by their chances."""
+    """The value of the best response as `player`, averaged over its cards and those of the opponent."""
     value = 0.0
     for own in range(RANKS):
         chances = np.array([COPIES - (other == own) for other in range(RANKS)]) / (RANKS * COPIES - 1)
@@ -122,8 +122,9 @@ def _dealt(known: Callable[[Hand, int], NDArray], player: int) -> float:
 
 
 def _value(known: Callable[[Hand, int], NDArray], hand: Hand, player: int, own: int, reach: NDArray) -> float:
-    """Of a hand for the best response, which holds `own`. reach (3,): the probability of each of the opponent's cards,
-    and of its having acted as it did with that one."""
+    """The value of a hand for the best response with the card `own`. reach (3,): the joint probability of each card of
+    the opponent and of its previous actions with it.
+    """
     if hand.is_over:
         ranks = [(own, other) if player == 0 else (other, own) for other in range(RANKS)]
         return sum(p * hand.payoff(player, pair) for p, pair in zip(reach, ranks, strict=True) if p)

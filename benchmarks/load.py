@@ -1,7 +1,8 @@
-"""A lean HTTP/1.1 load generator: raw sockets, keep-alive, one request in flight per connection.
+"""A lightweight HTTP/1.1 load generator: raw sockets, keep-alive, one request in flight per connection.
 
-`python -m benchmarks.load URL --connections 32 --seconds 5 < body.json` prints one line of JSON (a `Load`). It is its
-own process so that it shares no interpreter with what it measures; each request costs it a few microseconds.
+`python -m benchmarks.load URL --connections 32 --seconds 5 < body.json` prints one line of JSON (a `Load`). It is a
+separate process, so that it does not share an interpreter with the measured server; each request costs it a few
+microseconds.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What one run saw. Times in milliseconds; `failed` counts dropped connections and statuses other than 200."""
+    """The results of one run. Times in milliseconds; `failed`: dropped connections and statuses other than 200."""
 
     requests: int
     seconds: float
@@ -34,7 +35,7 @@ class Load:
 
     @property
     def rate(self) -> float:
-        """Answers with status 200 per second."""
+        """Responses with status 200 per second."""
         return (self.requests - self.failed) / self.seconds
 
 
@@ -48,10 +49,11 @@ LAST_CHUNK = b"0\r\n\r\n"
 
 
 class Connection(asyncio.Protocol):
-    """Sends `request` again as soon as its reply is whole, or every `interval` seconds, and reports each reply.
+    """Sends `request` again as soon as its response is complete, or every `interval` seconds, and reports each
+    response.
 
-    A request that is due while the one before is not answered yet counts as sent when it was due: a server that is late
-    answers for all that wait (Tene's coordinated omission).
+    A request that is due while the previous one is unanswered counts as sent when it was due, so that a slow server is
+    charged for all waiting requests (Tene's coordinated omission).
     """
 
     def __init__(self, request: bytes, on_reply: OnReply, interval: float = 0.0) -> None:
@@ -89,7 +91,7 @@ class Connection(asyncio.Protocol):
         if end < 0:
             return
         head = self.received[:end].lower()
-        if not self.is_whole(head, end + 4):
+        if not self.is_complete(head, end + 4):
             return
         reply, self.received, self.waiting = self.received, b"", False
         if self.on_reply(int(reply[9:12]), reply[end + 4 :], self.sent_at) and b"connection: close" not in head:
@@ -97,8 +99,8 @@ class Connection(asyncio.Protocol):
         else:
             self.transport.close()
 
-    def is_whole(self, head: bytes, body: int) -> bool:
-        """Whether a reply, whose body starts at `body`, has arrived; its length is stated, or it is in chunks."""
+    def is_complete(self, head: bytes, body: int) -> bool:
+        """Whether a response whose body starts at `body` has arrived, with a stated length or in chunks."""
         at = head.find(LENGTH)
         if at < 0:
             return self.received.endswith(LAST_CHUNK)
@@ -125,22 +127,22 @@ async def drive(
     body: bytes,
     connections: int,
     on_reply: OnReply,
-    going: Callable[[], bool],
+    is_running: Callable[[], bool],
     *,
     rate: float = 0.0,
     headers: Mapping[str, str] = JSON,
 ) -> None:
-    """Keep `connections` busy until `going()` is false; a dropped connection is opened again.
+    """Keep `connections` busy until `is_running()` is false; dropped connections are reopened.
 
-    rate: requests per second of all connections together; 0: as fast as they are answered.
+    rate: requests per second of all connections together; 0: each as fast as it is answered.
     """
     parts = urlsplit(url)
     request = post(url, body, headers)
     interval = connections / rate if rate else 0.0
 
-    async def keep() -> None:
+    async def keep_busy() -> None:
         loop = asyncio.get_running_loop()
-        while going():
+        while is_running():
             try:
                 _, connection = await loop.create_connection(
                     lambda: Connection(request, on_reply, interval), parts.hostname, parts.port
@@ -151,7 +153,7 @@ async def drive(
                 continue
             await connection.closed
 
-    await asyncio.gather(*(keep() for _ in range(connections)))
+    await asyncio.gather(*(keep_busy() for _ in range(connections)))
 
 
 async def run(
@@ -189,7 +191,7 @@ def measure(
     rate: float = 0.0,
     headers: Mapping[str, str] = JSON,
 ) -> Load:
-    """Run the generator in a process of its own."""
+    """Run the generator in a subprocess."""
     command = [sys.executable, "-m", "benchmarks.load", url]
     command += ["--connections", str(connections), "--seconds", str(seconds), "--warm-up", str(warm_up)]
     command += ["--rate", str(rate), "--headers", json.dumps(dict(headers))]

@@ -1,9 +1,9 @@
-"""MADDPG against independent DDPG in simple_adversary: who deceives better?
+"""MADDPG compared with independent DDPG in simple_adversary: which one deceives better?
 
-Both are trained as long, by the processor's time, so that other work on the machine takes nothing from either; each
-seed in a process of its own on one core, two at a time. Then every adversary plays every good side, greedily, from the
-same starts. A seed that has finished is not trained again: its policies stay in `--directory`. All seeds are printed,
-none is left out. Returns are per agent and episode.
+Both are trained for the same CPU time, so that other load on the machine does not affect the comparison; each seed in a
+process with one core, two at a time. Then each adversary plays each good side, greedily, from the same initial states.
+A finished seed is not trained again: its policies are kept in `--directory`. All seeds are printed. Returns are per
+agent and episode.
 """
 
 import argparse
@@ -26,24 +26,24 @@ from scipy import stats
 from benchmarks.learned import local_ray, one_thread
 from league.config import LeagueConfig
 from league.environments.building import interface
-from training.algorithms.dispatch import algorithm_config
 from training.algorithms.maddpg import MADDPG
-from training.sampling.actor_runner import ActorRunner
-from training.trial import build
+from training.algorithms.setup import algorithm_config
+from training.runs.trial import build_algorithm
+from training.sampling.replay_runner import ActorRunner
 
 CONFIG = Path(__file__).parent.parent / "configs" / "simple_adversary.yaml"
 CRITICS = {"MADDPG": "centralised", "DDPG": "own"}
 ADVERSARY, GOOD = "adversary", "good_0"
-"""Policies of the two sides; the two good agents are paid alike."""
+"""Policies of the two sides; the two good agents have equal rewards."""
 AGENTS = 3
 BAND = "MAPPO of MARLlib after 20M steps: good agent +8.0 … +10.6, adversary −14.9 … −17.1"
 POINTS = 10
-"""Of the curve that is printed."""
+"""Number of points of the printed curve."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What was asked for. directory: where trained policies stay."""
+    """The command-line options. directory: where trained policies are kept."""
 
     minutes: float
     seeds: int
@@ -52,7 +52,7 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class TrainingJob:
     """One training."""
 
     critic: str
@@ -67,7 +67,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """weights: policy id → name → array. summary: what `train` measured."""
+    """weights: policy id → name → array. summary: measurements of `train`."""
 
     weights: dict[str, dict[str, NDArray]]
     summary: dict[str, Any]
@@ -88,17 +88,17 @@ def league_of(critic: str, **settings: Any) -> LeagueConfig:
     return LeagueConfig.load(CONFIG).with_training(critic=critic, runners=0, **settings)
 
 
-def train(job: Job) -> None:
-    """Learn for so many minutes of this process's one core, and keep the actors."""
+def train(job: TrainingJob) -> None:
+    """Learn for this number of CPU minutes on one core, and save the actors."""
     if job.file.exists():
         return
     one_thread()
     league = league_of(job.critic, seed=job.seed)
     with local_ray(cpus=1):
-        algorithm = build(league, interface(league))
+        algorithm = build_algorithm(league, interface(league))
         assert isinstance(algorithm, MADDPG)
-        algorithm.begin_anew(0)
-        curve = learned(algorithm, 60 * job.minutes)
+        algorithm.reset_episodes(0)
+        curve = learning_curve(algorithm, 60 * job.minutes)
         weights = {
             f"{policy}/{name}": array
             for policy, module in algorithm.learner_group._learner.module.items()
@@ -112,9 +112,10 @@ def train(job: Job) -> None:
     draft.rename(job.file)
 
 
-def learned(algorithm: MADDPG, seconds: float) -> list[dict[str, float]]:
-    """Train for so many seconds of the processor. Returns POINTS of the curve, each with the mean returns since the one
-    before."""
+def learning_curve(algorithm: MADDPG, seconds: float) -> list[dict[str, float]]:
+    """Train for this number of CPU seconds. Returns POINTS of the curve, each with the mean returns since the previous
+    one.
+    """
     curve: list[dict[str, float]] = []
     returns: dict[str, list[float]] = {ADVERSARY: [], GOOD: []}
     began = time.process_time()
@@ -131,12 +132,12 @@ def learned(algorithm: MADDPG, seconds: float) -> list[dict[str, float]]:
 
 
 def cross_play(options: Options) -> bool:
-    """Four cells: the adversaries of each against the good sides of each."""
+    """Four cells: the adversaries of each algorithm against the good sides of each."""
     jobs = {
-        name: [Job(critic, seed, options.minutes, options.directory) for seed in range(options.seeds)]
+        name: [TrainingJob(critic, seed, options.minutes, options.directory) for seed in range(options.seeds)]
         for name, critic in CRITICS.items()
     }
-    # Side by side, a seed of each, so that both have as much of the machine.
+    # Seeds of both algorithms run side by side, so that both have the same share of the machine.
     queue = [job for pair in zip(*jobs.values(), strict=True) for job in pair]
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
@@ -149,16 +150,19 @@ def cross_play(options: Options) -> bool:
         one_thread()
         cells, random = matrix(trained, options.episodes)
     print(f"\nall at random: good agent {random[1]:.2f}, adversary {random[0]:.2f}. {BAND}")
-    return told_cells(cells)
+    return report_cells(cells)
 
 
 Cells = dict[tuple[str, str], NDArray]
-"""(whose adversary, whose good side) → mean returns of adversary and good agent, (adversary seeds, good seeds, 2)."""
+"""(algorithm of the adversary, of the good side) → mean returns of adversary and good agent, (adversary seeds, good
+seeds, 2).
+"""
 
 
 def matrix(trained: dict[str, list[Trained]], episodes: int) -> tuple[Cells, tuple[float, float]]:
-    """Every adversary against every good side, each pair in as many episodes from the same starts; and what comes of
-    random play."""
+    """Each adversary against each good side, for the same number of episodes from the same initial states; and the
+    returns of random play.
+    """
     league = league_of("centralised", seed=10_000)
     described = interface(league)
     runner = ActorRunner(config=algorithm_config(league, described), worker_index=0)
@@ -166,25 +170,25 @@ def matrix(trained: dict[str, list[Trained]], episodes: int) -> tuple[Cells, tup
     cells: Cells = {}
     for own, adversaries in trained.items():
         for other, goods in trained.items():
-            pairs = [[played(runner, left, right, episodes) for right in goods] for left in adversaries]
+            pairs = [[play(runner, left, right, episodes) for right in goods] for left in adversaries]
             cells[own, other] = np.array(pairs)
     runner.stop()
     return cells, random
 
 
-def played(runner: ActorRunner, adversary: Trained, good: Trained, episodes: int) -> tuple[float, float]:
-    """Mean returns of the adversary and of a good agent, which act greedily."""
+def play(runner: ActorRunner, adversary: Trained, good: Trained, episodes: int) -> tuple[float, float]:
+    """Mean returns of the adversary and of a good agent, with greedy actions."""
     for policy, module in runner.module.items():
         module.set_state((adversary if policy == ADVERSARY else good).weights[policy])
-    runner.begin_anew(0)
+    runner.reset_episodes(0)
     return means(runner.sample(num_episodes=episodes, explore=False))
 
 
 def means(chunks: Sequence[SingleAgentEpisode]) -> tuple[float, float]:
-    """Mean returns of the adversary and of a good agent in whole episodes."""
-    whole = [chunk for chunk in chunks if chunk.is_done and chunk.t_started == 0]
+    """Mean returns of the adversary and of a good agent in complete episodes."""
+    complete = [chunk for chunk in chunks if chunk.is_done and chunk.t_started == 0]
     adversary, good = (
-        float(np.mean([chunk.get_return() for chunk in whole if chunk.module_id == policy]))
+        float(np.mean([chunk.get_return() for chunk in complete if chunk.module_id == policy]))
         for policy in (ADVERSARY, GOOD)
     )
     return adversary, good
@@ -200,12 +204,12 @@ def print_seed(name: str, seed: int, trained: Trained) -> None:
     print("  " + "  ".join(f"{point[ADVERSARY]:.1f}/{point[GOOD]:+.1f}" for point in summary["curve"]))
 
 
-def told_cells(cells: Cells) -> bool:
-    """Print the cells, and by how much MADDPG's good side is better. A seed counts once: its mean over the others."""
+def report_cells(cells: Cells) -> bool:
+    """Print the cells, and the advantage of MADDPG's good side. Each seed counts once, by its mean over the others."""
     print(f"\n{'adversary of':>14} {'good side of':>14} {'good agent':>28} {'adversary':>28}   (95 % over seeds)")
     for (own, other), cell in cells.items():
         good, adversary = cell[:, :, 1].mean(axis=0), cell[:, :, 0].mean(axis=1)
-        print(f"{own:>14} {other:>14} {shown(good):>28} {shown(adversary):>28}")
+        print(f"{own:>14} {other:>14} {format_mean(good):>28} {format_mean(adversary):>28}")
         print(f"{'':>30} of each good side: {', '.join(f'{value:.2f}' for value in good)}")
     met = True
     for own in CRITICS:
@@ -220,7 +224,7 @@ def told_cells(cells: Cells) -> bool:
     return met
 
 
-def shown(values: NDArray) -> str:
+def format_mean(values: NDArray) -> str:
     """A mean with its t-interval."""
     if len(values) < 2:
         return f"{values.mean():.2f}"
@@ -229,7 +233,7 @@ def shown(values: NDArray) -> str:
 
 
 def difference(first: NDArray, second: NDArray) -> tuple[float, float]:
-    """Welch's 95 % interval of the difference of two means; of single values, none to speak of."""
+    """Welch's 95 % interval of the difference of two means; infinite for single values."""
     if len(first) < 2:
         return float("-inf"), float("inf")
     interval = stats.ttest_ind(first, second, equal_var=False).confidence_interval(0.95)
@@ -237,13 +241,15 @@ def difference(first: NDArray, second: NDArray) -> tuple[float, float]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train, play, tell; 1 if the target is missed."""
+    """Train, play and report; 1 if the target is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=20.0, help="of each training (20)")
-    parser.add_argument("--seeds", type=int, default=5, help="of each of the two (5)")
-    parser.add_argument("--episodes", type=int, default=400, help="of each pair in cross-play (400)")
-    parser.add_argument("--directory", type=Path, default=Path("build/benchmarks/maddpg"), help="of trained policies")
-    parser.add_argument("--quick", action="store_true", help="two seeds of half a minute, for a look")
+    parser.add_argument("--minutes", type=float, default=20.0, help="minutes of each training (20)")
+    parser.add_argument("--seeds", type=int, default=5, help="seeds of each algorithm (5)")
+    parser.add_argument("--episodes", type=int, default=400, help="episodes of each pair in cross-play (400)")
+    parser.add_argument(
+        "--directory", type=Path, default=Path("build/benchmarks/maddpg"), help="directory of trained policies"
+    )
+    parser.add_argument("--quick", action="store_true", help="two seeds of half a minute")
     given = parser.parse_args(arguments)
     if given.quick:
         given.minutes, given.seeds, given.episodes = 0.5, 2, 50

@@ -1,12 +1,12 @@
-"""Games of a policy that has just been trained, as matches play them: its graph, greedily, in each seat in turn."""
+"""Games of a newly trained policy, like those of matches: its exported graph, greedily, on each side in turn."""
 
 import tempfile
 from pathlib import Path
 
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from evaluation.play import play
-from evaluation.schedule import round_robin
+from evaluation.matches.lockstep_runner import play_matches
+from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
 from league.environments.lockstep import stepping
@@ -14,31 +14,31 @@ from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.results.records import Game
-from training.export import export_policy
+from training.export.onnx_export import export_policy
 
 TRAINED = "trained"
-COPIES = 128
+NUM_ENVS = 128
 
 
 def graph(algorithm: Algorithm, league: LeagueConfig) -> Policy:
-    """The policy of a league that has one, by its exported graph."""
-    described = interface_of(league)
-    (policy,) = described.policy_ids
+    """The exported graph of the policy of a league with one policy."""
+    league_interface = interface_of(league)
+    (policy,) = league_interface.policy_ids
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "policy.onnx"
-        export_policy(algorithm.learner_group._learner.module[policy], described.of_policy(policy), path)
+        export_policy(algorithm.learner_group._learner.module[policy], league_interface.of_policy(policy), path)
         return OnnxPolicy(path)
 
 
 def games(trained: Policy, league: LeagueConfig, opponent: str, count: int, seed: int = 0) -> list[Game]:
-    """So many games against a script; the trained policy is contestant 0. Raises IllegalAction if it acts illegally."""
-    described = interface_of(league)
-    schedule = round_robin(league, described, [TRAINED, opponent], count // 2, seed)
-    own = {agent: (policy, trained) for agent, policy in described.policies.items()}
-    roster = {TRAINED: own, opponent: contestant(opponent, None, described)}
-    environment = stepping(league.environment, COPIES)
+    """Play games against a script; the trained policy is contestant 0. Raises IllegalAction on an illegal action."""
+    league_interface = interface_of(league)
+    schedule = round_robin(league, league_interface, [TRAINED, opponent], count // 2, seed)
+    own = {agent: (policy, trained) for agent, policy in league_interface.policies.items()}
+    roster = {TRAINED: own, opponent: contestant(opponent, None, league_interface)}
+    environment = stepping(league.environment, NUM_ENVS)
     try:
-        matches = play(schedule, range(schedule.length), environment, described, roster)
+        matches = play_matches(schedule, range(schedule.length), environment, league_interface, roster)
     finally:
         environment.close()
     return [game for match in matches for game in match.games]

@@ -1,9 +1,9 @@
-"""How fast are the pages of a league with 200 versions and 100,000 matches in the registry?
+"""How fast are the web pages of a league with 200 versions and 100,000 matches?
 
-From a real server on loopback: each call of the API behind them, one after another on one connection, behind a first
-one that is not counted, and pages from far down the lists; the first contentful paint of each page in headless
-Chromium, with an empty cache; and the rate of the action route while a page is open that follows its league, over the
-rate without, in pairs of runs one behind the other, of which the median counts.
+On a real server over loopback: each call of the API behind them, one at a time on one connection, after an uncounted
+first one, and pages from the end of lists; the first contentful paint of each page in headless Chromium, with an empty
+cache; and the rate of the action route while a page of the league is open, divided by the rate without, in successive
+pairs of runs, of which the median counts.
 """
 
 import argparse
@@ -23,29 +23,29 @@ from playwright.sync_api import Browser, sync_playwright
 from benchmarks.crowded_league import LEAGUE, crowd
 from benchmarks.load import measure
 from benchmarks.served_league import BODY
-from serve_app.launch import running
+from serve_app.runtime.launch import running
 
 CALL = 100
-"""Milliseconds, at most, of 95 % of the requests of each call."""
+"""Maximum 95th percentile of the requests of each call, in milliseconds."""
 PAINT = 1000
-"""Milliseconds, at most, until something of a page is seen."""
+"""Maximum time to the first contentful paint, in milliseconds."""
 RATE = 0.95
-"""Of the action route's rate without a page, at least, while one is open."""
+"""Minimum ratio of the action route's rate with an open page to that without."""
 CONNECTIONS = 32
 CHROMIUM = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update")
 BELOW = f"/v1/leagues/{LEAGUE}"
 LISTS = ("verdicts", "matches", "runs", "versions", "aliases/champion/history", "evaluations")
 PAGES = ("", "/payoff", "/versions", "/verdicts", "/history", "/matches", "/evaluations", "/runs")
-"""Below the page of the league."""
+"""Paths relative to the page of the league."""
 
 
 def main() -> int:
-    """Print what was measured; 1 if a target was missed."""
+    """Print the measurements; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--times", type=int, default=50, help="of each call")
+    parser.add_argument("--times", type=int, default=50, help="repetitions of each call")
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--quick", action="store_true", help="a small league, once: shows that it works, no more")
+    parser.add_argument("--quick", action="store_true", help="smoke test: a small league, once")
     options = parser.parse_args()
     times, pairs, seconds = (5, 1, 2.0) if options.quick else (options.times, options.pairs, options.seconds)
     with tempfile.TemporaryDirectory() as scratch:
@@ -79,24 +79,24 @@ def _calls(url: str, times: int) -> float:
 
 
 def _timed(client: httpx.Client, path: str) -> float:
-    begun = time.perf_counter()
+    started = time.perf_counter()
     client.get(path).raise_for_status()
-    return 1e3 * (time.perf_counter() - begun)
+    return 1e3 * (time.perf_counter() - started)
 
 
 def _paths(client: httpx.Client) -> Iterator[str]:
-    """Every call that pages make: of lists a usual page and the largest, of matches one from far down, too."""
+    """The calls of the web pages: for lists the default and the maximum page size, for matches also a page far down."""
     yield "/v1/leagues"
     yield BELOW
     for part in ("payoff", "ratings", "versions", "traffic"):
         yield f"{BELOW}/{part}"
     for query in ("", "?limit=200", "?offset=150"):
-        yield f"{BELOW}/standings{query}"
+        yield f"{BELOW}/leaderboard{query}"
     for name in LISTS:
         yield f"{BELOW}/{name}?limit=50"
         yield f"{BELOW}/{name}?limit={100 if name == 'evaluations' else 200}"
     yield f"{BELOW}/matches?limit=50&before={_far(client)}"
-    first, second = client.get(f"{BELOW}/standings?limit=2").json()["standings"]
+    first, second = client.get(f"{BELOW}/leaderboard?limit=2").json()["leaderboard"]
     yield f"{BELOW}/matches?first={first['ref']}&second={second['ref']}"
     yield f"{BELOW}/aliases/champion/history?at=2026-03-03T14:00:00Z"
     for name, key in (("verdicts", "verdict"), ("matches", "match"), ("runs", "run")):
@@ -105,7 +105,7 @@ def _paths(client: httpx.Client) -> Iterator[str]:
 
 
 def _far(client: httpx.Client) -> str:
-    """A match that is far down the list."""
+    """A match far down the list."""
     page = client.get(f"{BELOW}/matches?limit=200").json()
     for _ in range(100):
         if page["next"] is None:
@@ -124,7 +124,7 @@ def _browser() -> Iterator[Browser]:
 
 
 def _paint(browser: Browser, url: str, path: str) -> float:
-    """Milliseconds from the address to the first contentful paint, by a browser that has never seen the server."""
+    """Milliseconds from navigation to the first contentful paint, with an empty cache."""
     context = browser.new_context()
     page = context.new_page()
     page.goto(url + path)
@@ -136,7 +136,7 @@ def _paint(browser: Browser, url: str, path: str) -> float:
 
 
 def _pair(browser: Browser, url: str, seconds: float, is_even: bool) -> float:
-    """The rate of actions with a page open over that without, which is measured first in every other pair."""
+    """The rate of actions with an open page divided by that without, which is measured first in every other pair."""
     rates = {}
     for is_watched in (is_even, not is_even):
         with _watching(browser, url) if is_watched else nullcontext():
@@ -150,7 +150,7 @@ def _pair(browser: Browser, url: str, seconds: float, is_even: bool) -> float:
 
 @contextmanager
 def _watching(browser: Browser, url: str) -> Iterator[None]:
-    """The page of the league is open, and follows it."""
+    """Keep the page of the league open."""
     context = browser.new_context()
     page = context.new_page()
     with page.expect_response("**/events"):

@@ -1,8 +1,8 @@
-"""What learning costs beside sampling, for the algorithms that learn from a buffer. One process, one core.
+"""What does learning cost in addition to sampling, for algorithms with a replay buffer? One process, one core.
 
-Of each configuration: environment steps per second with learning on, divided by phase; and of sampling alone, networks,
-exploration and transitions for the buffer included, against the bare stock environment with random legal actions and
-without a network. These two take turns; a rate is the median over the rounds. In a step all agents act that must.
+For each configuration: environment steps per second with learning, divided by phase; and of sampling alone, including
+networks, exploration and transitions for the buffer, compared with the unmodified environment with random legal actions
+and without a network. These two alternate; a rate is the median over the rounds. In one step, all agents to move act.
 """
 
 import argparse
@@ -17,23 +17,23 @@ from types import ModuleType
 from mpe2 import simple_adversary_v3, simple_spread_v3
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 
-from benchmarks.learned import local_ray, one_thread, told
+from benchmarks.learned import local_ray, one_thread, report_target
 from benchmarks.sampling import in_parallel, in_turns
 from league.config import LeagueConfig
 from league.environments.building import interface
+from training.algorithms.metrics import PHASES, totals
 from training.algorithms.off_policy import OffPolicy
-from training.curves import PHASES, amounts
+from training.runs.trial import build_algorithm
 from training.sampling.replay_runner import ReplayRunner
-from training.trial import build
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SAMPLING = 0.75
-"""Of the bare environment's rate, at least."""
+"""Minimum ratio to the rate of the unmodified environment."""
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """module: the stock environment. bare: its steps per second. agents: how many act in a step."""
+class Phase:
+    """module: the unmodified environment. bare: its steps per second. agents: number of agents that act in a step."""
 
     module: ModuleType
     bare: Callable[[ModuleType, float], float]
@@ -41,20 +41,20 @@ class Part:
 
 
 PARTS = {
-    "leduc_holdem": Part(leduc_holdem_v4, in_turns, 1),
-    "connect_four_dqn": Part(connect_four_v3, in_turns, 1),
-    "simple_spread_qmix": Part(simple_spread_v3, in_parallel, 3),
-    "simple_adversary": Part(simple_adversary_v3, in_parallel, 3),
+    "leduc_holdem": Phase(leduc_holdem_v4, in_turns, 1),
+    "connect_four_dqn": Phase(connect_four_v3, in_turns, 1),
+    "simple_spread_qmix": Phase(simple_spread_v3, in_parallel, 3),
+    "simple_adversary": Phase(simple_adversary_v3, in_parallel, 3),
 }
 
 
-def measure(name: str, part: Part, seconds: float, rounds: int) -> bool:
+def measure(name: str, part: Phase, seconds: float, rounds: int) -> bool:
     """Print the two lines of one configuration."""
-    # Opponents would be networks, or scripts, that the bare environment does not ask either.
+    # Opponents would need networks or scripts, which the unmodified environment does not run either.
     league = LeagueConfig.load(CONFIGS / f"{name}.yaml").with_training(runners=0, learning_starts=1000, opponents=[])
-    algorithm = build(league, interface(league))
+    algorithm = build_algorithm(league, interface(league))
     assert isinstance(algorithm, OffPolicy)
-    algorithm.begin_anew(0)
+    algorithm.reset_episodes(0)
     rate, phases = learning(algorithm, part, seconds)
     split = ", ".join(f"{phase} {share:.0%}" for phase, share in phases.items())
     print(f"{name} ({league.training.algorithm}): learning on {rate:,.0f} environment steps/s: {split}")
@@ -62,28 +62,30 @@ def measure(name: str, part: Part, seconds: float, rounds: int) -> bool:
     assert isinstance(runner, ReplayRunner)
     rates: dict[str, list[float]] = {"sampling": [], "bare": []}
     for _ in range(rounds):
-        rates["sampling"].append(sampled(runner, part, algorithm.settings.exploration.final, seconds / 10))
+        rates["sampling"].append(sampling_rate(runner, part, algorithm.settings.exploration.final, seconds / 10))
         rates["bare"].append(part.bare(part.module, seconds / 10))
     algorithm.stop()
     ours, bare = (statistics.median(each) for each in rates.values())
     print(f"{name}: sampling alone {ours:,.0f}, the stock environment {bare:,.0f} environment steps/s")
-    return told(f"{name}, sampling {ours / bare:.2f}× of the bare environment", f"{SAMPLING}×", ours >= SAMPLING * bare)
+    return report_target(
+        f"{name}, sampling {ours / bare:.2f}× of the bare environment", f"{SAMPLING}×", ours >= SAMPLING * bare
+    )
 
 
-def learning(algorithm: OffPolicy, part: Part, seconds: float) -> tuple[float, dict[str, float]]:
-    """Environment steps per second behind the first transitions, and the share of each phase; the rest is `other`."""
+def learning(algorithm: OffPolicy, part: Phase, seconds: float) -> tuple[float, dict[str, float]]:
+    """Environment steps per second after the first transitions, and the fraction of each phase; the rest is `other`."""
     while algorithm.steps < algorithm.settings.learning_starts * part.agents:
         algorithm.train()
     phases, first, began = dict.fromkeys(PHASES, 0.0), algorithm.steps, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
-        taken = amounts(algorithm.train())
+        taken = totals(algorithm.train())
         phases = {phase: value + taken[phase] for phase, value in phases.items()}
     shares = {phase.removeprefix("time/"): value / elapsed for phase, value in phases.items()}
     return (algorithm.steps - first) / part.agents / elapsed, shares | {"other": 1 - sum(shares.values())}
 
 
-def sampled(runner: ReplayRunner, part: Part, exploration: float, seconds: float) -> float:
-    """Environment steps per second of play with exploration, transitions for the buffer included."""
+def sampling_rate(runner: ReplayRunner, part: Phase, exploration: float, seconds: float) -> float:
+    """Environment steps per second of play with exploration, including transitions for the buffer."""
     steps, began = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
         steps += runner.transitions(part.agents * 1000, exploration)[0]
@@ -91,10 +93,10 @@ def sampled(runner: ReplayRunner, part: Part, exploration: float, seconds: float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the configurations that were asked for; 1 if a target is missed."""
+    """Measure the requested configurations; 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="a few seconds each, for a look")
+    parser.add_argument("--quick", action="store_true", help="a few seconds each")
     given = parser.parse_args(arguments)
     if unknown := [part for part in given.parts if part not in PARTS]:
         parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")

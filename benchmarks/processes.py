@@ -1,15 +1,15 @@
-"""The processes of the servers that a benchmark has started."""
+"""The server processes that a benchmark has started."""
 
 import psutil
 
 
-def of_haproxy() -> set[int]:
-    """Ids of the HAProxy processes below this one."""
+def haproxy_processes() -> set[int]:
+    """Ids of the HAProxy processes below this process."""
     return {process.pid for process in _below() if _name(process) == "haproxy"}
 
 
-def of_replicas() -> list[psutil.Process]:
-    """The replicas of Ray Serve below this process that serve actions."""
+def replica_processes() -> list[psutil.Process]:
+    """The replicas of Ray Serve below this process."""
     return [process for process in _below() if _is_replica(process)]
 
 

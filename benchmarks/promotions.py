@@ -1,13 +1,13 @@
-"""What does a promotion cost those who are being served, and how soon does it reach every replica?
+"""What does a promotion cost clients, and how soon does it reach all replicas?
 
-The champion moves between two versions, to and fro, as `league promote` moves it, each time as soon as every replica
-has acknowledged the last one.
+The champion alternates between two versions, moved like by `league promote`, each time as soon as all replicas have
+acknowledged the previous one.
 
-First under clients that ask without a pause and without a second try: requests that failed, requests that were sent
-after every replica had acknowledged a version and yet were answered by another, processes of HAProxy that were started
-(a reload starts one), and the time from the call that promotes until every replica has acknowledged. Then at half of
-the rate that the server can answer: the 99th percentile of the latency with promotions over that without, in pairs of
-runs one behind the other, of which the median counts.
+First with clients that send requests without pause and without retries: the number of failed requests, of requests sent
+after all replicas had acknowledged a version but answered by another one, and of new HAProxy processes (a reload starts
+one), and the time from the promoting call until all replicas have acknowledged. Then at half of the maximum rate of the
+server: the 99th percentile of the latency with promotions divided by that without, in successive pairs of runs, of
+which the median counts.
 """
 
 import argparse
@@ -29,38 +29,38 @@ import orjson
 from numpy.typing import NDArray
 
 from benchmarks.load import Load, drive, measure
-from benchmarks.processes import of_haproxy
+from benchmarks.processes import haproxy_processes
 from benchmarks.served_league import BODY, LEAGUE, publish
 from league.registry.registry import Registry
-from serve_app.launch import running
+from serve_app.runtime.launch import running
 
 ROOT = Path(__file__).parent.parent
 CLIENTS = 8
 REPLICAS = 2
 REQUESTS = 1_000_000
-PROMISE = 0.25
-"""Seconds from a promotion until every replica serves it, 99th percentile."""
+TARGET = 0.25
+"""Seconds from a promotion until all replicas serve it, 99th percentile."""
 SLOWER = 1.5
-"""Times the latency without promotions, 99th percentile."""
+"""Maximum ratio to the latency without promotions, 99th percentile."""
 
 
 @dataclass(frozen=True, slots=True)
-class Promotion:
-    """One movement of the champion. Times by `time.perf_counter`, which all processes of a machine share."""
+class MeasuredPromotion:
+    """One promotion. Times by `time.perf_counter`, which all processes of a machine share."""
 
     version: int
-    begun: float
+    start: float
     returned: float
     everywhere: float
 
 
 def main() -> int:
-    """Print what was counted; 1 if a target was missed."""
+    """Print the counts; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--promotions", type=int, default=1_000)
     parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each run at half the rate")
-    parser.add_argument("--quick", action="store_true", help="20 promotions, one short pair: shows that it works")
+    parser.add_argument("--seconds", type=float, default=10.0, help="seconds of each run at half the rate")
+    parser.add_argument("--quick", action="store_true", help="smoke test: 20 promotions, one short pair")
     parser.add_argument("--load", nargs=2, metavar=("URL", "FILE"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.load:
@@ -77,22 +77,22 @@ def main() -> int:
                 promotions = []
                 for i in range(count):
                     promotions.append(_promote(registry, 2 - i % 2))
-                    started |= of_haproxy() - before
+                    started |= haproxy_processes() - before
             met = [_report(promotions, np.load(replies), len(started), None if options.quick else REQUESTS)]
             met.append(_pairs(url, registry, pairs, seconds))
         registry.close()
     return int(not all(met))
 
 
-def _report(promotions: list[Promotion], replies: NDArray, reloads: int, enough: int | None) -> bool:
-    """replies: (n, 3), when it was sent, when it was answered, and by which version, 0 if not at all."""
+def _report(promotions: list[MeasuredPromotion], replies: NDArray, reloads: int, enough: int | None) -> bool:
+    """replies: (n, 3): time of sending, time of the answer, and its version, 0 without one."""
     sent, answered, version = replies.T
     failed = int((version == 0).sum())
     wrong = sum(
-        int(((sent > now.everywhere) & (answered < then.begun) & (version != now.version) & (version != 0)).sum())
+        int(((sent > now.everywhere) & (answered < then.start) & (version != now.version) & (version != 0)).sum())
         for now, then in pairwise(promotions)
     )
-    reached = np.array([promotion.everywhere - promotion.begun for promotion in promotions])
+    reached = np.array([promotion.everywhere - promotion.start for promotion in promotions])
     p99 = float(np.percentile(reached, 99))
     seconds = answered.max() - sent.min()
     print(f"{len(promotions)} promotions, {CLIENTS} clients, {REPLICAS} replicas: {len(replies):,} requests, ", end="")
@@ -101,8 +101,8 @@ def _report(promotions: list[Promotion], replies: NDArray, reloads: int, enough:
     print(f"answered by a version that was replaced everywhere: {wrong}   (at most 0)")
     print(f"reloads of HAProxy: {reloads}   (at most 0)")
     print(f"promotion → every replica: median {np.median(reached):.3f} s, p99 {p99:.3f} s, ", end="")
-    print(f"longest {reached.max():.3f} s   (p99 at most {PROMISE:g} s)")
-    return not failed + wrong + reloads and p99 <= PROMISE and len(replies) >= (enough or 0)
+    print(f"longest {reached.max():.3f} s   (p99 at most {TARGET:g} s)")
+    return not failed + wrong + reloads and p99 <= TARGET and len(replies) >= (enough or 0)
 
 
 def _pairs(url: str, registry: Registry, pairs: int, seconds: float) -> bool:
@@ -114,28 +114,28 @@ def _pairs(url: str, registry: Registry, pairs: int, seconds: float) -> bool:
         with _promoting(registry) as promotions:
             moving = measure(address, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
         ratios.append(moving.p99 / steady.p99)
-        print(f"pair {number + 1}, {rate:,.0f}/s: {_told(steady)} without, ", end="")
-        print(f"{_told(moving)} with {len(promotions)} promotions: {ratios[-1]:.2f}×", flush=True)
+        print(f"pair {number + 1}, {rate:,.0f}/s: {_format(steady)} without, ", end="")
+        print(f"{_format(moving)} with {len(promotions)} promotions: {ratios[-1]:.2f}×", flush=True)
     print(f"p99 with promotions over without: {median(ratios):.2f}×   (at most {SLOWER:g}×)")
     return median(ratios) <= SLOWER
 
 
-def _told(load: Load) -> str:
+def _format(load: Load) -> str:
     failed = f", {load.failed} failed" if load.failed else ""
     return f"p50 {load.p50:.2f} ms, p99 {load.p99:.2f} ms{failed}"
 
 
 @contextmanager
-def _promoting(registry: Registry) -> Iterator[list[Promotion]]:
-    """Move the champion while the context lasts."""
-    promotions: list[Promotion] = []
+def _promoting(registry: Registry) -> Iterator[list[MeasuredPromotion]]:
+    """Promote continuously while the context lasts."""
+    promotions: list[MeasuredPromotion] = []
     is_over = threading.Event()
 
     def promote() -> None:
-        # Who promotes is elsewhere as a rule: here it takes what the others leave of the processors.
+        # Usually the promoting process runs elsewhere: here it uses only the CPU time that others leave.
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
         while not is_over.is_set():
-            promotions.append(_promote(registry, 3 - registry.aliases(LEAGUE)["champion"], every=0.05))
+            promotions.append(_promote(registry, 3 - registry.aliases.current(LEAGUE)["champion"], every=0.05))
 
     thread = threading.Thread(target=promote)
     thread.start()
@@ -146,38 +146,38 @@ def _promoting(registry: Registry) -> Iterator[list[Promotion]]:
         thread.join()
 
 
-def _promote(registry: Registry, version: int, every: float = 0.005) -> Promotion:
-    """Move the champion and wait until it is moved everywhere, looking every so many seconds."""
-    begun = time.perf_counter()
-    expected = registry.aliases(LEAGUE)["champion"]
-    registry.set_alias(LEAGUE, "champion", version, expected=expected, actor="benchmark", reason="back and forth")
+def _promote(registry: Registry, version: int, every: float = 0.005) -> MeasuredPromotion:
+    """Move the champion and wait for all replicas, polling at this interval in seconds."""
+    start = time.perf_counter()
+    expected = registry.aliases.current(LEAGUE)["champion"]
+    registry.aliases.set(LEAGUE, "champion", version, expected=expected, actor="benchmark", reason="back and forth")
     returned = time.perf_counter()
     _await_replicas(registry, version, every)
-    return Promotion(version, begun, returned, time.perf_counter())
+    return MeasuredPromotion(version, start, returned, time.perf_counter())
 
 
 def _await_replicas(registry: Registry, version: int, every: float = 0.005) -> None:
-    """Return when every replica has acknowledged a version."""
+    """Return when all replicas have acknowledged a version."""
     deadline = time.monotonic() + 30
-    while sum(said.version == version for said in registry.acknowledgements(LEAGUE)) < REPLICAS:
+    while sum(row.version == version for row in registry.replicas.acknowledgements(LEAGUE)) < REPLICAS:
         if time.monotonic() > deadline:
             raise TimeoutError(f"version {version} did not reach every replica within 30 s")
         time.sleep(every)
 
 
 def _settled(seconds: float = 3.0) -> set[int]:
-    """HAProxy's processes, once they have stayed the same for a while: the last replica's coming is a reload, too."""
-    known, since = of_haproxy(), time.monotonic()
+    """HAProxy's processes, once they have not changed for a while: a new replica causes a reload, too."""
+    known, since = haproxy_processes(), time.monotonic()
     while time.monotonic() < since + seconds:
         time.sleep(0.1)
-        if (now := of_haproxy()) != known:
+        if (now := haproxy_processes()) != known:
             known, since = now, time.monotonic()
     return known
 
 
 @contextmanager
 def _loading(url: str, replies: Path) -> Iterator[None]:
-    """Ask for actions in another process while the context lasts; the replies are in the file afterwards."""
+    """Request actions in a subprocess while the context lasts; the replies are in the file afterwards."""
     command = [sys.executable, "-m", "benchmarks.promotions", "--load", url, str(replies)]
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as load:
         assert load.stdin is not None
@@ -190,7 +190,7 @@ def _loading(url: str, replies: Path) -> Iterator[None]:
 
 
 def _load(url: str, file: str) -> None:
-    """Ask until standard input ends."""
+    """Send requests until standard input is closed."""
     import threading
 
     import uvloop

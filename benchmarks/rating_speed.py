@@ -1,13 +1,13 @@
 """How long does it take to rate 1,000 versions from a million games?
 
-Three leagues, of blocks of two games that are drawn by the logistic model:
+Three leagues, with blocks of two games drawn from the logistic model:
 
-- nights: each version has met `script:random`, the ten before it and now and then an older one, in 500 blocks;
-- adaptive: each has met those near it in strength;
-- round robin: everybody has met everybody once, 499,500 pairs.
+- nights: each version has played `script:random`, the ten previous versions and some older ones, in 500 blocks;
+- adaptive: each version has played those of similar strength;
+- round robin: each pair has played once, 499,500 pairs.
 
-Timed is `evaluation.standings.ranked`: sums, ratings, and their 95 % intervals; from the blocks in memory. Besides, the
-round robin is written into a ledger, a SQLite file, and timed once more from there. Target: 10 s each.
+Measured is `evaluation.matches.leaderboard.ranked`: sums, ratings, and their 95 % intervals, from blocks in memory. In
+addition, the round robin is written to a ledger, a SQLite file, and measured again from there. Target: 10 s each.
 """
 
 import argparse
@@ -22,20 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from evaluation.schedule import round_robin
-from evaluation.standings import ranked
+from evaluation.matches.leaderboard import rank_contestants
+from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.registry import tables
-from league.registry.database import insert
 from league.registry.registry import Registry
-from league.results.documents import dump_games, dump_numbers
+from league.registry.storage import tables
+from league.registry.storage.database import insert
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Game
+from league.results.records import BlockResult, Game, dump_games, dump_numbers
 from league.settings import Storage
 
 SECONDS = 10.0
-"""The target."""
+"""The target in seconds."""
 LEAGUE = "tictactoe"
 BATCH = 20_000
 
@@ -45,12 +44,12 @@ Pairs = NDArray[np.int64]
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a line for each league; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="200 versions, and no ledger: shows that it works")
+    parser.add_argument("--quick", action="store_true", help="smoke test: 200 versions, without a ledger")
     return run(parser.parse_args(argv).quick)
 
 
 def run(quick: bool = False) -> int:
-    """The benchmark with its usual settings."""
+    """Run the benchmark with its usual settings."""
     versions, rng = 200 if quick else 1000, np.random.default_rng(0)
     truth = np.cumsum(rng.normal(2, 6, versions)) * np.log(10) / 400
     print("league | games | pairs | seconds | target", flush=True)
@@ -58,18 +57,18 @@ def run(quick: bool = False) -> int:
     for name, draw in LEAGUES.items():
         pairs = draw(versions, truth, rng)
         results = _blocks(pairs, truth, rng)
-        met &= _tell(name, pairs, lambda results=results: results)
+        met &= _report(name, pairs, lambda results=results: results)
     if not quick:
         with tempfile.TemporaryDirectory() as scratch:
             registry = _written(Path(scratch), results)
-            met &= _tell("the last one, from its ledger", pairs, lambda: Ledger(registry).results(LEAGUE))
+            met &= _report("the last one, from its ledger", pairs, lambda: Ledger(registry).results(LEAGUE))
             registry.close()
     return int(not met)
 
 
-def _tell(name: str, pairs: Pairs, read: Callable[[], list[BlockResult]]) -> bool:
+def _report(name: str, pairs: Pairs, read: Callable[[], list[BlockResult]]) -> bool:
     began = time.perf_counter()
-    table = ranked(read())
+    table = rank_contestants(read())
     seconds = time.perf_counter() - began
     assert all(standing.interval is not None for standing in table)
     met = seconds <= SECONDS
@@ -82,9 +81,9 @@ def _tell(name: str, pairs: Pairs, read: Callable[[], list[BlockResult]]) -> boo
 def _nights(versions: int, truth: NDArray[np.float64], rng: np.random.Generator) -> Pairs:  # noqa: ARG001
     version = np.repeat(np.arange(1, versions), 500)
     kind = rng.random(len(version))
-    before = rng.integers(1, 11, len(version))
+    distance = rng.integers(1, 11, len(version))
     older = (rng.integers(0, 20, len(version)) * version) // 20
-    opponent = np.where(kind < 0.1, 0, np.where(kind < 0.9, np.maximum(version - before, 0), older))
+    opponent = np.where(kind < 0.1, 0, np.where(kind < 0.9, np.maximum(version - distance, 0), older))
     return np.column_stack([version, opponent])
 
 
@@ -114,12 +113,12 @@ def _blocks(pairs: Pairs, truth: NDArray[np.float64], rng: np.random.Generator) 
 
 
 def _written(scratch: Path, results: Sequence[BlockResult]) -> Registry:
-    """A ledger that holds a round robin with these results; of the moves only a few, as those are not read."""
+    """A ledger with a round robin of these results; most moves are omitted, as they are not read."""
     config = LeagueConfig.from_mapping(
         {"league": LEAGUE, "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}}
     )
     registry = Registry.open(Storage.at(scratch / "home"))
-    registry.register(config, interface(config))
+    registry.leagues.register(config, interface(config))
     contestants = list(dict.fromkeys(ref for block in results for ref in block.contestants))
     schedule = Ledger(registry).open(round_robin(config, interface(config), contestants, blocks=1))
     moves = dump_games([Game((i, 1 - i), 1, (), (4, 0, 8), (1.0, -1.0), (1.0, 0.0)) for i in range(2)])
@@ -140,7 +139,7 @@ def _written(scratch: Path, results: Sequence[BlockResult]) -> Registry:
             for block in results[start : start + BATCH]
         ]
         with registry.database.write() as session:
-            insert(session, tables.Match, rows)
+            insert(session, tables.MatchTable, rows)
     return registry
 
 

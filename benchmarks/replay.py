@@ -1,9 +1,9 @@
-"""How fast transitions of three agents are kept and sampled, against RLlib's multi-agent replay buffer.
+"""How fast are transitions of three agents stored and sampled, compared with RLlib's multi-agent replay buffer?
 
-Both hold the same 100,000 steps of simple_spread, three agents with 18 numbers each, and are asked for 1,024 steps of
-all three at once: ours by rows of a ring buffer, RLlib's MultiAgentEpisodeReplayBuffer by its episodes, in the one mode
-that keeps agents together (`synchronized`) and in its default, which draws agents' steps independently. Median of the
-calls of a round, what is compared takes turns; one thread.
+Both contain the same 100,000 steps of simple_spread, three agents with 18 numbers each, and sample 1,024 steps of all
+three agents: ours from rows of a ring buffer, RLlib's MultiAgentEpisodeReplayBuffer from episodes, in the mode that
+keeps agents together (`synchronized`) and in its default mode, which draws agents' steps independently. Median of the
+calls in a round; compared measurements alternate; one thread.
 """
 
 import argparse
@@ -17,14 +17,14 @@ from ray.rllib.env.multi_agent_episode import MultiAgentEpisode
 from ray.rllib.utils.replay_buffers.multi_agent_episode_buffer import MultiAgentEpisodeReplayBuffer
 
 from league.training_config import PrioritiesConfig
-from training.replay import Block, Replay
+from training.replay_buffer import ReplayBuffer, TransitionBlock
 
 STEPS, BATCH, LENGTH, NUMBERS = 100_000, 1024, 25, 18
 AGENTS = ("agent_0", "agent_1", "agent_2")
-MOST_SECONDS, FASTER = 1e-3, 50.0
+MAX_SECONDS, FASTER = 1e-3, 50.0
 
 
-def ours(priorities: PrioritiesConfig | None) -> Replay:
+def our_buffer(priorities: PrioritiesConfig | None) -> ReplayBuffer:
     """A full buffer of joint transitions with their global state."""
     rng = np.random.default_rng(0)
     n, shape = STEPS, (STEPS, len(AGENTS), NUMBERS)
@@ -40,13 +40,13 @@ def ours(priorities: PrioritiesConfig | None) -> Replay:
         "state": rng.standard_normal((n, 3 * NUMBERS), dtype=np.float32),
         "next_state": rng.standard_normal((n, 3 * NUMBERS), dtype=np.float32),
     }
-    replay = Replay(STEPS, priorities=priorities)
-    replay.add(Block(rows, np.zeros(n, dtype=np.int64), np.roll(ends, 1)))
+    replay = ReplayBuffer(STEPS, priorities=priorities)
+    replay.add(TransitionBlock(rows, np.zeros(n, dtype=np.int64), np.roll(ends, 1)))
     return replay
 
 
-def rllibs(steps: int) -> MultiAgentEpisodeReplayBuffer:
-    """The same in episodes."""
+def rllib_buffer(steps: int) -> MultiAgentEpisodeReplayBuffer:
+    """The same transitions as episodes."""
     rng = np.random.default_rng(0)
     buffer = MultiAgentEpisodeReplayBuffer(capacity=steps)
     for number in range(steps // LENGTH):
@@ -67,7 +67,7 @@ def rllibs(steps: int) -> MultiAgentEpisodeReplayBuffer:
 
 
 def seconds(call: Callable[[], object], calls: int) -> float:
-    """The median of some calls."""
+    """The median duration of some calls."""
     taken = []
     for _ in range(calls):
         began = time.perf_counter()
@@ -77,12 +77,12 @@ def seconds(call: Callable[[], object], calls: int) -> float:
 
 
 def main() -> int:
-    """Print what each takes; 1 if a target is missed."""
+    """Print the durations; 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer steps in RLlib's buffer, and fewer calls")
+    parser.add_argument("--quick", action="store_true", help="fewer steps in RLlib's buffer and fewer calls")
     quick = parser.parse_args().quick
-    uniform, prioritised = ours(None), ours(PrioritiesConfig())
-    buffer = rllibs(STEPS // 10 if quick else STEPS)
+    uniform, prioritised = our_buffer(None), our_buffer(PrioritiesConfig())
+    buffer = rllib_buffer(STEPS // 10 if quick else STEPS)
     contestants: dict[str, Callable[[], object]] = {
         "ours, uniform": lambda: uniform.sample(BATCH),
         "ours, uniform, 3 steps": lambda: uniform.sample(BATCH, n_step=3, gamma=0.99),
@@ -101,7 +101,7 @@ def main() -> int:
         print(f"{name:>28}: {1e3 * value:8.3f} ms for {BATCH} steps of {len(AGENTS)} agents")
     slowest = max(value for name, value in medians.items() if name.startswith("ours"))
     factor = min(value for name, value in medians.items() if name.startswith("RLlib")) / medians["ours, uniform"]
-    met = slowest <= MOST_SECONDS and factor >= FASTER
+    met = slowest <= MAX_SECONDS and factor >= FASTER
     print(f"slowest of ours {1e3 * slowest:.3f} ms, target 1 ms; {factor:.0f}× RLlib's fastest, target {FASTER:g}×")
     print("met" if met else "MISSED")
     return not met

@@ -1,7 +1,8 @@
-"""The peer: RLlib's own example of serving a policy, `rllib/examples/ray_serve`, on a module of connect four's size.
+"""The peer: RLlib's example of serving a policy, `rllib/examples/ray_serve`, with a module of the size for connect
+four.
 
-`python -m benchmarks.rllib_server CHECKPOINT PORT` serves until its standard input ends. Its deployment is the class of
-the wheel itself; whether HAProxy stands before it, and how many threads torch has, the environment says.
+`python -m benchmarks.rllib_server CHECKPOINT PORT` serves until its standard input is closed. Its deployment is the
+class of the wheel; environment variables select HAProxy and the number of torch threads.
 """
 
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 
 def save_module(path: Path) -> None:
-    """Save an untrained RLModule that takes a flat board and has 7 logits."""
+    """Save an untrained RLModule with a flat board as input and 7 logits."""
     import gymnasium
     import numpy as np
     from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPPOTorchRLModule
@@ -29,7 +30,7 @@ def save_module(path: Path) -> None:
 
 
 def main() -> None:
-    """Serve, and say when it is up."""
+    """Serve, and report when the server is ready."""
     checkpoint, port = sys.argv[1], int(sys.argv[2])
     import ray
     from ray import serve

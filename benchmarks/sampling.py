@@ -1,10 +1,11 @@
-"""How fast training samples, against RLlib's own runner and against the bare environment. One torch thread per runner.
+"""How fast does training sample, compared with RLlib's runner and with the unmodified environment? One torch thread per
+runner.
 
-Parts: simple_spread and connect_four (one runner against RLlib's MultiAgentEnvRunner with its wrappers of PettingZoo,
-over numbers of copies), stock (one runner, its network included, against the stock environment with random legal
-actions and without a network), iteration (PPO in one process: 4,000 environment steps, 4 epochs), runners (two against
-one). Everybody plays and learns by the same network, a 2×256 multilayer perceptron of ours, in RLlib too. What is
-compared takes turns within a round; a rate is the median over the rounds. Steps are those of the environment: all
+Parts: simple_spread and connect_four (one runner compared with RLlib's MultiAgentEnvRunner with its PettingZoo
+wrappers, for several numbers of environments), stock (one runner, including its network, compared with the unmodified
+environment with random legal actions and without a network), iteration (PPO in one process: 4,000 environment steps, 4
+epochs), runners (two compared with one). All use the same network, our 2×256 multilayer perceptron, also in RLlib.
+Compared measurements alternate within a round; a rate is the median over the rounds. In one environment step, all
 agents act once.
 """
 
@@ -38,10 +39,10 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.ppo import algorithm_config
 from training.modules.actor_critic import ActorCritic
+from training.runs.trial import build_algorithm
 from training.sampling.env_runner import LockstepEnvRunner
-from training.trial import build
 
-COPIES = (1, 4, 8, 16, 32, 64)
+NUM_ENVS = (1, 4, 8, 16, 32, 64)
 HIDDEN = (256, 256)
 SPREAD, FOUR, LEDUC = (
     "mpe2.simple_spread_v3",
@@ -49,15 +50,15 @@ SPREAD, FOUR, LEDUC = (
     "pettingzoo.classic.leduc_holdem_v4",
 )
 AGENTS = {SPREAD: 3, FOUR: 1, LEDUC: 1}
-"""That act in one step."""
+"""Agents that act in one step."""
 STEPS, EPOCHS, MINIBATCH = 4000, 4, 128
-"""Of an iteration; the size of a minibatch is RLlib's default."""
+"""Of an iteration; the minibatch size is RLlib's default."""
 
 Rates = dict[Hashable, float]
 
 
 class Flat(ActorCritic):
-    """The same network on observations that are no dictionary, as RLlib's wrappers give them."""
+    """The same network on observations that are not a dictionary, as returned by RLlib's wrappers."""
 
     def setup(self) -> None:
         self.observation_space = gymnasium.spaces.Dict({"observation": self.observation_space})
@@ -84,23 +85,23 @@ def connect_four(quick: bool) -> bool:
 
 
 def against_rllib(entry_point: str, quick: bool, best: float, default: float) -> bool:
-    """One runner against RLlib's, over numbers of copies."""
-    runners: dict[Hashable, EnvRunner] = {("ours", copies): ours(entry_point, copies) for copies in COPIES}
-    runners |= {("RLlib", copies): rllib(entry_point, copies) for copies in COPIES}
+    """One runner compared with RLlib's, for several numbers of environments."""
+    runners: dict[Hashable, EnvRunner] = {("ours", num_envs): ours(entry_point, num_envs) for num_envs in NUM_ENVS}
+    runners |= {("RLlib", num_envs): rllib(entry_point, num_envs) for num_envs in NUM_ENVS}
     for runner in runners.values():
         runner.sample(num_timesteps=500)
     seconds = 0.5 if quick else 2.0
     rates = in_rounds(
-        {key: lambda runner=runner: sampled(runner, entry_point, seconds) for key, runner in runners.items()},
+        {key: lambda runner=runner: sampling_rate(runner, entry_point, seconds) for key, runner in runners.items()},
         rounds=2 if quick else 5,
     )
-    print(f"{'copies':>8} {'ours':>12} {'RLlib':>12}   environment steps/s in one runner")
-    for copies in COPIES:
-        print(f"{copies:>8} {rates['ours', copies]:>12,.0f} {rates['RLlib', copies]:>12,.0f}")
-    top = {name: max(rates[name, copies] for copies in COPIES) for name in ("ours", "RLlib")}
+    print(f"{'num_envs':>8} {'ours':>12} {'RLlib':>12}   environment steps/s in one runner")
+    for num_envs in NUM_ENVS:
+        print(f"{num_envs:>8} {rates['ours', num_envs]:>12,.0f} {rates['RLlib', num_envs]:>12,.0f}")
+    top = {name: max(rates[name, num_envs] for num_envs in NUM_ENVS) for name in ("ours", "RLlib")}
     met = [
-        told("ours against RLlib's best", top["ours"] / top["RLlib"], best),
-        told("ours against RLlib's default (1 copy)", top["ours"] / rates["RLlib", 1], default),
+        report("ours against RLlib's best", top["ours"] / top["RLlib"], best),
+        report("ours against RLlib's default (1 environment)", top["ours"] / rates["RLlib", 1], default),
     ]
     for runner in runners.values():
         runner.stop()
@@ -108,34 +109,34 @@ def against_rllib(entry_point: str, quick: bool, best: float, default: float) ->
 
 
 def stock(quick: bool) -> bool:
-    """At least 75 % of what the stock environment does alone."""
+    """At least 75 % of the rate of the unmodified environment alone."""
     modules = {SPREAD: simple_spread_v3, FOUR: connect_four_v3, LEDUC: leduc_holdem_v4}
     met = [against_stock(name, module, quick) for name, module in modules.items()]
     return all(met)
 
 
 def against_stock(entry_point: str, module: Any, quick: bool) -> bool:
-    """One runner of 32 copies."""
-    runner, seconds = ours(entry_point, copies=32), 0.5 if quick else 2.0
+    """One runner with 32 environments."""
+    runner, seconds = ours(entry_point, num_envs=32), 0.5 if quick else 2.0
     runner.sample(num_timesteps=3000)
     alone = in_parallel if entry_point == SPREAD else in_turns
     rates = in_rounds(
-        {"ours": lambda: sampled(runner, entry_point, seconds), "stock": lambda: alone(module, seconds)},
+        {"ours": lambda: sampling_rate(runner, entry_point, seconds), "stock": lambda: alone(module, seconds)},
         rounds=3 if quick else 7,
     )
     runner.stop()
     name = entry_point.rpartition(".")[2]
     print(f"{name}: ours {rates['ours']:,.0f}, the stock environment alone {rates['stock']:,.0f} steps/s")
-    return told(f"{name}, ours against the stock environment", rates["ours"] / rates["stock"], 0.75)
+    return report(f"{name}, ours against the stock environment", rates["ours"] / rates["stock"], 0.75)
 
 
 def iteration(quick: bool) -> bool:
-    """At least 4.5 times RLlib's default; its best is printed beside."""
-    algorithms = {"ours": our_ppo(), "RLlib's default": rllib_ppo(1), "RLlib's best (32 copies)": rllib_ppo(32)}
+    """At least 4.5 times RLlib's default; the ratio to its best is printed as well."""
+    algorithms = {"ours": our_ppo(), "RLlib's default": rllib_ppo(1), "RLlib's best (32 environments)": rllib_ppo(32)}
     for algorithm in algorithms.values():
         algorithm.train()
     rates = in_rounds(
-        {key: lambda algorithm=algorithm: iterated(algorithm) for key, algorithm in algorithms.items()},
+        {key: lambda algorithm=algorithm: iteration_rate(algorithm) for key, algorithm in algorithms.items()},
         rounds=1 if quick else 3,
     )
     for name, rate in rates.items():
@@ -144,46 +145,49 @@ def iteration(quick: bool) -> bool:
         algorithm.stop()
     default, best = (rates["ours"] / rates[name] for name in list(rates)[1:])
     print(f"an iteration, ours against RLlib's best: {best:.1f}x")
-    return told("an iteration, ours against RLlib's default", default, 4.5)
+    return report("an iteration, ours against RLlib's default", default, 4.5)
 
 
 def runners(quick: bool) -> bool:
     """Two runners sample at least 1.7 times as fast as one."""
     batch = 9600
     algorithms = {
-        count: build(league(SPREAD, runners=count, train_batch_size=batch), interface(league(SPREAD)))
+        count: build_algorithm(league(SPREAD, runners=count, train_batch_size=batch), interface(league(SPREAD)))
         for count in (1, 2)
     }
     rates = in_rounds(
-        {count: lambda algorithm=algorithm: gathered(algorithm, batch) for count, algorithm in algorithms.items()},
+        {
+            count: lambda algorithm=algorithm: gathering_rate(algorithm, batch)
+            for count, algorithm in algorithms.items()
+        },
         rounds=5 if quick else 15,
     )
     for algorithm in algorithms.values():
         algorithm.stop()
     print(f"one runner {rates[1]:,.0f}, two {rates[2]:,.0f} actions/s, in batches of {batch:,}")
-    return told("two runners against one", rates[2] / rates[1], 1.7)
+    return report("two runners against one", rates[2] / rates[1], 1.7)
 
 
 def league(entry_point: str, **training: Any) -> LeagueConfig:
     """A league of that environment with one policy."""
-    settings = {"runners": 0, "copies": 32, "hidden": HIDDEN} | training
+    settings = {"runners": 0, "num_envs": 32, "hidden": HIDDEN} | training
     document = {"league": "benchmark", "environment": {"entry_point": entry_point}, "training": settings}
     return LeagueConfig.from_mapping(document)
 
 
-def ours(entry_point: str, copies: int) -> EnvRunner:
-    """LockstepEnvRunner as training builds it."""
-    config = league(entry_point, copies=copies)
+def ours(entry_point: str, num_envs: int) -> EnvRunner:
+    """LockstepEnvRunner as created by training."""
+    config = league(entry_point, num_envs=num_envs)
     return LockstepEnvRunner(algorithm_config(config, interface(config)), worker_index=0)
 
 
-def rllib(entry_point: str, copies: int) -> EnvRunner:
-    """RLlib's runner as its documentation sets it up for a PettingZoo environment."""
-    return MultiAgentEnvRunner(config=rllib_config(entry_point, copies), worker_index=0)
+def rllib(entry_point: str, num_envs: int) -> EnvRunner:
+    """RLlib's runner as configured in its documentation for a PettingZoo environment."""
+    return MultiAgentEnvRunner(config=rllib_config(entry_point, num_envs), worker_index=0)
 
 
-def rllib_config(entry_point: str, copies: int) -> PPOConfig:
-    """RLlib's PPO with its default settings, but for the number of copies and the network."""
+def rllib_config(entry_point: str, num_envs: int) -> PPOConfig:
+    """RLlib's PPO with its default settings, except for the number of environments and the network."""
     if entry_point == SPREAD:
         wrapped: Any = ParallelPettingZooEnv(simple_spread_v3.parallel_env())
         register_env(entry_point, lambda _: ParallelPettingZooEnv(simple_spread_v3.parallel_env()))
@@ -199,26 +203,26 @@ def rllib_config(entry_point: str, copies: int) -> PPOConfig:
         model_config={"hidden": list(HIDDEN)},
     )
     config = PPOConfig().environment(entry_point, disable_env_checking=True)
-    config.env_runners(num_env_runners=0, num_envs_per_env_runner=copies)
+    config.env_runners(num_env_runners=0, num_envs_per_env_runner=num_envs)
     config.multi_agent(policies={"shared"}, policy_mapping_fn=lambda *_, **__: "shared")
     return config.rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs={"shared": module}))
 
 
 def our_ppo() -> Algorithm:
-    """Of each environment step, all agents' actions are learned from; RLlib counts the steps, we the actions."""
+    """PPO that learns from the actions of all agents in each environment step; RLlib counts steps, we count actions."""
     config = league(SPREAD, train_batch_size=STEPS * AGENTS[SPREAD], epochs=EPOCHS, minibatch_size=MINIBATCH, runners=0)
-    return build(config, interface(config))
+    return build_algorithm(config, interface(config))
 
 
-def rllib_ppo(copies: int) -> Algorithm:
-    """RLlib's."""
-    config = rllib_config(SPREAD, copies)
+def rllib_ppo(num_envs: int) -> Algorithm:
+    """RLlib's PPO."""
+    config = rllib_config(SPREAD, num_envs)
     config.training(train_batch_size_per_learner=STEPS, num_epochs=EPOCHS, minibatch_size=MINIBATCH)
     return config.build_algo()
 
 
 def in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int) -> Any:
-    """What each measures, in turns; the median of the rounds."""
+    """The median of each measurement over the rounds, in alternation."""
     found: dict[Any, list[float]] = {key: [] for key in measures}
     for _ in range(rounds):
         for key, measure in measures.items():
@@ -226,8 +230,8 @@ def in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int) -> Any:
     return {key: statistics.median(values) for key, values in found.items()}
 
 
-def sampled(runner: EnvRunner, entry_point: str, seconds: float) -> float:
-    """Environment steps per second, episodes that a learner takes included. RLlib counts them, ours counts actions."""
+def sampling_rate(runner: EnvRunner, entry_point: str, seconds: float) -> float:
+    """Environment steps per second, including episodes for a learner. RLlib counts steps, our runner counts actions."""
     share = AGENTS[entry_point] if isinstance(runner, LockstepEnvRunner) else 1
     steps, began = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
@@ -237,7 +241,7 @@ def sampled(runner: EnvRunner, entry_point: str, seconds: float) -> float:
 
 
 def in_parallel(module: Any, seconds: float) -> float:
-    """Steps per second of the stock `parallel_env()`, with random actions."""
+    """Steps per second of the unmodified `parallel_env()`, with random actions."""
     env, rng, steps = module.parallel_env(), np.random.default_rng(0), 0
     spaces = {agent: int(env.action_space(agent).n) for agent in env.possible_agents}
     began = time.perf_counter()
@@ -250,7 +254,7 @@ def in_parallel(module: Any, seconds: float) -> float:
 
 
 def in_turns(module: Any, seconds: float) -> float:
-    """Moves per second of the stock `env()`, with random legal actions, in PettingZoo's own loop."""
+    """Moves per second of the unmodified `env()`, with random legal actions, in PettingZoo's loop."""
     env, rng, moves = module.env(), np.random.default_rng(0), 0
     began = time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
@@ -265,15 +269,15 @@ def in_turns(module: Any, seconds: float) -> float:
     return moves / elapsed
 
 
-def iterated(algorithm: Algorithm) -> float:
-    """Environment steps per second of one iteration, learning included."""
+def iteration_rate(algorithm: Algorithm) -> float:
+    """Environment steps per second of one iteration, including learning."""
     began = time.perf_counter()
     algorithm.train()
     return STEPS / (time.perf_counter() - began)
 
 
-def gathered(algorithm: Algorithm, batch: int) -> float:
-    """Actions per second until a batch has come from all runners."""
+def gathering_rate(algorithm: Algorithm, batch: int) -> float:
+    """Actions per second until a batch has arrived from all runners."""
     began = time.perf_counter()
     episodes = synchronous_parallel_sample(
         worker_set=algorithm.env_runner_group, max_env_steps=batch, _uses_new_env_runners=True
@@ -281,8 +285,8 @@ def gathered(algorithm: Algorithm, batch: int) -> float:
     return sum(len(episode) for episode in episodes) / (time.perf_counter() - began)
 
 
-def told(what: str, ratio: float, target: float) -> bool:
-    """Print a ratio against its target; whether it is met."""
+def report(what: str, ratio: float, target: float) -> bool:
+    """Print a ratio with its target; returns whether it is met."""
     print(f"{what}: {ratio:.2f}x (target {target:g}x){'' if ratio >= target else '  BELOW TARGET'}", flush=True)
     return ratio >= target
 
@@ -293,10 +297,10 @@ PARTS: dict[str, Callable[[bool], bool]] = {
 
 
 def main() -> int:
-    """Run the parts that were asked for; 1 if a target is missed."""
+    """Run the requested parts; 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="shorter measurements, for a look")
+    parser.add_argument("--quick", action="store_true", help="shorter measurements")
     options = parser.parse_args()
     if unknown := [part for part in options.parts if part not in PARTS]:
         parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")

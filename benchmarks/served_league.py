@@ -1,4 +1,4 @@
-"""A league to serve: the real interface of connect four, versions with a 2×256 network of random weights."""
+"""A league for serving: the interface of connect four, and versions with a 2×256 network with random weights."""
 
 import contextlib
 import io
@@ -17,9 +17,9 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.interface import AgentInterface
 from league.registry.aliases import ANY
-from league.registry.manifest import Manifest, Parity, PolicyManifest
-from league.registry.manifest import Tensor as TensorManifest
 from league.registry.registry import Registry
+from league.registry.storage.manifest import Manifest, Parity, PolicyManifest
+from league.registry.storage.manifest import Tensor as TensorManifest
 from league.settings import Storage
 from league.spaces import inputs
 
@@ -47,19 +47,21 @@ class MaskedMLP(nn.Module):
 
 
 def publish(home: Path, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Registry:
-    """A registry in `home` whose league has so many versions, the first its champion. hidden: units of the network."""
+    """A registry in `home` whose league has this number of versions, the first of them its champion. hidden: units of
+    the network.
+    """
     config = LeagueConfig.load(ROOT / "configs" / "connect_four.yaml")
     registry = Registry.open(Storage.at(home))
-    registry.register(config, interface(config))
+    registry.leagues.register(config, interface(config))
     for seed in range(versions):
-        registry.publish(LEAGUE, builder(registry, seed, hidden), source=f"random/{seed}")
-    registry.set_alias(LEAGUE, "champion", 1, expected=ANY, actor="benchmark", reason="something must answer")
+        registry.publisher.publish(LEAGUE, builder(registry, seed, hidden), source=f"random/{seed}")
+    registry.aliases.set(LEAGUE, "champion", 1, expected=ANY, actor="benchmark", reason="something must answer")
     return registry
 
 
 def builder(registry: Registry, seed: int, hidden: tuple[int, ...]) -> Callable[[Path, int], Manifest]:
-    """Writes a version's files into a directory."""
-    row = registry.league(LEAGUE)
+    """A function that writes the files of a version into a directory."""
+    row = registry.leagues.get(LEAGUE)
     (policy,) = row.interface.policy_ids
     spaces = row.interface.of_policy(policy)
 

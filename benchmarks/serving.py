@@ -1,12 +1,12 @@
-"""How fast does the action endpoint answer, against what others serve policies with, and against what it stands on?
+"""How fast is the action endpoint, compared with other policy servers and with the software it is built on?
 
-All have a 2×256 network for connect four. Ours reads the board, checks board and mask, and answers with the legal
+All have a 2×256 network for connect four. Ours parses the board, checks board and mask, and answers with the legal
 action, the version and its digest. Peers: a Serve application with the same settings that reads the same body and
-answers a constant; the same handler and model on bare uvicorn; FastAPI with torch on uvicorn; RLlib's own example of
-serving a policy, which reads a flat board and answers with the arg max. Servers run one at a time, in rounds; a ratio
-is taken within a round, and the medians of the rounds are told. One replica each, unless it says otherwise. By default
-Serve gives a replica 5 requests at once and backs off beyond: RLlib's example is measured with 5 connections too, and
-its better rate counts.
+answers with a constant; the same handler and model on uvicorn alone; FastAPI with torch on uvicorn; RLlib's example of
+serving a policy, which reads a flat board and answers with the arg max. Servers run one at a time, in rounds; ratios
+are computed within a round, and the medians over the rounds are reported. One replica each, unless stated otherwise. By
+default Serve sends 5 concurrent requests to a replica and backs off beyond that: RLlib's example is measured with 5
+connections, too, and its better rate counts.
 """
 
 import argparse
@@ -30,21 +30,23 @@ from benchmarks.load import measure
 from benchmarks.rllib_server import save_module
 from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
 from league.settings import Storage
-from serve_app import haproxy
-from serve_app.launch import DEPLOY_YAML, running
+from serve_app.runtime import haproxy
+from serve_app.runtime.launch import DEPLOY_YAML, running
 
 ROOT = Path(__file__).parent.parent
 CONNECTIONS = 32
 AT_LEAST = {"constant": 0.8, "handler": 0.45, "fastapi": None, "short": None, "default": 14.0, "haproxy": 2.8}
-"""Our rate against each peer's."""
+"""Minimum ratio of our rate to that of each peer."""
 SLOWER_BY = 0.3
-"""Milliseconds, at most, of the median latency with one connection over that of the same handler on bare uvicorn."""
+"""Maximum difference in milliseconds of the median latency with one connection to that of the same handler on uvicorn
+alone.
+"""
 FLAT_BODY = json.dumps({"observation": PLANES.flatten().tolist()}).encode()
 
 
 @dataclass
-class Server:
-    """One of those that are compared, and what was measured of it, by round."""
+class ServerUnderTest:
+    """One of the compared servers, and its measurements by round."""
 
     name: str
     start: Callable[[], AbstractContextManager[str]]
@@ -55,7 +57,7 @@ class Server:
     failed: int = 0
 
     def measure(self, seconds: float) -> None:
-        """One round at each number of connections, and with one for the latency."""
+        """Measure one round with each number of connections, and with one connection for the latency."""
         with self.start() as url:
             rates = {}
             for connections in self.connections:
@@ -68,11 +70,11 @@ class Server:
         self.latencies.append(one.p50)
 
     def best(self, number: int) -> float:
-        """The rate in a round, at the number of connections that suits it best."""
+        """The rate in a round with the best number of connections."""
         return max(self.rates[number].values())
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         rates = ", ".join(
             f"{median(each[count] for each in self.rates):,.0f}/s at {count}" for count in self.connections
         )
@@ -85,7 +87,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--quick", action="store_true", help="one short round: shows that it works, no more")
+    parser.add_argument("--quick", action="store_true", help="smoke test: one short round")
     options = parser.parse_args()
     rounds, seconds = (1, 2.0) if options.quick else (options.rounds, options.seconds)
     with tempfile.TemporaryDirectory() as scratch:
@@ -93,10 +95,10 @@ def main() -> int:
         for number in range(rounds):
             for server in servers.values():
                 server.measure(seconds)
-                print(f"after round {number + 1}: {server.name}: {server.told}", flush=True)
+                print(f"after round {number + 1}: {server.name}: {server.summary}", flush=True)
     print()
     for server in servers.values():
-        print(f"{server.name}: {server.told}")
+        print(f"{server.name}: {server.summary}")
     assert not servers["ours"].failed, "an action was not answered"
     met = [_compare(servers["ours"], servers[peer], least) for peer, least in AT_LEAST.items()]
     pairs = zip(servers["ours"].latencies, servers["handler"].latencies, strict=True)
@@ -105,29 +107,31 @@ def main() -> int:
     return int(not all(met) or slower > SLOWER_BY)
 
 
-def _compare(ours: Server, peer: Server, least: float | None) -> bool:
+def _compare(ours: ServerUnderTest, peer: ServerUnderTest, least: float | None) -> bool:
     ratio = median(ours.best(number) / (peer.best(number) or nan) for number in range(len(ours.rates)))
     print(f"ours / {peer.name}: {ratio:.2f}×" + ("" if least is None else f"   (at least {least:g}×)"))
     return least is None or not ratio < least
 
 
-def _servers(scratch: Path) -> dict[str, Server]:
+def _servers(scratch: Path) -> dict[str, ServerUnderTest]:
     storage = publish(scratch / "home", versions=1).storage
     checkpoint = scratch / "rllib"
     save_module(checkpoint)
     return {
-        "ours": Server("ours", lambda: _ours(storage, 1), BODY),
-        "ours, 2": Server("ours, two replicas as in deploy.yaml", lambda: _ours(storage, 2), BODY),
-        "constant": Server("a constant on Serve", lambda: _constant(storage, scratch, "build_app"), BODY),
-        "short": Server("a constant past Serve's handling", lambda: _constant(storage, scratch, "build_short"), BODY),
-        "handler": Server("the same handler on bare uvicorn", lambda: _bare("handler", storage), BODY),
-        "fastapi": Server("FastAPI and torch on uvicorn", lambda: _bare("fastapi", storage), BODY),
-        "haproxy": Server(
+        "ours": ServerUnderTest("ours", lambda: _ours(storage, 1), BODY),
+        "ours, 2": ServerUnderTest("ours, two replicas as in deploy.yaml", lambda: _ours(storage, 2), BODY),
+        "constant": ServerUnderTest("a constant on Serve", lambda: _constant(storage, scratch, "build_app"), BODY),
+        "short": ServerUnderTest(
+            "a constant past Serve's handling", lambda: _constant(storage, scratch, "build_short"), BODY
+        ),
+        "handler": ServerUnderTest("the same handler on bare uvicorn", lambda: _bare("handler", storage), BODY),
+        "fastapi": ServerUnderTest("FastAPI and torch on uvicorn", lambda: _bare("fastapi", storage), BODY),
+        "haproxy": ServerUnderTest(
             "RLlib's example, one torch thread, our HAProxy settings", lambda: _tuned(checkpoint), FLAT_BODY
         ),
-        "default": Server(
+        "default": ServerUnderTest(
             "RLlib's example, one torch thread, default Serve",
-            lambda: _theirs(checkpoint, {"OMP_NUM_THREADS": "1"}),
+            lambda: _rllib_server(checkpoint, {"OMP_NUM_THREADS": "1"}),
             FLAT_BODY,
             (5, CONNECTIONS),
         ),
@@ -183,13 +187,13 @@ def _await(url: str, server: "subprocess.Popen[bytes]") -> None:
 def _tuned(checkpoint: Path) -> Iterator[str]:
     with (
         haproxy.private_directory() as directory,
-        _theirs(checkpoint, haproxy.environment(directory)) as url,
+        _rllib_server(checkpoint, haproxy.environment(directory)) as url,
     ):
         yield url
 
 
 @contextmanager
-def _theirs(checkpoint: Path, environment: dict[str, str]) -> Iterator[str]:
+def _rllib_server(checkpoint: Path, environment: dict[str, str]) -> Iterator[str]:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
     command = [sys.executable, "-m", "benchmarks.rllib_server", str(checkpoint), str(port)]
     with subprocess.Popen(

@@ -1,8 +1,8 @@
-"""What does a shadow cost those who are being served?
+"""What does a shadow cost clients?
 
-One league, a champion and a candidate of the same size, as deploy.yaml serves them, at half of the rate that the server
-can answer: the median latency with every request shown to the candidate over that without, in pairs of runs one behind
-the other, of which the median counts.
+One league with a champion and a candidate of the same size, served as by deploy.yaml, at half of the maximum rate of
+the server: the median latency with all requests mirrored to the candidate divided by that without, in successive pairs
+of runs, of which the median counts.
 """
 
 import argparse
@@ -15,8 +15,8 @@ from statistics import median
 from benchmarks.load import measure
 from benchmarks.served_league import BODY, LEAGUE, publish
 from league.registry.registry import Registry
-from league.registry.rows import Portion
-from serve_app.launch import running
+from league.registry.storage.rows import Portion
+from serve_app.runtime.launch import running
 
 CLIENTS = 8
 REPLICAS = 2
@@ -28,7 +28,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--quick", action="store_true", help="one short pair: shows that it works, no more")
+    parser.add_argument("--quick", action="store_true", help="smoke test: one short pair")
     options = parser.parse_args()
     pairs, seconds = (1, 2.0) if options.quick else (options.pairs, options.seconds)
     ratios = []
@@ -45,30 +45,30 @@ def main() -> int:
                 ratios.append(shadowed.p50 / alone.p50)
                 print(f"pair {number + 1}, {rate:,.0f}/s: p50 {alone.p50:.3f} ms without a shadow, ", end="")
                 print(f"{shadowed.p50:.3f} ms with one: {ratios[-1]:.2f}×", flush=True)
-            _tell(registry)
+            _report(registry)
         registry.close()
     print(f"p50 with a shadow of all requests over without: {median(ratios):.2f}×   (at most {SLOWER:g}×)")
     return int(median(ratios) > SLOWER)
 
 
 def _shadow(registry: Registry, shadow: Portion | None) -> None:
-    """Return when every replica follows."""
-    setting = registry.set_traffic(LEAGUE, shadow=shadow, actor="benchmark", reason="a pair")
+    """Set the shadow; returns when all replicas follow."""
+    setting = registry.traffic.set(LEAGUE, shadow=shadow, actor="benchmark", reason="a pair")
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
-        said = registry.acknowledgements(LEAGUE)
+        said = registry.replicas.acknowledgements(LEAGUE)
         if len(said) >= REPLICAS and all(one.traffic == setting.id for one in said):
             return
         time.sleep(0.02)
     raise TimeoutError("the replicas do not follow within 30 s")
 
 
-def _tell(registry: Registry) -> None:
-    """How much of the load the candidate has seen: it gets what fits into its share of a core."""
-    (seen,) = registry.shadowings(LEAGUE)
-    offered = seen.requests + seen.dropped
-    print(f"of {offered:,} requests {seen.requests:,} were computed by the candidate, ", end="")
-    print(f"{seen.dropped:,} were dropped ({seen.dropped / offered:.0%}); agreement {seen.agreement:.1%}")
+def _report(registry: Registry) -> None:
+    """Print which part of the load the candidate has received: it is limited to its share of a core."""
+    (counts,) = registry.traffic.shadow_counts(LEAGUE)
+    offered = counts.requests + counts.dropped
+    print(f"of {offered:,} requests {counts.requests:,} were computed by the candidate, ", end="")
+    print(f"{counts.dropped:,} were dropped ({counts.dropped / offered:.0%}); agreement {counts.agreement:.1%}")
 
 
 if __name__ == "__main__":

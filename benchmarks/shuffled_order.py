@@ -1,8 +1,8 @@
-"""A verdict whose matches are finished in another order each time, fast when they are won and slow when they are lost.
+"""A verdict whose matches finish in random order, quickly when they are won and slowly when they are lost.
 
-Workers are simulated: each takes the next chunk when it has finished one, and a chunk takes as long as its games, each
-of a random duration that depends on how it ends. What is finished goes through the queue that real workers' chunks go
-through (`evaluation.ordering`), and the gate looks after each chunk, as it does at night.
+Workers are simulated: each takes the next chunk after it has finished one, and a chunk takes as long as its games, each
+of which has a random duration that depends on its result. Finished chunks go through the same queue as those of real
+workers (`evaluation.matches.tournament`), and the gate checks after each chunk, as in a nightly run.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from benchmarks.simulated_gates import EQUALS, stronger
-from evaluation.gate import Watch, judge
-from evaluation.ordering import InOrder
+from evaluation.gating.gate import SequentialMonitor, decide_matches
+from evaluation.matches.tournament import ReorderBuffer
 from league.config import GateConfig
 from league.results.records import Game, Match
 
@@ -22,11 +22,11 @@ SETTINGS = GateConfig(elo1=60, max_blocks=600, nights=None)
 CHUNK = 16
 POINTS = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (1.0, 0.5), (1.0, 1.0))
 SECONDS = {0.0: 9.0, 0.5: 3.0, 1.0: 1.0}
-"""Of a game that is lost, drawn and won."""
+"""Mean duration of a game that is lost, drawn and won."""
 
 
 def verdicts_of_shuffled_completion(orders: int) -> dict[tuple[str | None, int], int]:
-    """(outcome, stopping block) → in how many of so many orders of completion the verdict came out so."""
+    """(outcome, stopping block) → the number of orders of completion with this verdict."""
     rng = np.random.default_rng(6)
     cells = rng.choice(5, p=stronger(EQUALS["drawish"], 35), size=SETTINGS.max_blocks)
     matches = [_match(position, POINTS[cell]) for position, cell in enumerate(cells)]
@@ -44,12 +44,12 @@ def _match(position: int, points: Sequence[float]) -> Match:
 
 
 def _judged(matches: Sequence[Match], workers: int, random: np.random.Generator) -> tuple[str | None, int]:
-    watch, seen = Watch(SETTINGS, "l@2"), list[Match]()
+    monitor, finished = SequentialMonitor(SETTINGS, "l@2"), list[Match]()
     for chunk in _in_schedule_order(matches, workers, random):
-        seen += chunk
-        if watch.is_over(seen):
+        finished += chunk
+        if monitor.is_over(finished):
             break
-    decision = judge(SETTINGS, seen, "l@2")
+    decision = decide_matches(SETTINGS, finished, "l@2")
     return decision.outcome, decision.blocks
 
 
@@ -57,16 +57,16 @@ def _in_schedule_order(
     matches: Sequence[Match], workers: int, random: np.random.Generator
 ) -> Iterator[Sequence[Match]]:
     chunks = [matches[start : start + CHUNK] for start in range(0, len(matches), CHUNK)]
-    queue: InOrder[Sequence[Match]] = InOrder()
-    waiting, flying = enumerate(chunks), list[tuple[float, int]]()
+    queue: ReorderBuffer[Sequence[Match]] = ReorderBuffer()
+    pending, running = enumerate(chunks), list[tuple[float, int]]()
     clock = 0.0
     while queue.due < len(chunks):
-        while len(flying) < workers and (following := next(waiting, None)) is not None:
-            heapq.heappush(flying, (clock + _duration(following[1], random), following[0]))
+        while len(running) < workers and (following := next(pending, None)) is not None:
+            heapq.heappush(running, (clock + _duration(following[1], random), following[0]))
         if (chunk := queue.take()) is not None:
             yield chunk
             continue
-        clock, done = heapq.heappop(flying)
+        clock, done = heapq.heappop(running)
         queue.put(done, chunks[done])
 
 

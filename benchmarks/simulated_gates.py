@@ -1,7 +1,7 @@
-"""Sequential tests on simulated blocks: which share is promoted, and after how many blocks.
+"""Sequential tests on simulated blocks: the fraction of promotions, and the number of blocks.
 
-Blocks are drawn from shares of the five cells (LL, LD, DD or WL, WD, WW). Shares of a stronger challenger are those of
-equals, tilted exponentially until the effect of a game is the one that is wanted.
+Blocks are drawn from probabilities of the five cells (LL, LD, DD or WL, WD, WW). The probabilities for a stronger
+challenger are those of equal players, tilted exponentially to the required effect of a game.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from evaluation.gate import limits_of
-from evaluation.sequential import ELO_PER_EFFECT, gsprt_llr, score_of
+from evaluation.gating.gate import decision_bounds
+from evaluation.statistics.sequential import ELO_PER_EFFECT, gsprt_llr, score_of
 from league.config import GateConfig
 
 CELLS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
@@ -22,23 +22,23 @@ EQUALS = {
     "first mover wins": (0.08, 0.06, 0.72, 0.06, 0.08),
     "drawish": (0.03, 0.17, 0.6, 0.17, 0.03),
 }
-"""Shares of the cells between equals."""
+"""Probabilities of the cells between equal players."""
 AT_ONCE = 50
-"""Blocks between two looks at which tests have ended."""
+"""Number of blocks between two checks for finished tests."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Gates:
-    """What many tests came to: `promoted` and `blocks` of each."""
+    """Results of many tests: `promoted` and `blocks` of each."""
 
     promoted: NDArray[np.bool_]
     blocks: NDArray[np.int64]
 
 
 def stronger(shares: tuple[float, ...], elo: float, model: str = "normalized") -> Floats:
-    """The shares of somebody who is `elo` stronger, in Elo of `model`."""
+    """The cell probabilities of a player that is `elo` stronger, in Elo of `model`."""
 
     def gap(theta: float) -> float:
         p = _tilted(shares, theta)
@@ -57,9 +57,9 @@ def _tilted(shares: tuple[float, ...], theta: float) -> Floats:
 
 
 def simulate(settings: GateConfig, shares: Floats, gates: int, seed: int) -> Gates:
-    """Many tests over random blocks, each ended where `evaluation.gate.decide` ends it."""
+    """Many tests on random blocks, each stopped as by `evaluation.gating.gate.decide`."""
     rng = np.random.default_rng(seed)
-    lower, upper = limits_of(settings)
+    lower, upper = decision_bounds(settings)
     assert settings.model != "returns"
     counts = np.zeros((gates, 5))
     promoted, blocks = np.zeros(gates, dtype=bool), np.full(gates, settings.max_blocks)

@@ -1,10 +1,10 @@
-"""Years of nights with candidates that are no better than the champion: how often is one of them promoted?
+"""Years of nightly runs with candidates that are not better than the champion: how often is one of them promoted?
 
-A year of 365 nights with 8 candidates is 2,920 tests, and 1,000 years are three million: too many to compute each
-block's likelihood ratio. Where every game has a winner, a block is lost, shared or won, and where a test stands depends
-on three counts alone. So the gate is asked once for each state that a test can be in, and tests are walks over that
-table. The same table gives the chance of a false promotion without any sampling error, by adding up the chances of all
-walks.
+A year of 365 nights with 8 candidates has 2,920 tests, and 1,000 years have three million: too many to compute the
+likelihood ratio of each block. If each game has a winner, a block is lost, shared or won, and the state of a test
+depends only on three counts. Therefore the gate is evaluated once for each possible state of a test, and tests are
+walks through that table. The same table gives the probability of a false promotion without sampling error, by adding up
+the probabilities of all walks.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.gate import limits_of
-from evaluation.sequential import gsprt_llr
+from evaluation.gating.gate import decision_bounds
+from evaluation.statistics.sequential import gsprt_llr
 from league.config import GateConfig
 
 OPEN, REJECTED, PROMOTED = 0, 1, 2
@@ -31,7 +31,7 @@ class Boundary:
     tables: Sequence[NDArray[np.int8]]
 
     def states(self, blocks: int, won: NDArray[np.int64], lost: NDArray[np.int64]) -> NDArray[np.int8]:
-        """Of tests with these counts after so many blocks."""
+        """The states of tests with these counts after this number of blocks."""
         (first, second), table = self.corners[blocks - 1], self.tables[blocks - 1]
         row, column = won - first, lost - second
         inside = (row >= 0) & (column >= 0) & (row < table.shape[0]) & (column < table.shape[1])
@@ -41,11 +41,11 @@ class Boundary:
 
 
 def boundary(settings: GateConfig, shares: Sequence[Floats]) -> Boundary:
-    """Ask the gate for every state that walks by any of these shares (lost, shared, won) can be in.
+    """Evaluate the gate for each state that walks with any of these probabilities (lost, shared, won) can reach.
 
-    A state counts as reachable if the chance to get there, unstopped, is above 1e-12 by one of the shares.
+    A state counts as reachable if the probability of reaching it, without stopping, is above 1e-12 for one of them.
     """
-    lower, upper = limits_of(settings)
+    lower, upper = decision_bounds(settings)
     assert settings.model != "returns"
     corner, mass = (0, 0), [np.ones((1, 1)) for _ in shares]
     corners, tables = [], []
@@ -53,7 +53,7 @@ def boundary(settings: GateConfig, shares: Sequence[Floats]) -> Boundary:
         mass = [_step(each, p) for each, p in zip(mass, shares, strict=True)]
         reachable = np.max(mass, axis=0) > 1e-12
         if not reachable.any():
-            break  # every test has ended before
+            break  # all tests have ended
         corner, reachable, mass = _trimmed(corner, reachable, mass)
         won, lost = (axis + start for axis, start in zip(np.nonzero(reachable), corner, strict=True))
         counts = np.zeros((len(won), 5))
@@ -68,7 +68,7 @@ def boundary(settings: GateConfig, shares: Sequence[Floats]) -> Boundary:
 
 
 def chance(ends: Boundary, shares: Floats) -> float:
-    """Of being promoted, exactly, for a challenger whose blocks have these shares (lost, shared, won)."""
+    """The exact probability of promotion for a challenger whose blocks have these probabilities (lost, shared, won)."""
     corner, mass, promoted = (0, 0), np.ones((1, 1)), 0.0
     for table, (first, second) in zip(ends.tables, ends.corners, strict=True):
         mass = _step(mass, shares)
@@ -82,7 +82,7 @@ def chance(ends: Boundary, shares: Floats) -> float:
 def walk(
     settings: GateConfig, ends: Boundary, shares: Floats, gates: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Simulate tests: which were promoted, and after how many blocks each ended."""
+    """Simulate tests: which ones were promoted, and after how many blocks each ended."""
     won, lost = np.zeros(gates, dtype=np.int64), np.zeros(gates, dtype=np.int64)
     promoted, length = np.zeros(gates, dtype=bool), np.full(gates, settings.max_blocks)
     running = np.arange(gates)
@@ -100,7 +100,7 @@ def walk(
 
 
 def _step(mass: Floats, shares: Floats) -> Floats:
-    """One block more: by (won, lost)."""
+    """Add one block; (won, lost)."""
     grown = np.zeros((mass.shape[0] + 1, mass.shape[1] + 1))
     grown[:-1, :-1] = shares[1] * mass
     grown[:-1, 1:] += shares[0] * mass
@@ -117,7 +117,7 @@ def _trimmed(
 
 
 def _window(mass: Floats, offset: tuple[int, int], shape: tuple[int, ...]) -> Floats:
-    """The part of `mass` from `offset` on, of `shape`; zero beyond it."""
+    """The part of `mass` from `offset` on with `shape`; zero outside of it."""
     cut = np.zeros(shape)
     part = mass[offset[0] : offset[0] + shape[0], offset[1] : offset[1] + shape[1]]
     cut[: part.shape[0], : part.shape[1]] = part

@@ -1,4 +1,4 @@
-"""Clients that behave badly: they connect and say nothing, or send so slowly that they are never done."""
+"""Misbehaving clients: they connect and send nothing, or so slowly that they never finish."""
 
 import asyncio
 import threading
@@ -8,21 +8,21 @@ from itertools import cycle
 from urllib.parse import urlsplit
 
 PAUSE = 0.2
-"""Seconds between two bytes of one that dribbles."""
+"""Seconds between two bytes of a slow client."""
 KINDS = ("silent", "in the head", "in the body", "half a head")
 
 
 @contextmanager
 def slow_clients(url: str, request: bytes, count: int) -> Iterator[None]:
-    """Hold so many connections while the context lasts; one that the server closes is opened again.
+    """Hold this number of connections while the context lasts; closed ones are reopened.
 
-    request: the bytes of a good request, of which they never send the whole. In equal parts they are silent, dribble in
-    the head, dribble in the body, or stop in the middle of the head.
+    request: a valid request that is never sent completely. In equal parts the clients send nothing, send the header
+    slowly, send the body slowly, or stop within the header.
     """
-    begun, stop = threading.Event(), threading.Event()
-    thread = threading.Thread(target=lambda: asyncio.run(_hold(url, request, count, begun, stop)))
+    started, stop = threading.Event(), threading.Event()
+    thread = threading.Thread(target=lambda: asyncio.run(_hold(url, request, count, started, stop)))
     thread.start()
-    begun.wait()
+    started.wait()
     try:
         yield
     finally:
@@ -30,11 +30,11 @@ def slow_clients(url: str, request: bytes, count: int) -> Iterator[None]:
         thread.join()
 
 
-async def _hold(url: str, request: bytes, count: int, begun: threading.Event, stop: threading.Event) -> None:
+async def _hold(url: str, request: bytes, count: int, started: threading.Event, stop: threading.Event) -> None:
     kinds = cycle(KINDS)
-    tasks = [asyncio.create_task(_again_and_again(url, request, next(kinds), stop)) for _ in range(count)]
+    tasks = [asyncio.create_task(_reconnect(url, request, next(kinds), stop)) for _ in range(count)]
     await asyncio.sleep(PAUSE)
-    begun.set()
+    started.set()
     while not stop.is_set():
         await asyncio.sleep(PAUSE)
     for task in tasks:
@@ -42,7 +42,7 @@ async def _hold(url: str, request: bytes, count: int, begun: threading.Event, st
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _again_and_again(url: str, request: bytes, kind: str, stop: threading.Event) -> None:
+async def _reconnect(url: str, request: bytes, kind: str, stop: threading.Event) -> None:
     while not stop.is_set():
         with suppress(OSError, asyncio.IncompleteReadError):
             async with _connected(url) as (reader, writer):
@@ -61,7 +61,7 @@ async def _connected(url: str) -> AsyncIterator[tuple[asyncio.StreamReader, asyn
 
 
 async def _misbehave(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, request: bytes, kind: str) -> None:
-    """Until the server closes the connection."""
+    """Send slowly until the server closes the connection."""
     body = request.index(b"\r\n\r\n") + 4
     at = {"silent": 0, "in the head": 10, "in the body": body + 5, "half a head": body // 2}[kind]
     writer.write(request[:at])

@@ -1,9 +1,10 @@
-"""Bare stepping, without a network: our lockstep copies against the stock environments, all with random legal actions.
+"""Stepping without a network: our lockstep environments compared with the unmodified ones, all with random legal
+actions.
 
-The stock environment is PettingZoo's `env()` or `parallel_env()` as users get it, in PettingZoo's own loop; its resets
-take no seed, which spares it some work, while each of ours has one. For pistonball it is SuperSuit's stack on the bare
-parallel environment, without the checking wrappers. Rates are environment steps per second (moves, in a game of turns)
-on one core; the two take turns within a round, and a rate is the median over the rounds.
+The unmodified environment is PettingZoo's `env()` or `parallel_env()`, in PettingZoo's loop; its resets have no seed,
+which saves some work, while each of ours has one. For pistonball it is SuperSuit's stack on the raw parallel
+environment, without the checking wrappers. Rates are environment steps per second (moves, in a turn-based game) on one
+core; the two alternate within a round, and a rate is the median over the rounds.
 """
 
 import argparse
@@ -28,13 +29,13 @@ from pettingzoo.butterfly.pistonball import pistonball
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
-from league.config import EnvironmentConfig
+from league.environment_config import EnvironmentConfig
 from league.environments.lockstep import stepping
-from league.environments.stepping import Batch, Episode
+from league.environments.stepping import Batch, EpisodeStart
 from league.spaces import ACTION_MASK
 
-DRAWN = {"render_mode": "rgb_array"}
-"""Without it, pistonball draws nothing, and all its observations are the same."""
+RENDERED = {"render_mode": "rgb_array"}
+"""Without it, pistonball renders nothing, and all its observations are the same."""
 STACK = [
     {"color_reduction_v0": {"mode": "B"}},
     {"resize_v1": {"x_size": 84, "y_size": 84}},
@@ -44,10 +45,10 @@ STACK = [
 
 @dataclass(frozen=True)
 class Case:
-    """One environment. stock: steps the stock environment for ever, yielding at each step."""
+    """One environment. stock: steps the unmodified environment endlessly, yielding at each step."""
 
     config: EnvironmentConfig
-    copies: int
+    num_envs: int
     stock: Callable[[], Iterator[None]]
     target: float
 
@@ -55,7 +56,7 @@ class Case:
 def main() -> int:
     """Print rates and ratios; 1 if a ratio is below its target."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="shorter measurements, for a look")
+    parser.add_argument("--quick", action="store_true", help="shorter measurements")
     quick = parser.parse_args().quick
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
@@ -71,13 +72,13 @@ def main() -> int:
 
 
 def measure(case: Case, rounds: int, seconds: float) -> tuple[float, float]:
-    """Steps per second, ours and the stock environment's."""
-    ours, stock = lockstep(case.config, case.copies), case.stock()
+    """Steps per second of our and of the unmodified environment."""
+    ours, stock = lockstep(case.config, case.num_envs), case.stock()
     rates: tuple[list[float], list[float]] = ([], [])
     for _ in range(rounds + 1):
-        for found, steps, each in zip(rates, (ours, stock), (case.copies, 1), strict=True):
+        for found, steps, each in zip(rates, (ours, stock), (case.num_envs, 1), strict=True):
             found.append(each * rate(steps, seconds))
-    return statistics.median(rates[0][1:]), statistics.median(rates[1][1:])  # the first round warms up
+    return statistics.median(rates[0][1:]), statistics.median(rates[1][1:])  # the first round is a warm-up
 
 
 def rate(steps: Iterator[None], seconds: float) -> float:
@@ -89,10 +90,10 @@ def rate(steps: Iterator[None], seconds: float) -> float:
     return taken / elapsed
 
 
-def lockstep(config: EnvironmentConfig, copies: int) -> Iterator[None]:
-    """All copies, one step in each at a time."""
-    env, seeds, rng = stepping(config, copies), itertools.count(), np.random.default_rng(0)
-    turn = env.start(lambda _: Episode(next(seeds), ("all",) * len(env.agents)))
+def lockstep(config: EnvironmentConfig, num_envs: int) -> Iterator[None]:
+    """All environments, one step in each at a time."""
+    env, seeds, rng = stepping(config, num_envs), itertools.count(), np.random.default_rng(0)
+    turn = env.start(lambda _: EpisodeStart(next(seeds), ("all",) * len(env.agents)))
     space = DRAWS[config.entry_point]
     while True:
         turn = env.step({group: space(batch, rng) for group, batch in turn.batches.items()})
@@ -105,8 +106,8 @@ def masked(batch: Batch, rng: np.random.Generator) -> Any:
     return (rng.random(mask.shape) * (mask != 0)).argmax(axis=1)
 
 
-def turns(env: Any) -> Iterator[None]:
-    """PettingZoo's loop over a game with masks."""
+def aec_loop(env: Any) -> Iterator[None]:
+    """PettingZoo's loop for a game with masks."""
     while True:
         env.reset()
         for _ in env.agent_iter():
@@ -118,8 +119,8 @@ def turns(env: Any) -> Iterator[None]:
             yield
 
 
-def together(env: Any, act: Callable[[], Any]) -> Iterator[None]:
-    """PettingZoo's loop over an environment in which all act at once."""
+def parallel_loop(env: Any, act: Callable[[], Any]) -> Iterator[None]:
+    """PettingZoo's loop for an environment in which all agents act at once."""
     while True:
         env.reset()
         while env.agents:
@@ -128,20 +129,20 @@ def together(env: Any, act: Callable[[], Any]) -> Iterator[None]:
 
 
 def stock_pistonball() -> Iterator[None]:
-    """SuperSuit's stack on the bare parallel environment."""
-    env = aec_to_parallel_wrapper(pistonball.raw_env(**DRAWN))
+    """SuperSuit's stack on the raw parallel environment."""
+    env = aec_to_parallel_wrapper(pistonball.raw_env(**RENDERED))
     for wrapper in STACK:
         for name, arguments in wrapper.items():
             env = getattr(supersuit, name)(env, **arguments)
     rng = np.random.default_rng(0)
-    return together(env, lambda: rng.uniform(-1, 1, 1).astype(np.float32))
+    return parallel_loop(env, lambda: rng.uniform(-1, 1, 1).astype(np.float32))
 
 
 DRAWS: dict[str, Callable[[Batch, np.random.Generator], Any]] = {
-    "mpe2.simple_spread_v3": lambda batch, rng: rng.integers(5, size=len(batch.copies)),
+    "mpe2.simple_spread_v3": lambda batch, rng: rng.integers(5, size=len(batch.envs)),
     "pettingzoo.classic.connect_four_v3": masked,
     "pettingzoo.classic.leduc_holdem_v4": masked,
-    "pettingzoo.butterfly.pistonball_v6": lambda batch, rng: rng.uniform(-1, 1, (len(batch.copies), 1)).astype(
+    "pettingzoo.butterfly.pistonball_v6": lambda batch, rng: rng.uniform(-1, 1, (len(batch.envs), 1)).astype(
         np.float32
     ),
 }
@@ -149,24 +150,24 @@ CASES = {
     "simple_spread": Case(
         EnvironmentConfig(entry_point="mpe2.simple_spread_v3"),
         32,
-        lambda: together(simple_spread_v3.parallel_env(), lambda: random.randrange(5)),
+        lambda: parallel_loop(simple_spread_v3.parallel_env(), lambda: random.randrange(5)),
         1.2,
     ),
     "connect_four": Case(
         EnvironmentConfig(entry_point="pettingzoo.classic.connect_four_v3"),
         32,
-        lambda: turns(connect_four_v3.env()),
+        lambda: aec_loop(connect_four_v3.env()),
         1.5,
     ),
     "leduc_holdem": Case(
         EnvironmentConfig(entry_point="pettingzoo.classic.leduc_holdem_v4"),
         32,
-        lambda: turns(leduc_holdem_v4.env()),
+        lambda: aec_loop(leduc_holdem_v4.env()),
         1.2,
     ),
     "pistonball with its wrappers": Case(
         EnvironmentConfig.model_validate(
-            {"entry_point": "pettingzoo.butterfly.pistonball_v6", "kwargs": DRAWN, "wrappers": STACK}
+            {"entry_point": "pettingzoo.butterfly.pistonball_v6", "kwargs": RENDERED, "wrappers": STACK}
         ),
         4,
         stock_pistonball,

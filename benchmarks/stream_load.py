@@ -1,7 +1,8 @@
-"""A lean WebSocket load generator: raw sockets, one message in flight per stream, as benchmarks.load is for HTTP.
+"""A lightweight WebSocket load generator: raw sockets, one message in flight per stream, like benchmarks.load for HTTP.
 
 `python -m benchmarks.stream_load URL --streams 16 --seconds 5 < message` prints one line of JSON (a `StreamLoad`).
-Frames are masked with zeros, which RFC 6455 allows and which costs the client nothing; the server unmasks all the same.
+Frames are masked with zeros, which RFC 6455 allows and which costs the client nothing; the server must unmask them
+nevertheless.
 """
 
 import argparse
@@ -29,22 +30,22 @@ HANDSHAKE = (
 
 @dataclass(frozen=True, slots=True)
 class StreamLoad:
-    """What one run saw. Latencies in milliseconds; `refused` counts answers that are not of the message's kind."""
+    """The results of one run. Latencies in milliseconds; `failures` counts answers of another kind than the message."""
 
     messages: int
     seconds: float
-    refused: int
+    failures: int
     p50: float
     p99: float
 
     @property
     def rate(self) -> float:
         """Answers per second."""
-        return (self.messages - self.refused) / self.seconds
+        return (self.messages - self.failures) / self.seconds
 
 
 class StreamConnection(asyncio.Protocol):
-    """Sends `frame` again as soon as its answer is whole; `on_answer` takes the opcode and when it was sent."""
+    """Sends `frame` again as soon as its answer is complete; `on_answer` takes the opcode and the time of sending."""
 
     def __init__(self, handshake: bytes, frame: bytes, on_answer: Callable[[int, float], bool]) -> None:
         self.handshake = handshake
@@ -70,12 +71,12 @@ class StreamConnection(asyncio.Protocol):
             self.is_open, self.received = True, self.received[end + 4 :]
             self.send()
             return
-        size = whole(self.received)
+        size = frame_length(self.received)
         if size is None or len(self.received) < size:
             return
         opcode, self.received = self.received[0] & 0x0F, self.received[size:]
         if opcode not in (TEXT, BINARY):
-            return  # a ping may go unanswered for as long as this runs
+            return  # a short run need not answer pings
         if self.on_answer(opcode, self.sent_at):
             self.send()
         else:
@@ -89,8 +90,8 @@ class StreamConnection(asyncio.Protocol):
         self.closed.set_result(error)
 
 
-def whole(data: bytes) -> int | None:
-    """Bytes of the frame that `data` begins with; None if its head has not arrived."""
+def frame_length(data: bytes) -> int | None:
+    """Length of the frame at the start of `data`; None if its header has not arrived."""
     if len(data) < 2:
         return None
     length = data[1] & 0x7F
@@ -100,8 +101,8 @@ def whole(data: bytes) -> int | None:
     return None if len(data) < head else head + int(struct.unpack_from(form, data, 2)[0])
 
 
-def framed(message: bytes, opcode: int) -> bytes:
-    """A message as a client's frame."""
+def frame_of(message: bytes, opcode: int) -> bytes:
+    """A message as a client frame."""
     head = bytes([FINAL | opcode])
     if len(message) < 126:
         head += bytes([MASKED | len(message)])
@@ -113,20 +114,20 @@ def framed(message: bytes, opcode: int) -> bytes:
 
 
 async def run(url: str, message: bytes, is_text: bool, streams: int, seconds: float, warm_up: float) -> StreamLoad:
-    """Load `url` for `warm_up + seconds`; the warm-up is not counted. A stream that ends early is a fault."""
+    """Load `url` for `warm_up + seconds`; the warm-up is not counted. A stream that ends early is an error."""
     parts = urlsplit(url)
     handshake = HANDSHAKE.format(path=f"{parts.path}?{parts.query}", host=parts.netloc).encode()
     opcode = TEXT if is_text else BINARY
-    frame, latencies, refused = framed(message, opcode), list[float](), 0
+    frame, latencies, failures = frame_of(message, opcode), list[float](), 0
     start = time.perf_counter() + warm_up
     stop = start + seconds
 
     def on_answer(answered: int, sent_at: float) -> bool:
-        nonlocal refused
+        nonlocal failures
         now = time.perf_counter()
         if start <= now <= stop:
             latencies.append(now - sent_at)
-            refused += answered != opcode
+            failures += answered != opcode
         return now < stop
 
     loop = asyncio.get_running_loop()
@@ -142,13 +143,13 @@ async def run(url: str, message: bytes, is_text: bool, streams: int, seconds: fl
     if time.perf_counter() < stop:
         raise RuntimeError("the server ended the streams")
     p50, p99 = np.percentile(np.array(latencies or [np.nan]) * 1e3, [50, 99])
-    return StreamLoad(len(latencies), seconds, refused, float(p50), float(p99))
+    return StreamLoad(len(latencies), seconds, failures, float(p50), float(p99))
 
 
 def measure(
     url: str, message: bytes, *, is_text: bool, streams: int, seconds: float, warm_up: float = 1.0
 ) -> StreamLoad:
-    """Run the generator in a process of its own."""
+    """Run the generator in a subprocess."""
     command = [sys.executable, "-m", "benchmarks.stream_load", url, "--streams", str(streams)]
     command += ["--seconds", str(seconds), "--warm-up", str(warm_up), *(["--text"] if is_text else [])]
     done = subprocess.run(command, input=message, stdout=subprocess.PIPE, check=True)

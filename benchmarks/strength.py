@@ -1,7 +1,7 @@
-"""How strong is a version? Greedy, with random openings, both seats alike, against `random` and `one_ply`.
+"""How strong is a version? Greedy, with random openings, on both sides equally, against `random` and `one_ply`.
 
-Plays the champion of LEAGUE_HOME's connect_four, or the version that is named. A draw is no win. The bound is the lower
-end of Wilson's two-sided 95 % interval of the share won. Nothing is written to the ledger.
+Plays the champion of connect_four in LEAGUE_HOME, or the given version. A draw is not a win. The bound is the lower
+limit of Wilson's two-sided 95 % interval of the fraction of wins. Nothing is written to the ledger.
 """
 
 import argparse
@@ -9,24 +9,23 @@ import sys
 
 from scipy.stats import binomtest
 
-from evaluation.contestants import baselines
-from evaluation.player import Player
-from evaluation.schedule import round_robin
+from evaluation.matches.worker import MatchWorker, baselines
+from evaluation.schedules.builders import round_robin
 from league.errors import LeagueError
-from league.policies.pinning import pinned
+from league.policies.loading import pinned
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 
 TARGETS = {"script:random": {"demo": 0.95, "full": 0.98}, "script:one_ply": {"full": 0.55}}
-"""opponent → configuration → what the lower bound is held to"""
+"""opponent → configuration → target of the lower bound"""
 
 
 def main() -> int:
-    """Print shares and bounds beside their targets; 1 if one that was asked for is missed."""
+    """Print fractions and bounds with their targets; 1 if a requested one is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ref", nargs="?", default="connect_four@champion", help="default: %(default)s")
     parser.add_argument("--games", type=int, default=2000, help="against each opponent; default: %(default)s")
-    parser.add_argument("--quick", action="store_true", help="a tenth of the games, for a look")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the games")
     parser.add_argument("--hold", choices=("demo", "full"), default="demo", help="which targets must be met")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -38,22 +37,22 @@ def main() -> int:
         return 2
 
 
-def _measure(ref: str, games: int, seed: int, held: str) -> bool:
+def _measure(ref: str, games: int, seed: int, target_set: str) -> bool:
     registry = Registry.open()
     league = CheckpointRef.parse(ref).league
-    row = registry.league(league)
+    row = registry.leagues.get(league)
     version = pinned(ref, league, registry)
-    player = Player(row.config, registry)
+    player = MatchWorker(row.config, registry)
     print(f"{version}, greedy, {games} games each, {row.config.play.opening_plies} random opening plies")
     met = True
     for opponent in baselines(row.interface):
         schedule = round_robin(row.config, row.interface, [version, opponent], games // 2, seed)
         points = [game.scores[0] for match in player.play(schedule, range(schedule.length)) for game in match.games]
-        met &= _report(opponent, points, held)
+        met &= _report(opponent, points, target_set)
     return met
 
 
-def _report(opponent: str, points: list[float], held: str) -> bool:
+def _report(opponent: str, points: list[float], target_set: str) -> bool:
     won, drawn = points.count(1.0), points.count(0.5)
     low = binomtest(won, len(points)).proportion_ci(0.95, "wilson").low
     print(
@@ -63,7 +62,7 @@ def _report(opponent: str, points: list[float], held: str) -> bool:
     for configuration, target in TARGETS[opponent].items():
         verdict = "met" if low >= target else "missed"
         print(f"  bound / target of the {configuration} configuration ({target:.0%}): {low / target:.3f}, {verdict}")
-    target = TARGETS[opponent].get(held)
+    target = TARGETS[opponent].get(target_set)
     return target is None or low >= target
 
 

@@ -1,4 +1,4 @@
-"""The ablation of `benchmarks.learning`: a truncated agent's last observation is worth nothing, as in RLlib."""
+"""The ablation of `benchmarks.learning`: the last observation of a truncated agent has no value, as in RLlib."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,12 @@ from training.learners.train_batch import Chunks
 
 
 def as_rllib(algorithm: Algorithm) -> None:
-    """RLlib 2.60 flags agents that are truncated together as terminated (`multi_agent_episode.py`): the learner of
-    this process then bootstraps only where a chunk was cut."""
+    """RLlib 2.60 flags agents that are truncated together as terminated (`multi_agent_episode.py`): the learner of this
+    process then bootstraps only where a chunk was cut.
+    """
     algorithm.learner_group._learner.bootstraps = unless_done
 
 
 def unless_done(chunks: Chunks) -> NDArray:
-    """Whether each chunk's episode goes on."""
+    """Whether the episode of each chunk continues."""
     return np.array([not chunk.is_done for chunk in chunks])

@@ -1,4 +1,4 @@
-"""The two-step game by QMIX, VDN and independent Q-learning: what each returns, and takes joint actions for."""
+"""The two-step game by QMIX, VDN and independent Q-learning: returns and learned joint values."""
 
 import time
 from dataclasses import dataclass
@@ -9,24 +9,25 @@ import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from benchmarks.learned import greedy_returns, local_ray, one_thread, told, two_at_once
+from benchmarks.learned import greedy_returns, local_ray, one_thread, report_target, two_at_once
 from examples.two_step import ACTIONS, AGENTS, STATES, values
 from league.config import LeagueConfig
 from league.environments.building import interface
-from training.trial import build
+from training.runs.trial import build_algorithm
 
 CONFIG = Path(__file__).parent.parent / "configs" / "two_step_game.yaml"
-SEEDS, MOST_SECONDS, NEAR = 20, 60.0, 0.1
+SEEDS, MAX_SECONDS, NEAR = 20, 60.0, 0.1
 RETURNS = {"qmix": 8.0, "vdn": 7.0, "none": 7.0}
-"""Of greedy play: QMIX finds the best, and the others cannot."""
+"""Of greedy play: QMIX finds the optimum, the others cannot."""
 EPISODES = 4
-"""As many alike: nothing in the game is random."""
+"""All are identical: nothing in the game is random."""
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
-    """returned: per agent and episode, greedily. joint: (3, 2, 2) the team's value of each pair of actions in each
-    state; the mean of both agents' own values where they are not mixed. seconds: of the processor, for training."""
+class LearningResult:
+    """returned: greedy return per agent and episode. joint: (3, 2, 2) the team's value of each pair of actions in each
+    state; without mixing, the mean of both agents' values. seconds: CPU time of training.
+    """
 
     returned: float
     joint: NDArray
@@ -37,27 +38,27 @@ class Learned:
         return float(np.abs(self.joint - values(gamma)).max())
 
 
-def learn(mixer: str, seed: int, **settings: object) -> Learned:
-    """Train by the shipped configuration, in this process."""
+def learn(mixer: str, seed: int, **settings: object) -> LearningResult:
+    """Train with the shipped configuration, in this process."""
     league = LeagueConfig.load(CONFIG).with_training(mixer=mixer, seed=seed, **settings)
-    algorithm = build(league, interface(league))
+    algorithm = build_algorithm(league, interface(league))
     try:
         began = time.process_time()
         while algorithm.steps < league.training.steps:
             algorithm.train()
         seconds = time.process_time() - began
         returned = greedy_returns(algorithm, EPISODES).mean()
-        return Learned(float(returned), joint_values(algorithm), seconds)
+        return LearningResult(float(returned), joint_values(algorithm), seconds)
     finally:
         algorithm.stop()
 
 
 @torch.no_grad()
 def joint_values(algorithm: Algorithm) -> NDArray:
-    """(3, 2, 2) what the learner takes each pair of actions for, in each state."""
+    """(3, 2, 2) the learned value of each pair of actions in each state."""
     learner = algorithm.learner_group._learner
-    states, who = torch.eye(STATES), torch.eye(len(AGENTS))
-    seen = [torch.cat([states, who[i].expand(STATES, -1)], dim=1) for i in range(len(AGENTS))]
+    states, agents = torch.eye(STATES), torch.eye(len(AGENTS))
+    seen = [torch.cat([states, agents[i].expand(STATES, -1)], dim=1) for i in range(len(AGENTS))]
     first, second = (learner.module["shared"].values({"observation": rows}) for rows in seen)
     mixer = learner.mixer(learner.networks, "team")
     pairs = [(a, b) for a in range(ACTIONS) for b in range(ACTIONS)]
@@ -65,15 +66,15 @@ def joint_values(algorithm: Algorithm) -> NDArray:
     return torch.stack(mixed, dim=1).reshape(STATES, ACTIONS, ACTIONS).numpy()
 
 
-def work(job: tuple[str, int]) -> Learned:
-    """On this process's one core."""
+def work(job: tuple[str, int]) -> LearningResult:
+    """Learn on the single core of this process."""
     one_thread()
     with local_ray(cpus=1):
         return learn(*job)
 
 
 def two_step_game(scale: float) -> bool:
-    """Twenty seeds of each way to mix."""
+    """Twenty seeds of each mixer."""
     seeds = range(max(1, round(SEEDS * scale)))
     gamma = LeagueConfig.load(CONFIG).training.gamma
     jobs = [(mixer, seed) for mixer in RETURNS for seed in seeds]
@@ -91,8 +92,10 @@ def two_step_game(scale: float) -> bool:
     print(f"largest error of the {STATES * ACTIONS**2} values by QMIX: {worst:.2g}; slowest seed: {slowest:.1f} s")
     return all(
         [
-            told("QMIX returns 8, VDN and none 7", "all seeds", all(count == len(seeds) for count in reached.values())),
-            told("largest error of a value by QMIX", f"below {NEAR:g}", worst < NEAR),
-            told("a seed on one core", f"at most {MOST_SECONDS:g} s", slowest <= MOST_SECONDS),
+            report_target(
+                "QMIX returns 8, VDN and none 7", "all seeds", all(count == len(seeds) for count in reached.values())
+            ),
+            report_target("largest error of a value by QMIX", f"below {NEAR:g}", worst < NEAR),
+            report_target("a seed on one core", f"at most {MAX_SECONDS:g} s", slowest <= MAX_SECONDS),
         ]
     )

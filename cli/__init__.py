@@ -1,1 +1,1 @@
-"""The `league` command: parses, calls one function, prints."""
+"""The `league` command line interface. Each command parses its arguments, calls one function and prints the result."""

@@ -1,106 +1,130 @@
-"""`league demo`: the whole loop once, on connect four, told as it goes."""
+"""`league demo`: train, evaluate, promote and serve Connect Four, with explanations."""
 
 import signal
 import threading
 from contextlib import closing
-from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.rule import Rule
 
-from cli.board import drawing
+from cli.options import open_registry
 from cli.output import console, say
-from league.config import LeagueConfig
+from configs import find
 from league.settings import Storage
 
-LEAGUE = Path("configs/connect_four.yaml")
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from league.config import LeagueConfig
+
+LEAGUE = "connect_four"
 OPPONENT = "script:one_ply"
 VERSIONS = 4
-"""How many a demo publishes, whatever the machine's speed."""
+"""Number of versions that the demo publishes, regardless of the speed of the machine."""
+MARKS = ("●", "○")
+EMPTY = "·"
 
 
 def demo(
-    minutes: Annotated[float, typer.Option(help="How long to train.")] = 4.0,
-    port: Annotated[int, typer.Option(help="Serve on this port of 127.0.0.1.")] = 8000,
-    exit_: Annotated[bool, typer.Option("--exit", help="End after the game instead of serving on.")] = False,
+    minutes: Annotated[float, typer.Option(help="Training time in minutes.")] = 4.0,
+    port: Annotated[int, typer.Option(help="HTTP port of the server on 127.0.0.1.")] = 8000,
+    exit_: Annotated[bool, typer.Option("--exit", help="Exit after the game instead of serving until Ctrl-C.")] = False,
 ) -> None:
-    """Train connect four for a few minutes, play the league, promote, serve, and play a game against the champion.
+    """Train, evaluate and serve Connect Four, then play a game against it.
 
-    Everything is kept in LEAGUE_HOME, so that the other commands can go on from there.
+    The results are stored in LEAGUE_HOME and can be used with all other commands.
     """
-    from serve_app.launch import running
+    from league.config import LeagueConfig
+    from serve_app.runtime.launch import running
 
     storage = Storage.from_environment()
     storage.export()
-    config = LeagueConfig.load(LEAGUE)
-    say("Policy League demo: connect four, from self-play to a champion that answers over HTTP.")
-    say(f"Everything is kept in {storage.home}.")
+    config = LeagueConfig.load(find(LEAGUE))
+    say("Policy League demo: Connect Four, from self-play training to a champion served over HTTP.")
+    say(f"Data is stored in {storage.home}.")
     _train(config, minutes)
-    _hold_league(config)
-    _step(3, f"serve: the champion becomes an action endpoint on 127.0.0.1:{port}, in Ray Serve behind HAProxy.")
+    _evaluate(config)
+    _step(3, f"Serve: Ray Serve and HAProxy serve the champion on 127.0.0.1:{port}.")
     with running(storage, port=port) as url:
         _play(config, url)
-        _invite(config.league, url)
-        if not exit_:
+        if exit_:
+            _show_next_steps(config.league, url, f"`league serve --port {port}` starts the server again.")
+        else:
+            _show_next_steps(config.league, url)
             say("Serving until Ctrl-C.")
             _wait_for_interrupt()
             say("\nStopping.")
 
 
-def _train(config: LeagueConfig, minutes: float) -> None:
-    from league.registry.registry import Registry
-    from training.run import train
+def _train(config: "LeagueConfig", minutes: float) -> None:
+    from training.runs.train import train
 
-    _step(1, f"train: a network plays against itself for {minutes:g} minutes (masked PPO, RLlib, Ray Tune).")
-    say("At each checkpoint it is exported to ONNX, proven to act the same, and published as a version.")
+    _step(1, f"Train: self-play for {minutes:g} minutes (masked PPO, RLlib, Ray Tune).")
+    say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
     paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS, checkpoint_every=None)
-    train(paced, registry=Registry.open(), config_path=LEAGUE, console=console)
+    train(paced, registry=open_registry(), config_path=find(LEAGUE), console=console)
 
 
-def _hold_league(config: LeagueConfig) -> None:
-    from cli.nightly import hold_night
+def _evaluate(config: "LeagueConfig") -> None:
+    from cli.nightly import run_nightly
 
-    _step(2, "the league: each new version challenges the champion, in pairs of games with the seats swapped.")
-    say("A sequential test (GSPRT) plays until it knows: promote, reject, or undecided.")
-    hold_night(config, workers=0)
+    _step(2, "Evaluate: each new version plays the champion in pairs of games with sides swapped.")
+    say("A sequential test (GSPRT) decides when to stop: promote, reject or undecided.")
+    run_nightly(config, workers=0)
 
 
-def _play(config: LeagueConfig, url: str) -> None:
-    from evaluation.exhibition import exhibit
+def _play(config: "LeagueConfig", url: str) -> None:
+    from evaluation.playback.single_game import play_game
     from league.environments.lockstep import stepping
     from league.policies.remote import RemotePolicy
     from league.policies.scripted import script
     from league.refs import ScriptRef
-    from league.registry.registry import Registry
 
-    _step(4, f"a game over HTTP: the champion ● moves first, {OPPONENT} ○ answers.")
-    interface = Registry.open().league(config.league).interface
+    _step(4, f"Play a game over HTTP: the champion ● moves first against {OPPONENT} ○.")
+    interface = open_registry().leagues.get(config.league).interface
     first, second = interface.agents
     spaces = interface.agents[second]
     opponent = script(ScriptRef.parse(OPPONENT).name, spaces.observation, spaces.action)
-    environment = stepping(config.environment, copies=1)
+    environment = stepping(config.environment, num_envs=1)
     with closing(environment), RemotePolicy(url, config.league) as champion:
-        moments = list(exhibit(environment, {first: champion, second: opponent}, seed=config.training.seed))
-    moves = [move for moment in moments for move in moment.moves]
-    board = next(drawing(e.observation["observation"]) for e in moments[-1].endings if e.agent == 0)
-    outcome = moments[-1].returns[first]
+        steps = list(play_game(environment, {first: champion, second: opponent}, seed=config.training.seed))
+    moves = [move for step in steps for move in step.moves]
+    board = next(drawing(e.observation["observation"]) for e in steps[-1].endings if e.agent == 0)
+    outcome = steps[-1].returns[first]
     say(f"\n{board}\n")
     say("Moves: " + " ".join(f"{'●' if move.agent == first else '○'}{move.action}" for move in moves))
     say("The champion won." if outcome > 0 else "The champion lost." if outcome < 0 else "A draw.")
 
 
-def _invite(league: str, url: str) -> None:
+def drawing(planes: "NDArray") -> str | None:
+    """Draw a board from its planes (rows, columns, 2), ● in the first and ○ in the second; None for other shapes."""
+    import numpy as np
+
+    if planes.ndim != 3 or planes.shape[2] != 2 or not np.isin(planes, (0, 1)).all():
+        return None
+    rows = [" ".join(_mark(square) for square in row) for row in planes]
+    columns = " ".join(str(column) for column in range(planes.shape[1]))
+    return "\n".join([*rows, columns])
+
+
+def _mark(square: "NDArray") -> str:
+    return next((mark for mark, there in zip(MARKS, square, strict=True) if there), EMPTY)
+
+
+def _show_next_steps(league: str, url: str, first: str = "") -> None:
     say("")
-    console.print(Rule("what to try next", align="left"))
-    say(f"Open {url} in a browser: standings, verdicts, games to watch, and")
-    say(f"  {url}/leagues/{league}/play    to play against the champion yourself.")
+    console.print(Rule("Next steps", align="left"))
+    if first:
+        say(first)
+    say(f"Open {url} in a browser for the leaderboard, verdicts and recorded games, and")
+    say(f"  {url}/leagues/{league}/play    to play against the champion.")
     say("In another terminal, after `source .venv/bin/activate`:")
-    say(f"  league act {league}@champion            ask for an action over HTTP")
-    say(f"  league versions {league}                versions with aliases and ratings")
-    say(f"  league evaluate {league}                a round robin of all versions and scripts")
-    say(f"  league promote {league}@1               move the champion by hand; replicas follow within a second")
-    say(f"  league history {league}                 who was champion when, and why")
+    say(f"  league act {league}@champion            request an action over HTTP")
+    say(f"  league versions {league}                list versions with aliases and ratings")
+    say(f"  league evaluate {league}                play a round robin of all versions and scripts")
+    say(f"  league promote {league}@1               change the champion; replicas follow within a second")
+    say(f"  league history {league}                 show past champions and the reasons for the changes")
     say(f"  league train {LEAGUE} --from {league}@champion")
 
 

@@ -1,4 +1,4 @@
-"""`league doctor`: is this machine fit, and if not, what to do."""
+"""`league doctor`: checks of the installation, with advice on how to fix problems."""
 
 import os
 import shutil
@@ -12,18 +12,18 @@ from typing import Annotated
 import typer
 
 from cli.output import emit, say, table
-from league.errors import LeagueError
+from league.errors import LeagueError, last_line
 from league.settings import Storage
 from league.stack import VERIFIED, installed
 
 GIGABYTE = 10**9
 MINIMUM_DISK = 2 * GIGABYTE
-"""A training run keeps a few hundred MB of checkpoints, and Ray spills objects when the disk allows it."""
+"""A training run stores a few hundred MB of checkpoints, and Ray spills objects to disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding. status: `ok`, `note` (works, worth knowing) or `fail`."""
+    """Result of one check. status: `ok`, `note` (works, with a restriction) or `fail`."""
 
     what: str
     status: str
@@ -32,25 +32,29 @@ class Check:
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
 ) -> None:
-    """Hold the installed stack against the verified one and look at CPU, GPU, disk, Ray and HAProxy.
+    """Check packages, CPU, GPU, disk, registry, Ray and HAProxy.
 
-    Prints what was found and, where something is amiss, what to do. Exits 1 if anything must be mended.
+    Compares installed package versions with the tested ones. Prints how to fix each problem. Exits 1 if a check fails.
     """
     findings = [finding for check in CHECKS for finding in check()]
     if as_json:
-        emit({"ok": _fit(findings), "checks": [asdict(finding) for finding in findings]})
+        emit({"ok": _passed(findings), "checks": [asdict(finding) for finding in findings]})
     else:
         table(
-            ("", "what", "found", "what to do"),
+            ("", "check", "result", "advice"),
             [(finding.status, finding.what, finding.found, finding.advice) for finding in findings],
         )
-        say("\nThis machine is fit." if _fit(findings) else "\nMend what is marked 'fail', then run this again.")
-    raise typer.Exit(0 if _fit(findings) else 1)
+        say(
+            "\nAll checks passed."
+            if _passed(findings)
+            else "\nFix the checks marked 'fail', then run this command again."
+        )
+    raise typer.Exit(0 if _passed(findings) else 1)
 
 
-def _fit(findings: list[Check]) -> bool:
+def _passed(findings: list[Check]) -> bool:
     return all(finding.status != "fail" for finding in findings)
 
 
@@ -69,13 +73,15 @@ def _stack() -> Iterator[Check]:
         elif version.partition("+")[0] == verified:
             yield Check(package, "ok", version)
         else:
-            advice = f"verified with {verified}: pip install -c constraints.txt {package}=={verified}"
+            advice = f"tested with {verified}: pip install -c constraints.txt {package}=={verified}"
             yield Check(package, "note", version, advice)
 
 
 def _processor() -> Iterator[Check]:
     cores = os.cpu_count() or 1
-    yield Check("CPU", "ok" if cores > 1 else "note", f"{cores} cores", "" if cores > 1 else "2 or more are better")
+    yield Check(
+        "CPU", "ok" if cores > 1 else "note", f"{cores} cores", "" if cores > 1 else "2 or more are recommended"
+    )
 
 
 def _accelerator() -> Iterator[Check]:
@@ -86,7 +92,7 @@ def _accelerator() -> Iterator[Check]:
     if torch.cuda.is_available():
         yield Check("GPU", "ok", torch.cuda.get_device_name())
     else:
-        yield Check("GPU", "ok", "none: learning runs on the CPU, as serving does anyway")
+        yield Check("GPU", "ok", "none: training and serving use the CPU")
 
 
 def _home() -> Iterator[Check]:
@@ -97,7 +103,7 @@ def _home() -> Iterator[Check]:
         "LEAGUE_HOME",
         "ok" if writable else "fail",
         str(storage.home),
-        "" if writable else "not writable: set LEAGUE_HOME to a directory that is",
+        "" if writable else "set LEAGUE_HOME to a writable directory",
     )
     free = shutil.disk_usage(existing).free
     enough = free >= MINIMUM_DISK
@@ -110,21 +116,22 @@ def _registry() -> Iterator[Check]:
 
     storage = Storage.from_environment()
     if storage.database_url.startswith("sqlite") and not storage.home.exists():
-        yield Check("registry", "ok", "none yet: `league train` makes it")
+        yield Check("registry", "ok", "not created yet: `league train CONFIG` creates it")
         return
     try:
-        leagues = Registry.open(storage).leagues()
+        leagues = Registry.open(storage).leagues.all()
     except LeagueError as error:
         yield Check("registry", "fail", str(error), "check LEAGUE_HOME and LEAGUE_DATABASE_URL")
         return
-    names = ", ".join(league.slug for league in leagues) or "no league yet: `league train CONFIG`"
+    names = ", ".join(league.slug for league in leagues) or "no leagues yet: `league train CONFIG` creates one"
     yield Check("registry", "ok", names)
 
 
 RAY_PROBE = """
 import ray
-ray.init(address="local", num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
-print(ray.get(ray.remote(lambda: "answers").remote()))
+from league.ray_cluster import LocalRay, start_local
+start_local(LocalRay(cpus=1))
+print(ray.get(ray.remote(lambda: "done").remote()))
 ray.shutdown()
 """
 
@@ -132,10 +139,12 @@ ray.shutdown()
 def _ray() -> Iterator[Check]:
     try:
         probe = subprocess.run([sys.executable, "-c", RAY_PROBE], capture_output=True, text=True, timeout=120)
-        answers, fault = "answers" in probe.stdout, (probe.stderr.strip().splitlines() or ["no answer"])[-1]
+        answers, fault = "done" in probe.stdout, last_line(probe.stderr) or "no output"
     except subprocess.TimeoutExpired:
-        answers, fault = False, "no answer within 120 s"
-    advice = "" if answers else "run `ray start --head` to see why; is /dev/shm large enough, /tmp/ray writable?"
+        answers, fault = False, "no result within 120 s"
+    advice = (
+        "" if answers else "run `ray start --head` for details; check the size of /dev/shm and write access to /tmp/ray"
+    )
     yield Check("Ray", "ok" if answers else "fail", "starts and runs a task" if answers else fault, advice)
 
 
@@ -153,8 +162,8 @@ def _haproxy() -> Iterator[Check]:
 def _port() -> Iterator[Check]:
     with socket.socket() as probe:
         taken = probe.connect_ex(("127.0.0.1", 8000)) == 0
-    found = "port 8000 is taken" if taken else "port 8000 is free"
-    advice = "if that is not your policy server: `league serve --port …`" if taken else ""
+    found = "port 8000 is in use" if taken else "port 8000 is free"
+    advice = "unless this is your policy server, use `league serve --port PORT`" if taken else ""
     yield Check("serving", "note" if taken else "ok", found, advice)
 
 

@@ -1,24 +1,22 @@
 """`league evaluate`."""
 
-import os
 from collections.abc import Sequence
 from enum import Enum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.output import complain, elo, emit, say, table
-from cli.watching import difference, watched
-from evaluation.report import CrossPlay, Estimate, EvaluationReport, Population, Standing
+from cli.options import CORES, AsJson, EvaluationCluster, LeagueName, Workers, open_registry
+from cli.output import GameProgress, complain, difference, emit, say, show_leaderboard, table
 from league.refs import check_slug
-from league.registry.registry import Registry
 from league.settings import Storage
 
-CORES = os.cpu_count() or 1
+if TYPE_CHECKING:
+    from evaluation.results import CrossPlay, Estimate, EvaluationReport, Population
 
 
-class Schedule(Enum):
-    """What `league evaluate` can play."""
+class ScheduleName(Enum):
+    """Schedules of `league evaluate`."""
 
     round_robin = "round_robin"
     gauntlet = "gauntlet"
@@ -26,66 +24,68 @@ class Schedule(Enum):
     cross_play = "cross_play"
 
 
-Workers = Annotated[int, typer.Option(min=0, help="Ray tasks that play at once; 0 plays in this process.")]
-Address = Annotated[
-    str | None,
-    typer.Option(metavar="HOST:PORT", help="Play on this Ray cluster; `auto` finds the one of this machine."),
+Refs = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[REF]…", help="Contestants, such as connect_four@3. Default: all versions."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
+Schedule = Annotated[
+    ScheduleName,
+    typer.Option(
+        help="round_robin: all pairs of contestants. gauntlet: each REF against the contestants of --against. "
+        "adaptive: the matches that reduce rating uncertainty most, a quarter of the games of a round robin. "
+        "cross_play: REFs mixed within one team."
+    ),
+]
+Against = Annotated[
+    list[str] | None,
+    typer.Option(metavar="REF", help="Opponent in a gauntlet; can be repeated. Default: champion and scripts."),
+]
+Blocks = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Matches per pair. A match is two games with the same seed and swapped sides. Adaptive: a quarter of "
+        "this number on average. Default: 32, or unlimited with --games, --minutes or --precision.",
+    ),
+]
+Games = Annotated[int | None, typer.Option(min=2, help="Stop after this number of games.")]
+Minutes = Annotated[float | None, typer.Option(help="Stop after this time.")]
+Precision = Annotated[
+    float | None, typer.Option(metavar="ELO", help="Stop when the 95 % interval of each rating is within ± ELO.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Random seed. Another seed plays different games.")]
 
 
 def evaluate(
-    league: Annotated[str, typer.Argument(metavar="LEAGUE", help="The league's name, such as connect_four.")],
-    refs: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[REF]…", help="Who plays, e.g. connect_four@3. Default: all versions."),
-    ] = None,
-    schedule: Annotated[
-        Schedule,
-        typer.Option(
-            help="round_robin: everybody meets everybody. gauntlet: each REF meets those of --against. adaptive: those "
-            "meet whose order is least plain, in a quarter of the games. cross_play: REFs play together in one team."
-        ),
-    ] = Schedule.round_robin,
-    against: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="REF", help="Whom each REF meets in a gauntlet; repeat it. Default: the champion and the scripts."
-        ),
-    ] = None,
-    blocks: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Matches of each pair; a match is two games from one seed, places changed. Adaptive: a quarter of "
-            "that on average. Default: 32, or as many as --games, --minutes and --precision allow.",
-        ),
-    ] = None,
-    games: Annotated[int | None, typer.Option(min=2, help="End after this many games.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="End after this long.")] = None,
-    precision: Annotated[
-        float | None, typer.Option(metavar="ELO", help="End when each rating's 95 % interval is within ± this many.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Another one plays fresh games.")] = 0,
+    league: LeagueName,
+    refs: Refs = None,
+    schedule: Schedule = ScheduleName.round_robin,
+    against: Against = None,
+    blocks: Blocks = None,
+    games: Games = None,
+    minutes: Minutes = None,
+    precision: Precision = None,
+    seed: Seed = 0,
     workers: Workers = CORES,
-    address: Address = None,
+    address: EvaluationCluster = None,
     as_json: AsJson = False,
 ) -> None:
-    """Play a tournament and show who stands where. The scripts `random` and `one_ply` take part where they can.
+    """Play a tournament; print leaderboard and payoff matrix.
 
-    Nothing is promoted: that is what `league nightly` and `league promote` do. All matches count for the ratings, but
-    for those of cross-play. Started again, it goes on where it was.
+    The scripts `random` and `one_ply` take part where they support the environment. Nothing is promoted; use
+    `league nightly` or `league promote`. All matches except cross-play count towards the ratings. An interrupted
+    tournament continues when the command is run again.
     """
-    from evaluation.budget import Budget
-    from evaluation.cluster import cluster
-    from evaluation.tournament import evaluate as run
+    from evaluation.matches.tournament import evaluate as run
+    from evaluation.schedules.tournament_plan import Budget
+    from league.ray_cluster import ray_session
 
     Storage.from_environment().export()
-    with cluster(address), watched(quiet=as_json) as listener:
+    with ray_session(address), GameProgress(quiet=as_json) as listener:
         report = run(
             check_slug("league", league),
             refs or (),
-            registry=Registry.open(),
+            registry=open_registry(),
             schedule=schedule.value,
             against=against or (),
             blocks=blocks,
@@ -96,84 +96,60 @@ def evaluate(
         )
     if as_json:
         emit(report.to_json())
-        return
-    _show(report)
+    else:
+        _show(report)
 
 
-_ENDS = {
-    "schedule": "",
-    "games": "; the games are used up",
-    "minutes": "; cut short, as the time was up",
-    "precision": "; the ratings are precise enough",
-}
-
-
-def _show(report: EvaluationReport) -> None:
-    say(f"{report.league}: {report.games} games, {report.distinct_games} of them different{_ENDS[report.stopped_by]}\n")
+def _show(report: "EvaluationReport") -> None:
+    end = "" if report.stopped_by == "schedule" else f"; stopped by --{report.stopped_by}"
+    say(f"{report.league}: {report.games} games, {report.unique_games} unique{end}\n")
     if report.cross_play is not None:
         _show_cross_play(report.cross_play)
         return
-    show_standings(report.standings)
-    for side, standings in report.by_side.items():
+    show_leaderboard(report.leaderboard)
+    for side, leaderboard in report.by_side.items():
         say(f"\nAs {side}:")
-        show_standings(standings)
+        show_leaderboard(leaderboard)
     _show_payoff(report)
     for ref, lost in report.forfeits.items():
-        complain(f"{ref} forfeited {lost} games: it had no legal action to give")
+        complain(f"{ref} forfeited {lost} games: it returned no legal action")
     if report.population is not None:
         _show_population(report.payoff.contestants, report.population)
 
 
-def show_standings(standings: tuple[Standing, ...]) -> None:
-    """A table of who stands where."""
-    table(
-        ("contestant", "rating [95 %]", "score", "mean return", "games"),
-        [
-            (
-                standing.ref,
-                elo(standing.rating, standing.interval),
-                standing.score,
-                standing.mean_return,
-                standing.games,
-            )
-            for standing in standings
-        ],
-    )
-
-
-def _show_payoff(report: EvaluationReport) -> None:
+def _show_payoff(report: "EvaluationReport") -> None:
     payoff = report.payoff
     names = [_short(ref) for ref in payoff.contestants]
-    compared = "" if report.scoring == "game" else ", compared on the same side of the same seed"
-    say(f"\nScore of the row against the column{compared} (1 wins always, 0.5 is even):")
+    compared = "" if report.scoring == "game" else ", compared on the same side and seed"
+    say(f"\nPayoff matrix: score of the row against the column{compared} (1: wins every game, 0.5: even):")
     table(("", *names), [(name, *row) for name, row in zip(names, payoff.score, strict=True)])
     if report.scoring == "side":
-        say("\nMean return of the row minus that of the column in the same blocks [95 %]:")
+        say("\nMean return of the row minus mean return of the column in the same blocks [95 %]:")
         cells = [[None if gap is None else difference(gap) for gap in row] for row in payoff.difference]
         table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
 
 
-def _show_population(contestants: Sequence[str], shares: Population) -> None:
-    say("\nShares of a population of imitators (α-Rank), and of the equilibrium of picking whom to play (Nash) [95 %]:")
+def _show_population(contestants: Sequence[str], shares: "Population") -> None:
+    say("\nα-Rank and Nash equilibrium shares [95 %]:")
     rows = zip(contestants, map(_share, shares.alpha_rank), map(_share, shares.nash), strict=True)
     table(("contestant", "α-Rank", "Nash"), rows)
 
 
-def _share(estimate: Estimate) -> str:
+def _share(estimate: "Estimate") -> str:
     """`0.250 [0.100, 0.400]`"""
     bounds = "" if estimate.low is None or estimate.high is None else f" [{estimate.low:.3f}, {estimate.high:.3f}]"
     return f"{estimate.value:.3f}{bounds}"
 
 
-def _show_cross_play(cross: CrossPlay) -> None:
-    say("Mean return of the team [95 %]: the row plays one agent, which goes round, and the column all others:")
+def _show_cross_play(cross: "CrossPlay") -> None:
+    say("Mean return of the team [95 %]: the row plays one agent (each in turn), the column plays all others:")
     names = [_short(ref) for ref in cross.contestants]
     cells = [[_span(cell) for cell in row] for row in cross.returns]
     table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
-    say(f"\nWith itself {_span(cross.own) or '–'}, with others {_span(cross.mixed) or '–'}.")
+    say(f"\nSelf-play {_span(cross.own) or '–'}, cross-play {_span(cross.mixed) or '–'}.")
 
 
-def _span(estimate: Estimate | None) -> str | None:
+def _span(estimate: "Estimate | None") -> str | None:
     """`-21.5 [-22.1, -20.9]`"""
     if estimate is None:
         return None

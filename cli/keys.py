@@ -1,54 +1,55 @@
-"""`league keys create`, `list` and `revoke`: who may call a server."""
+"""`league keys create`, `list` and `revoke`: management of API keys."""
 
 import re
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.options import AsJson, open_registry
 from cli.output import emit, say, table
 from league.errors import InvalidInput
 from league.refs import check_slug
-from league.registry.registry import Registry
-from league.registry.rows import KeyRow
+
+if TYPE_CHECKING:
+    from league.registry.storage.rows import KeyRow
 
 app = typer.Typer(
     name="keys",
     no_args_is_help=True,
-    help="API keys: who may ask for actions, look at what is served, have games played, and change what is served.\n\n"
-    "As soon as there is one, every request needs one: replicas notice within a second.",
+    help="Create, list and revoke API keys.\n\n"
+    "A key permits action requests, reading, evaluations or promotions. As soon as one key exists, every request needs"
+    " one. Replicas apply changes within a second.",
 )
 
 DURATIONS = {"m": timedelta(minutes=1), "h": timedelta(hours=1), "d": timedelta(days=1), "w": timedelta(weeks=1)}
 PERIODS = {"s": 1, "m": 60, "h": 3600}
 
-KeyName = Annotated[str, typer.Argument(metavar="NAME", help="The key's name, which history tells as the actor.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
+KeyName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the key, recorded in histories as the actor.")]
 
 
 @app.command()
 def create(
     name: KeyName,
     scopes: Annotated[
-        list[str], typer.Option("--scope", help="What for: act, read, evaluate or promote. May be given several times.")
+        list[str], typer.Option("--scope", help="Permission: act, read, evaluate or promote. Can be repeated.")
     ],
     leagues: Annotated[
-        list[str] | None, typer.Option("--league", help="Only for this league. May be given several times.")
+        list[str] | None,
+        typer.Option("--league", help="Restrict the key to this league. Can be repeated. Default: all leagues."),
     ] = None,
     expires: Annotated[
-        str | None, typer.Option(metavar="DURATION", help="Void after this long: 90m, 12h, 30d, 4w. Default: never.")
+        str | None, typer.Option(metavar="DURATION", help="Lifetime: 90m, 12h, 30d, 4w. Default: unlimited.")
     ] = None,
-    rate: Annotated[
-        str | None, typer.Option(help="At most so many requests, at each replica: 100/s, 600/m. Default: any number.")
-    ] = None,
+    rate: Annotated[str | None, typer.Option(help="Rate limit per replica: 100/s, 600/m. Default: unlimited.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make an API key and show it, once: only its digest is kept.
+    """Create an API key and print it. It cannot be shown again, as only its digest is stored.
 
-    A caller sends it as `Authorization: Bearer plk_…`.
+    Clients send it in the header `Authorization: Bearer plk_…`.
     """
-    key, token = Registry.open().create_key(
+    key, token = open_registry().keys.create(
         name,
         scopes,
         only_leagues=[check_slug("league", league) for league in leagues or ()],
@@ -59,21 +60,21 @@ def create(
         emit(_document(key) | {"key": token})
         return
     say(token)
-    say(f"\nThis is the only time that the key {name} is shown. Send it as `Authorization: Bearer {token[:12]}_…`.")
+    say(f"\nStore the key {name} now: it is not shown again. Clients send `Authorization: Bearer {token[:12]}_…`.")
 
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """List all keys that ever were, with what they are for and whether they still open anything."""
-    keys = Registry.open().api_keys()
+    """List all API keys with their permissions and state, including revoked and expired ones."""
+    keys = open_registry().keys.all()
     if as_json:
         emit({"keys": [_document(key) for key in keys]})
         return
     if not keys:
-        say("There is no key yet, so a server on the loopback interface asks for none: league keys create NAME")
+        say("No API keys: a server on the loopback interface accepts all requests. See `league keys create --help`.")
         return
     table(
-        ("name", "id", "scopes", "leagues", "rate", "made", "expires", "state"),
+        ("name", "id", "scopes", "leagues", "rate", "created", "expires", "state"),
         [
             (
                 key.name,
@@ -92,23 +93,23 @@ def list_(as_json: AsJson = False) -> None:
 
 @app.command()
 def revoke(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The key's name, or its id.")], as_json: AsJson = False
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name or ID of the key.")], as_json: AsJson = False
 ) -> None:
-    """Make a key void. Every replica refuses it within a second, unless it cannot reach the database just then."""
-    key = Registry.open().revoke_key(name)
+    """Revoke an API key. Every replica that can reach the database rejects it within a second."""
+    key = open_registry().keys.revoke(name)
     if as_json:
         emit(_document(key))
     else:
-        say(f"The key {key.name} opens nothing any more.")
+        say(f"Revoked the key {key.name}.")
 
 
-def _document(key: KeyRow) -> dict[str, object]:
+def _document(key: "KeyRow") -> dict[str, object]:
     document = asdict(key) | {"state": _state(key), "scopes": sorted(key.scopes)}
     del document["sha256"]
     return document | {"leagues": None if key.leagues is None else sorted(key.leagues)}
 
 
-def _state(key: KeyRow) -> str:
+def _state(key: "KeyRow") -> str:
     if key.revoked_at is not None:
         return "revoked"
     return "valid" if key.is_valid(datetime.now(UTC)) else "expired"

@@ -1,78 +1,144 @@
-"""The composition of the `league` command, and the edge where errors become sentences and exit codes."""
+"""The `league` command: subcommands that are imported on demand, and the mapping of errors to exit codes."""
 
 import os
 import sys
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from cli.demo import demo
-from cli.doctor import doctor
-from cli.environments import check_env
-from cli.evaluation import evaluate
-from cli.keys import app as keys
-from cli.nightly import nightly
-from cli.output import complain
-from cli.replay import replay
-from cli.report import report
-from cli.serving import act, serve
-from cli.traffic import traffic
-from cli.training import sweep, train
-from cli.verdicts import verify, void
-from cli.versions import history, note, promote, rollback, versions
-from league.errors import InvalidInput, LeagueError, NotFound
+from league.errors import InvalidInput, LeagueError, NotFound, one_line
+
+USAGE_ERROR = 2
+FAILURE = 1
+
+
+class Subcommand(NamedTuple):
+    """Where a subcommand is defined, and the first paragraph of its help, which `league --help` shows."""
+
+    target: str
+    """`module:attribute`: a function, or a Typer application with subcommands of its own."""
+    help: str
+
+
+PANELS = {
+    "Get started": {
+        "demo": Subcommand("cli.demo:demo", "Train, evaluate and serve Connect Four, then play a game against it."),
+        "doctor": Subcommand("cli.doctor:doctor", "Check packages, CPU, GPU, disk, registry, Ray and HAProxy."),
+    },
+    "Train": {
+        "check-env": Subcommand("cli.training:check_env", "Test a league's environment against the contract."),
+        "train": Subcommand("cli.training:train", "Train a league's policies and publish versions."),
+        "sweep": Subcommand("cli.training:sweep", "Train with each combination of settings and report the best."),
+    },
+    "Evaluate": {
+        "evaluate": Subcommand("cli.evaluation:evaluate", "Play a tournament; print leaderboard and payoff matrix."),
+        "nightly": Subcommand("cli.nightly:nightly", "Test new versions, promote the best and update the ratings."),
+        "report": Subcommand("cli.report:report", "Write a league's leaderboard, verdicts and upsets as one page."),
+        "replay": Subcommand("cli.replay:replay", "Record a game as an animated image, or show it in a window."),
+        "verify": Subcommand("cli.verdicts:verify", "Recompute a verdict from the ledger and compare the results."),
+        "void": Subcommand("cli.verdicts:void", "Void a verdict, whether its test is running or complete."),
+    },
+    "Versions": {
+        "versions": Subcommand("cli.versions:versions", "List a league's versions with their aliases and ratings."),
+        "history": Subcommand("cli.versions:history", "Show when and why an alias moved, and who moved it."),
+        "note": Subcommand("cli.versions:note", "Set or clear the note of a version."),
+        "promote": Subcommand("cli.versions:promote", "Make a version the champion, or move another alias to it."),
+        "rollback": Subcommand("cli.versions:rollback", "Restore the previous champion."),
+    },
+    "Serve": {
+        "serve": Subcommand("cli.serving:serve", "Serve all leagues over HTTP and gRPC until Ctrl-C."),
+        "act": Subcommand("cli.serving:act", "Request one action from a policy server, or compute it locally."),
+        "traffic": Subcommand("cli.traffic:traffic", "Show or set the canary and the shadow of a league."),
+        "keys": Subcommand("cli.keys:app", "Create, list and revoke API keys."),
+    },
+}
+SUBCOMMANDS = {name: subcommand for panel in PANELS.values() for name, subcommand in panel.items()}
+
+
+class _ImportedOnDemand(Mapping[str, TyperCommand | TyperGroup]):
+    """The commands of `PANELS`. Access to one imports its module."""
+
+    def __getitem__(self, name: str) -> TyperCommand | TyperGroup:
+        module, _, attribute = SUBCOMMANDS[name].target.partition(":")
+        target = getattr(import_module(module), attribute)
+        if isinstance(target, typer.Typer):
+            command = typer.main.get_command(target)
+        else:
+            wrapper = typer.Typer(**_SETTINGS)
+            wrapper.command(name)(target)
+            command = typer.main.get_command(wrapper)
+        assert isinstance(command, TyperCommand | TyperGroup)
+        return command
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(SUBCOMMANDS)
+
+    def __len__(self) -> int:
+        return len(SUBCOMMANDS)
+
+
+class LazyGroup(TyperGroup):
+    """A group whose subcommands are imported when they are invoked. Its own help imports none of them."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = _ImportedOnDemand()  # type: ignore[assignment]
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of the group from the texts of `PANELS`."""
+        texts = {
+            name: TyperCommand(name, help=subcommand.help, rich_help_panel=panel)
+            for panel, subcommands in PANELS.items()
+            for name, subcommand in subcommands.items()
+        }
+        listing = TyperGroup(
+            name=self.name,
+            commands=texts,  # type: ignore[arg-type]
+            help=self.help,
+            params=self.params,
+            rich_markup_mode=self.rich_markup_mode,
+        )
+        listing.format_help(ctx, formatter)
+
+
+_SETTINGS: dict[str, Any] = {"add_completion": False, "rich_markup_mode": "markdown", "pretty_exceptions_enable": False}
 
 app = typer.Typer(
+    **_SETTINGS,
     name="league",
+    cls=LazyGroup,
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Train multi-agent policies, let a league decide which version is really better, and serve the champion.\n\n"
-    "A first look: `league demo`. The usual way: `train`, `nightly`, `serve`, `act`. What lives where is set by "
-    "LEAGUE_HOME (default ./league-home), LEAGUE_DATABASE_URL and LEAGUE_ARTIFACTS.",
 )
-for command in (
-    demo,
-    doctor,
-    check_env,
-    train,
-    sweep,
-    versions,
-    note,
-    evaluate,
-    nightly,
-    verify,
-    void,
-    promote,
-    rollback,
-    history,
-    traffic,
-    replay,
-    report,
-    serve,
-    act,
-):
-    app.command()(command)
-app.add_typer(keys)
 
-CALLERS_MISTAKE = 2
-FAULT = 1
+
+@app.callback()
+def _league() -> None:
+    """Train multi-agent policies, decide by statistical tests which version is better, and serve the champion.
+
+    Start with `league demo`. The usual sequence is `train`, `nightly`, `serve`, `act`. Data is stored in LEAGUE_HOME
+    (default: ./league-home); LEAGUE_DATABASE_URL and LEAGUE_ARTIFACTS select another database and artefact store.
+    """
 
 
 def run() -> None:
-    """Run the command. A fault is one line on stderr: exit 2 for the caller's mistake, 1 otherwise."""
-    _let_modules_here_be_found()
+    """Run the command. A LeagueError becomes one line on stderr and exit code 2 (invalid input) or 1."""
+    _add_working_directory_to_path()
     try:
         app()
     except LeagueError as error:
-        complain(f"league: {' '.join(str(error).split())}")
-        sys.exit(CALLERS_MISTAKE if isinstance(error, InvalidInput | NotFound) else FAULT)
+        from cli.output import complain
+
+        complain(f"league: {one_line(error)}")
+        sys.exit(USAGE_ERROR if isinstance(error, InvalidInput | NotFound) else FAILURE)
 
 
-def _let_modules_here_be_found() -> None:
-    """A league's `entry_point` may lie in the directory where the command is run. Ray hands the path on to workers.
+def _add_working_directory_to_path() -> None:
+    """Let a league's `entry_point` name a module in the working directory. Ray passes the path on to its workers.
 
-    Behind everything else, so that a file there takes no installed package's place.
+    The directory is appended so that its files do not shadow installed packages.
     """
     sys.path.append(os.getcwd())

@@ -1,21 +1,23 @@
-"""`league nightly`: what a scheduler runs."""
+"""`league nightly`: gate and promotion of new versions, run by a scheduler."""
 
 import sys
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.evaluation import CORES, Address, AsJson, Workers, show_standings
-from cli.output import complain, emit, say
-from cli.watching import difference, watched
-from evaluation.report import Confirmation, NightReport
-from league.config import LeagueConfig
-from league.errors import AlreadyRunning, LeagueError
+from cli.options import CORES, AsJson, EvaluationCluster, Workers, open_registry
+from cli.output import GameProgress, complain, difference, emit, say, show_leaderboard
+from configs import find, names
+from league.errors import AlreadyRunning, LeagueError, UnknownLeague, one_line
+from league.files import disk_errors
 from league.refs import check_slug
-from league.registry.faults import disk_faults
-from league.registry.registry import Registry
 from league.settings import Storage
+
+if TYPE_CHECKING:
+    from evaluation.results import Confirmation, NightlyReport
+    from league.config import LeagueConfig
+    from league.registry.registry import Registry
 
 FAULTS = 1
 BUSY = 75
@@ -24,36 +26,41 @@ BUSY = 75
 
 def nightly(
     leagues: Annotated[
-        list[str] | None, typer.Argument(metavar="[LEAGUE|FILE]…", help="Default: all registered leagues.")
+        list[str] | None,
+        typer.Argument(
+            metavar="[LEAGUE|CONFIG]…",
+            help="Registered leagues, YAML files or bundled configurations. Default: all registered leagues.",
+        ),
     ] = None,
     workers: Workers = CORES,
     webhook: Annotated[
         str | None,
-        typer.Option(envvar="LEAGUE_WEBHOOK", help="POST a summary, and the reports as JSON, to this URL at the end."),
+        typer.Option(envvar="LEAGUE_WEBHOOK", help="URL to which a summary and the reports are posted as JSON."),
     ] = None,
-    address: Address = None,
+    address: EvaluationCluster = None,
     as_json: AsJson = False,
 ) -> None:
-    """Judge each new version against the champion and the anchors, promote the better one, and rate everybody.
+    """Test new versions, promote the best and update the ratings.
 
-    May be killed at any point and started again: what was played is in the ledger and is not played twice. Meant for
-    cron, a systemd timer or a CronJob (see deploy/nightly/). The page that `league report` makes is left in
-    LEAGUE_HOME/reports. Exit code 0: all is well, whoever is champion; 1: a
-    version could not be judged, a league failed, or nobody took the webhook; 2: a mistake in what was asked; 75:
-    another night is at work on one of the leagues.
+    Intended for cron, a systemd timer or a CronJob (see deploy/nightly/ in the repository). An interrupted run
+    continues when the command is run again, without replaying recorded games. The report of each league is written
+    to LEAGUE_HOME/reports.
+
+    Exit codes: 0 success, with or without a promotion; 1 a version could not be tested, a league failed, or the
+    webhook could not be delivered; 2 invalid arguments; 75 another nightly run holds the lock of a league.
     """
-    from evaluation.cluster import cluster
-    from evaluation.webhook import deliver
+    from evaluation.reporting.webhook import deliver
+    from league.ray_cluster import ray_session
 
     configs = _configs(leagues or ())
     reports, faults, busy = [], [], False
     for config in configs:
         try:
-            with cluster(address):
-                report = hold_night(config, workers, quiet=as_json)
+            with ray_session(address):
+                report = run_nightly(config, workers, quiet=as_json)
         except LeagueError as error:
-            # The other leagues shall have their night all the same.
-            sentence = f"{config.league}: {' '.join(str(error).split())}"
+            # The remaining leagues are still processed.
+            sentence = f"{config.league}: {one_line(error)}"
             busy |= isinstance(error, AlreadyRunning)
             faults += [] if isinstance(error, AlreadyRunning) else [sentence]
             complain(f"league: {sentence}")
@@ -69,68 +76,76 @@ def nightly(
         sys.exit(FAULTS if faults else BUSY)
 
 
-def hold_night(config: LeagueConfig, workers: int = CORES, quiet: bool = False) -> NightReport:
-    """Hold one league's night, tell of it, and leave the league's page in the home."""
-    from evaluation.nightly import nightly as run
-    from evaluation.pages.league_report import league_report
-    from evaluation.pages.page import write
+def run_nightly(config: "LeagueConfig", workers: int = CORES, quiet: bool = False) -> "NightlyReport":
+    """Run one league's nightly run, print the results, and write the league's report to LEAGUE_HOME/reports."""
+    from evaluation.gating.nightly import nightly as run
+    from evaluation.reporting.html_page import write
+    from evaluation.reporting.league_report import league_report
 
     Storage.from_environment().export()
-    registry = Registry.open()
-    with watched(quiet) as listener:
+    registry = open_registry()
+    with GameProgress(quiet) as listener:
         report = run(config, registry=registry, workers=workers, listener=listener)
     page = registry.storage.home / "reports" / f"{config.league}.html"
-    with disk_faults(page):
+    with disk_errors(page):
         page.parent.mkdir(exist_ok=True)
     write(league_report(registry, config.league), page)
     for fault in report.faults:
         complain(f"{config.league}: {fault}")
     if not quiet:
         if not report.verdicts:
-            say(f"{config.league}: no new version to judge.")
+            say(f"{config.league}: no new versions to test.")
         say()
         for sentence in summary_of(report):
             say(sentence)
         say()
-        show_standings(report.standings)
-        say(f"\nMore on {page}")
+        show_leaderboard(report.leaderboard)
+        say(f"\nReport: {page}")
     return report
 
 
-def summary_of(report: NightReport) -> list[str]:
-    """What a person wants to know of a night in the morning."""
+def summary_of(report: "NightlyReport") -> list[str]:
+    """Summarise a nightly run in one sentence per league and confirmed promotion."""
     return [f"{report.league}: {_change(report)}", *(_gain(gain) for gain in report.confirmations)]
 
 
-def _change(report: NightReport) -> str:
-    judged = f"{len(report.verdicts)} judged, " if report.verdicts else ""
+def _change(report: "NightlyReport") -> str:
+    judged = f"{len(report.verdicts)} tested, " if report.verdicts else ""
     if report.champion is None:
-        return f"{judged}no version has beaten script:random yet, so there is no champion."
+        return f"{judged}no champion, as no version has beaten script:random yet."
     if report.champion == report.champion_before:
         return f"{judged}the champion is still {report.champion}."
     return f"{judged}the champion is now {report.champion} (before: {report.champion_before or 'none'})."
 
 
-def _gain(gain: Confirmation) -> str:
+def _gain(gain: "Confirmation") -> str:
     low, high = (f"{bound:+.0f}" if bound is not None else "∞" for bound in gain.interval)
     returns = f", returns {difference(gain.difference)}" if gain.difference else ""
     return (
-        f"{gain.candidate} against {gain.opponent} in {gain.games} fresh games: {gain.elo:+.0f} Elo [{low}, {high}]"
+        f"{gain.candidate} against {gain.opponent} in {gain.games} new games: {gain.elo:+.0f} Elo [{low}, {high}]"
         f"{returns}."
     )
 
 
-def _configs(named: list[str] | tuple[str, ...]) -> list[LeagueConfig]:
-    """Of files and of registered leagues; of all that are registered if none is named."""
-    registry = Registry.open()
+def _configs(named: Sequence[str]) -> "list[LeagueConfig]":
+    """Return the configurations of the named leagues and files; of all registered leagues if none is named."""
+    registry = open_registry()
     if not named:
-        found = [row.config for row in registry.leagues()]
+        found = [row.config for row in registry.leagues.all()]
         if not found:
-            say("No league is registered yet: name a file, such as configs/connect_four.yaml.")
+            say("No league is registered yet. Name a configuration, such as connect_four or a YAML file.")
         return found
-    return [
-        LeagueConfig.load(Path(name))
-        if name.endswith((".yaml", ".yml"))
-        else registry.league(check_slug("league", name)).config
-        for name in named
-    ]
+    return [_config(registry, name) for name in named]
+
+
+def _config(registry: "Registry", name: str) -> "LeagueConfig":
+    """Return the configuration of a registered league, else of a file or a bundled configuration."""
+    from league.config import LeagueConfig
+
+    if not name.endswith((".yaml", ".yml")):
+        try:
+            return registry.leagues.get(check_slug("league", name)).config
+        except UnknownLeague as error:
+            if name not in names():
+                raise UnknownLeague(f"{error}; bundled configurations: {', '.join(names())}") from None
+    return LeagueConfig.load(find(name))

@@ -1,18 +1,22 @@
-"""What the commands print: tables and sentences for people, JSON for programs."""
+"""Output of the commands: text, tables, progress bars and JSON."""
 
 import re
 from collections.abc import Iterable, Sequence
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import orjson
 from rich.console import Console
 from rich.table import Table
 
+if TYPE_CHECKING:
+    from evaluation.results import Difference, Listener, Standing, VerdictReport
+    from evaluation.results import Progress as Games
+
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""What a terminal obeys instead of showing it. Names, reasons and notes come from other people."""
+"""Terminal control characters. They are removed because names, reasons and notes are untrusted."""
 
 
 def emit(document: Any) -> None:
@@ -21,17 +25,17 @@ def emit(document: Any) -> None:
 
 
 def say(sentence: str = "") -> None:
-    """Print a sentence. Square brackets in it are text, not markup."""
+    """Print text without interpreting square brackets as markup."""
     console.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
 
 
 def complain(sentence: str) -> None:
-    """Say on stderr what is wrong."""
+    """Print an error or a warning to stderr."""
     errors.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print rows under column heads; numbers to the right."""
+    """Print a table with headers. Numeric columns are aligned to the right."""
     sheet = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     rows = [tuple(row) for row in rows]
     for index, column in enumerate(columns):
@@ -43,7 +47,7 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
 
 
 def text(value: Any) -> str:
-    """One cell of a table."""
+    """Format one cell of a table."""
     match value:
         case None:
             return "–"
@@ -57,8 +61,74 @@ def text(value: Any) -> str:
 
 
 def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:
-    """A rating with its interval, as `+123 [100, 150]`."""
+    """Format a rating and its interval as `+123 [+100, +150]`."""
     if rating is None:
         return None
     span = f" [{interval[0]:+.0f}, {interval[1]:+.0f}]" if interval else ""
     return f"{rating:+.0f}{span}"
+
+
+class GameProgress:
+    """Context manager that returns a listener, which prints verdicts and shows a progress bar on a terminal."""
+
+    def __init__(self, quiet: bool) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._quiet = quiet
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=quiet or not console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=None, note="")
+
+    def __enter__(self) -> "Listener":
+        self._bar.start()
+        return self._show
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def _show(self, event: "Games | VerdictReport") -> None:
+        if self._quiet:
+            return
+        from evaluation.results import VerdictReport
+
+        if isinstance(event, VerdictReport):
+            console.print(f"  {verdict(event)}", markup=False, soft_wrap=True)
+            return
+        note = "" if event.llr is None else f"LLR {event.llr:+.2f}"
+        self._bar.update(self._task, description=event.what, completed=event.played, total=event.of, note=note)
+
+
+def show_leaderboard(leaderboard: "tuple[Standing, ...]") -> None:
+    """Print a leaderboard."""
+    table(
+        ("contestant", "rating [95 %]", "score", "mean return", "games"),
+        [(each.ref, elo(each.rating, each.interval), each.score, each.mean_return, each.games) for each in leaderboard],
+    )
+
+
+def verdict(report: "VerdictReport") -> str:
+    """`connect_four@2 against connect_four@1: promote after 40 games (40 unique), score 0.710, LLR +2.97 in […]`"""
+    score = "–" if report.score is None else f"{report.score:.3f}"
+    low, high = report.bounds
+    games = f"after {report.games} games ({report.unique_games} unique), score {score}"
+    place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
+    gap = f", returns differ by {difference(report.difference)}" if report.difference else ""
+    anchors = "".join(
+        f"; {each.outcome} to {each.ref} by {each.margin:g} after {each.games} games" for each in report.anchors
+    )
+    note = f": {report.note}" if report.note else ""
+    return f"{report.candidate} against {report.opponent}: {report.outcome} {games}, {place}{gap}{anchors}{note}"
+
+
+def difference(gap: "Difference") -> str:
+    """`+1.5 [0.9, 2.1]`"""
+    span = "" if gap.low is None or gap.high is None else f" [{gap.low:.4g}, {gap.high:.4g}]"
+    return f"{gap.mean:+.4g}{span}"

@@ -1,36 +1,37 @@
-"""`league report`: a league as one page, or as one JSON document."""
+"""`league report`: a league as an HTML page or a JSON document."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from cli.options import LeagueName, open_registry
 from cli.output import console, emit, say
 from league.errors import ConfigError
 from league.refs import check_slug
-from league.registry.registry import Registry
 
 
 def report(
-    league: Annotated[str, typer.Argument(metavar="LEAGUE", help="The league's name, such as connect_four.")],
+    league: LeagueName,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The HTML file. Default: LEAGUE-report.html in this directory.")
+        Path | None,
+        typer.Option("--out", "-o", help="HTML file. Default: LEAGUE-report.html in the working directory."),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print the same as one JSON document, without pictures, and write no file.")
+        bool, typer.Option("--json", help="Print the report as one JSON document without images; write no file.")
     ] = False,
 ) -> None:
-    """Show a league on one page: standings, who beats whom, every verdict with its evidence, and surprising games.
+    """Write a league's leaderboard, verdicts and upsets as one page.
 
-    The page is one file that needs no network: open it from the disk, mail it, print it. Nothing is played for it but
-    the surprising games once more, from their records.
+    The page is a single HTML file that needs no network. It contains the leaderboard, the payoff matrix, every verdict
+    with its evidence, and replays of the most unexpected results.
     """
-    from evaluation.pages.league_report import league_report
-    from evaluation.pages.page import write
+    from evaluation.reporting.html_page import write
+    from evaluation.reporting.league_report import league_report
 
     if as_json and out is not None:
-        raise ConfigError(f"--json is printed and writes no file: leave out --out {out}")
-    registry = Registry.open()
+        raise ConfigError(f"--json prints to stdout and cannot be combined with --out {out}")
+    registry = open_registry()
     check_slug("league", league)
     if as_json:
         emit(league_report(registry, league, pictures=False).to_json())
@@ -39,6 +40,6 @@ def report(
     with console.status(f"reading {league}"):
         found = league_report(registry, league)
     write(found, out)
-    say(f"{out}: {found.games} games, {len(found.verdicts)} verdicts, {len(found.surprises)} surprising games.")
+    say(f"{out}: {found.games} games, {len(found.verdicts)} verdicts, {len(found.upsets)} upsets.")
     for sentence in found.left_out:
         say(sentence)

@@ -1,4 +1,4 @@
-"""`league serve` and `league act`."""
+"""`league serve` and `league act`: a policy server, and single action requests."""
 
 import sys
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import orjson
 import typer
 
+from cli.options import open_registry
 from cli.output import emit, say
 from league.errors import ConfigError, InvalidReference
 from league.refs import CheckpointRef, PolicyRef, ScriptRef, parse_ref
@@ -14,26 +15,28 @@ from league.settings import Storage
 
 
 def serve(
-    host: Annotated[str | None, typer.Option(help="Listen here. Default: what deploy.yaml says, 127.0.0.1.")] = None,
-    port: Annotated[int | None, typer.Option(help="Listen here. Default: what deploy.yaml says, 8000.")] = None,
-    grpc_port: Annotated[
-        int | None, typer.Option(help="gRPC listens here. Default: what deploy.yaml says, 8001.")
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on. Default: from deploy.yaml, 127.0.0.1.")
     ] = None,
-    replicas: Annotated[int | None, typer.Option(help="How many processes answer. Default: deploy.yaml's.")] = None,
-    address: Annotated[str | None, typer.Option(help="A running Ray cluster. Default: a local Ray.")] = None,
+    port: Annotated[int | None, typer.Option(help="HTTP port. Default: from deploy.yaml, 8000.")] = None,
+    grpc_port: Annotated[int | None, typer.Option(help="gRPC port. Default: from deploy.yaml, 8001.")] = None,
+    replicas: Annotated[int | None, typer.Option(help="Number of server processes. Default: from deploy.yaml.")] = None,
+    address: Annotated[
+        str | None, typer.Option(help="Running Ray cluster. Default: start Ray on this machine.")
+    ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Ask nobody for an API key, even where other machines reach the server.")
+        bool, typer.Option("--insecure", help="Accept requests without an API key, even from other machines.")
     ] = False,
 ) -> None:
-    """Serve every league's champion (and any version by number) as an action endpoint, until Ctrl-C.
+    """Serve all leagues over HTTP and gRPC until Ctrl-C.
 
-    `POST /v1/policies/{league}/action` takes an observation and answers with an action. Promotions and rollbacks reach
-    every replica within a second, without a restart and without a failed request.
+    `POST /v1/policies/{league}/action` returns the action of the champion, or of any version, for an observation.
+    Replicas apply promotions and rollbacks within a second, without a restart and without failed requests.
 
-    Who may call is told by API keys (`league keys`). On the loopback interface they are asked for as soon as there is
-    one; to listen to other machines (`--host 0.0.0.0`) there must be one.
+    API keys (`league keys`) authenticate clients. On the loopback interface they are required as soon as one exists.
+    Listening on other interfaces (`--host 0.0.0.0`) requires at least one key, or --insecure.
     """
-    from serve_app.launch import serve_forever
+    from serve_app.runtime.launch import serve_forever
 
     storage = Storage.from_environment()
     storage.export()
@@ -48,11 +51,11 @@ def serve(
         address=address,
         on_ready=lambda url: say(
             f"Serving the leagues of {storage.home} on {url}\n"
-            f"  {url}                                     the leagues, to look at and to play with in a browser\n"
-            f"  {url}/docs                                every call, to try in a browser\n"
-            f"  {url}/v1/leagues                          what is served\n"
-            f"  {url}/v1/policies/LEAGUE/action           POST an observation, get an action\n"
-            f"  {url}/v2/models/LEAGUE                    the Open Inference Protocol, over gRPC too\n"
+            f"  {url}                                     web pages\n"
+            f"  {url}/docs                                API documentation\n"
+            f"  {url}/v1/leagues                          leagues as JSON\n"
+            f"  {url}/v1/policies/LEAGUE/action           POST an observation to get an action\n"
+            f"  {url}/v2/models/LEAGUE                    Open Inference Protocol over HTTP; also over gRPC\n"
             "Try: league act connect_four@champion          Stop: Ctrl-C"
         ),
     )
@@ -65,27 +68,29 @@ def act(
         typer.Option(
             "--observation",
             "-o",
-            help="JSON text, a file, or - for stdin: a nested list, or {observation, action_mask}. "
-            "Default: the first observation of a fresh episode.",
+            help="Observation as JSON text, a file, or - for stdin: a nested list, or {observation, action_mask}. "
+            "Default: the first observation of a new episode.",
         ),
     ] = None,
-    policy: Annotated[str | None, typer.Option(help="Which policy, where the version has several.")] = None,
-    url: Annotated[str, typer.Option(envvar="LEAGUE_URL", help="The policy server.")] = "http://127.0.0.1:8000",
-    local: Annotated[bool, typer.Option("--local", help="Load the version here instead of asking a server.")] = False,
-    explore: Annotated[bool, typer.Option("--explore", help="Sample an action instead of taking the best.")] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="Makes --explore reproducible.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the whole answer as JSON.")] = False,
+    policy: Annotated[str | None, typer.Option(help="Policy ID, if the version has several policies.")] = None,
+    url: Annotated[str, typer.Option(envvar="LEAGUE_URL", help="URL of the policy server.")] = "http://127.0.0.1:8000",
+    local: Annotated[
+        bool, typer.Option("--local", help="Load the version in this process instead of calling a server.")
+    ] = False,
+    explore: Annotated[bool, typer.Option("--explore", help="Sample an action instead of the greedy one.")] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Random seed for --explore.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the complete response as JSON.")] = False,
 ) -> None:
-    """Ask a policy for one action, from the server that `league serve` started, or --local from the registry."""
+    """Request one action from a policy server, or compute it locally."""
     parsed = parse_ref(ref)
     if isinstance(parsed, ScriptRef):
-        raise InvalidReference(f"{ref} is a script: only checkpoint versions are served, e.g. connect_four@champion")
+        raise InvalidReference(f"{ref} is a script. Only versions can be served, such as connect_four@champion")
     value = _first_observation(parsed, policy) if observation is None else _read(observation)
-    answer = (_act_here if local else _ask)(parsed, policy, value, explore, seed, url)
+    response = (_act_here if local else _ask)(parsed, policy, value, explore, seed, url)
     if as_json:
-        emit(answer)
+        emit(response)
     else:
-        say(str(answer["action"]))
+        say(str(response["action"]))
 
 
 def _ask(
@@ -97,12 +102,12 @@ def _ask(
 
     model = str(PolicyRef(ref.league, policy))
     with Client(url) as client:
-        answer = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
+        response = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
     return {
-        "action": np.asarray(answer.action).tolist(),
+        "action": np.asarray(response.action).tolist(),
         "model": model,
-        "version": answer.version,
-        "sha256": answer.sha256,
+        "version": response.version,
+        "sha256": response.sha256,
     }
 
 
@@ -112,17 +117,16 @@ def _act_here(
     import numpy as np
 
     from league.policies.loading import load
-    from league.registry.registry import Registry
     from league.seeds import generator
-    from serve_app.observations import ObservationReader, refuse_strings
+    from serve_app.codecs.observation_codec import ObservationReader, reject_strings
 
-    registry = Registry.open()
-    version = registry.resolve(ref)
+    registry = open_registry()
+    version = registry.versions.resolve(ref)
     loaded = load(version.ref, policy=policy, registry=registry)
     space = version.manifest.policies[policy or next(iter(version.manifest.policies))].observation
-    refuse_strings(value)
+    reject_strings(value)
     observations = ObservationReader(space).read([value])
-    # The server draws from the same generator, so that both sample the same action.
+    # The same generator as on the server, so that both sample the same action.
     rng = np.random.default_rng() if seed is None else generator(seed, 0)
     actions = loaded.act(observations, explore=explore, rng=[rng] if explore else None)
     return {
@@ -134,10 +138,9 @@ def _act_here(
 
 
 def _first_observation(ref: CheckpointRef, policy: str | None) -> Any:
-    from evaluation.exhibition import first_observation
-    from league.registry.registry import Registry
+    from evaluation.playback.single_game import first_observation
 
-    league = Registry.open().league(ref.league)
+    league = open_registry().leagues.get(ref.league)
     return first_observation(league.config, league.interface, policy)
 
 
@@ -154,4 +157,4 @@ def _read(observation: str) -> Any:
     try:
         return orjson.loads(text)
     except orjson.JSONDecodeError as error:
-        raise ConfigError(f"--observation is no JSON: {error}") from error
+        raise ConfigError(f"--observation is not valid JSON: {error}") from error

@@ -1,81 +1,94 @@
-"""`league traffic`: the canary and the shadow of a league."""
+"""`league traffic`: canary and shadow versions of a league."""
 
 import getpass
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
 from cli.output import emit, say, table
-from cli.versions import Actor, AsJson, LeagueName, Reason, Timeout
 from league.errors import InvalidInput
 from league.refs import CheckpointRef, check_slug, parse_version
-from league.registry.following import await_traffic
-from league.registry.registry import Registry
-from league.registry.rows import Portion, Shadowing, Traffic
-from league.registry.traffic import KEEP, Unchanged
+
+if TYPE_CHECKING:
+    from league.registry.registry import Registry
+    from league.registry.storage.rows import Portion, ShadowCounts, Traffic
+    from league.registry.traffic import Unchanged
 
 CANARY_SHARE, SHADOW_SHARE = 0.05, 1.0
 NOBODY = "none"
 
 
+Canary = Annotated[
+    str | None,
+    typer.Option(metavar="REF", help="Version that serves a share of the champion's requests; `none` removes it."),
+]
+CanaryShare = Annotated[
+    float | None,
+    typer.Option(min=0, max=1, help=f"Share of routing keys that the canary serves. Default: {CANARY_SHARE}."),
+]
+ShadowRef = Annotated[
+    str | None,
+    typer.Option(metavar="REF", help="Version that receives copies of requests for comparison; `none` removes it."),
+]
+ShadowShare = Annotated[
+    float | None,
+    typer.Option(min=0, max=1, help=f"Share of requests copied to the shadow. Default: {SHADOW_SHARE:g}."),
+]
+
+
 def traffic(
     league: LeagueName,
-    canary: Annotated[
-        str | None,
-        typer.Option(metavar="REF", help="Answers a share of the champion's requests; `none` ends that."),
-    ] = None,
-    share: Annotated[
-        float | None, typer.Option(min=0, max=1, help=f"Share of keys that it answers. Default: {CANARY_SHARE}.")
-    ] = None,
-    shadow: Annotated[
-        str | None,
-        typer.Option(metavar="REF", help="Is shown the champion's requests and compared; `none` ends that."),
-    ] = None,
-    shadow_share: Annotated[
-        float | None, typer.Option(min=0, max=1, help=f"Share of requests that it is shown. Default: {SHADOW_SHARE:g}.")
-    ] = None,
-    off: Annotated[bool, typer.Option("--off", help="End both.")] = False,
+    canary: Canary = None,
+    share: CanaryShare = None,
+    shadow: ShadowRef = None,
+    shadow_share: ShadowShare = None,
+    off: Annotated[bool, typer.Option("--off", help="Remove both.")] = False,
     reason: Reason = "set by hand",
     actor: Actor = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Return when every live replica follows.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until every live replica has applied the change.")] = False,
     timeout: Timeout = 30.0,
     as_json: AsJson = False,
 ) -> None:
-    """Show or set which versions get a share of a league's requests besides the champion.
+    """Show or set the canary and the shadow of a league.
 
-    A *canary* answers callers whose key (header `x-league-key`: a player, an episode) falls into its share; a greater
-    share only adds keys. A *shadow* is shown requests after the champion has answered; its answers are compared and
-    counted, and nobody sees them. REF is a version or an alias, which is then followed: `connect_four@candidate`.
+    A *canary* serves the requests whose routing key (header `x-league-key`: a player, an episode) falls into its share.
+    Increasing the share only adds keys. A *shadow* receives copies of requests after the champion has responded; its
+    actions are compared and counted but never returned. REF is a version or an alias such as `connect_four@candidate`;
+    replicas follow the alias.
     """
-    registry = Registry.open()
+    registry = open_registry()
     check_slug("league", league)
     given = (canary, share, shadow, shadow_share)
     if off and any(option is not None for option in given):
-        raise InvalidInput("--off ends both canary and shadow: it goes with no other of them")
+        raise InvalidInput("--off removes canary and shadow and cannot be combined with their options")
     if not off and all(option is None for option in given):
         _show(registry, league, as_json)
         return
-    now = registry.traffic(league)
-    setting = registry.set_traffic(
+    now = registry.traffic.current(league)
+    setting = registry.traffic.set(
         league,
         canary=None if off else _portion(league, "--canary", canary, share, now.canary, CANARY_SHARE),
         shadow=None if off else _portion(league, "--shadow", shadow, shadow_share, now.shadow, SHADOW_SHARE),
         actor=actor or getpass.getuser(),
         reason=reason,
     )
-    replicas = await_traffic(registry, setting, timeout) if wait else None
+    replicas = registry.changes.wait_for_traffic(setting, timeout) if wait else None
     if as_json:
         emit(asdict(setting) | ({} if replicas is None else {"replicas": replicas}))
         return
     _say(setting)
     if replicas is not None:
-        say(f"All {len(replicas)} replicas follow.")
+        say(f"All {len(replicas)} replicas have applied the change.")
 
 
 def _portion(
-    league: str, option: str, ref: str | None, share: float | None, now: Portion | None, default: float
-) -> Portion | Unchanged | None:
+    league: str, option: str, ref: str | None, share: float | None, now: "Portion | None", default: float
+) -> "Portion | Unchanged | None":
+    from league.registry.storage.rows import Portion
+    from league.registry.traffic import KEEP
+
     if ref is None and share is None:
         return KEEP
     if ref == NOBODY:
@@ -83,7 +96,7 @@ def _portion(
     if ref is not None:
         return Portion(_version(league, option, ref), default if share is None else share)
     if now is None or share is None:
-        raise InvalidInput(f"a share needs a version: {option} REF")
+        raise InvalidInput(f"a share requires a version: {option} REF")
     return Portion(now.version, share)
 
 
@@ -96,8 +109,8 @@ def _version(league: str, option: str, ref: str) -> int | str:
     return parsed.version
 
 
-def _show(registry: Registry, league: str, as_json: bool) -> None:
-    setting, shadowings = registry.traffic(league), registry.shadowings(league)
+def _show(registry: "Registry", league: str, as_json: bool) -> None:
+    setting, shadowings = registry.traffic.current(league), registry.traffic.shadow_counts(league)
     if as_json:
         emit(asdict(setting) | {"shadows": [_document(one) for one in shadowings]})
         return
@@ -123,18 +136,18 @@ def _show(registry: Registry, league: str, as_json: bool) -> None:
         )
 
 
-def _document(one: Shadowing) -> dict[str, Any]:
+def _document(one: "ShadowCounts") -> dict[str, Any]:
     document = asdict(one)
     del document["latency"], document["ns"], document["league"]
     quantiles = {"p50": one.milliseconds(0.5), "p95": one.milliseconds(0.95)}
     return document | {"agreement": one.agreement, "latency_ms": quantiles}
 
 
-def _say(setting: Traffic) -> None:
+def _say(setting: "Traffic") -> None:
     league = setting.league
     if setting.canary is None and setting.shadow is None:
-        say(f"All requests for {league} are answered by its champion alone.")
+        say(f"{league} has no canary and no shadow: the champion serves all requests.")
     if setting.canary is not None:
-        say(f"{league}@{setting.canary.version} answers {setting.canary.share:.1%} of the keys, as canary.")
+        say(f"{league}@{setting.canary.version} is the canary for {setting.canary.share:.1%} of the routing keys.")
     if setting.shadow is not None:
-        say(f"{league}@{setting.shadow.version} is shown {setting.shadow.share:.1%} of the requests, as shadow.")
+        say(f"{league}@{setting.shadow.version} is the shadow for {setting.shadow.share:.1%} of the requests.")

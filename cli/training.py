@@ -1,56 +1,96 @@
-"""`league train` and `league sweep`."""
+"""`league check-env`, `league train` and `league sweep`: environment checks and training."""
 
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
-import yaml
 
-from cli.output import console, say, table
-from league.config import LeagueConfig
+from cli.options import AsJson, Config, open_registry
+from cli.output import console, emit, say, table
+from configs import find
 from league.errors import ConfigError
+from league.refs import CheckpointRef, of_league
 
 if TYPE_CHECKING:
-    from training.sweep import SweepReport
+    from league.config import LeagueConfig
+    from training.sweeps.sweep import SweepReport
 
 INTERRUPTED = 130
-"""128 + SIGINT."""
+"""Exit code of a process ended by SIGINT: 128 + 2."""
 TOKENS = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
 
-Config = Annotated[Path, typer.Argument(help="The league's file, such as configs/connect_four.yaml.")]
 Address = Annotated[
-    str | None, typer.Option(help="A running Ray cluster (`auto`, or host:port). Default: a local Ray.")
+    str | None, typer.Option(help="Running Ray cluster (`auto`, or HOST:PORT). Default: start Ray on this machine.")
 ]
-Cpus = Annotated[int | None, typer.Option(min=1, help="CPUs that the local Ray may use. Default: all.")]
+Cpus = Annotated[int | None, typer.Option(min=1, help="Number of CPUs for the local Ray. Default: all.")]
 ObjectStore = Annotated[
-    int | None, typer.Option(metavar="MB", help="Shared memory of the local Ray's object store. Default: as Ray does.")
+    int | None, typer.Option(metavar="MB", help="Size of the local Ray's object store. Default: Ray's own.")
 ]
-Dashboard = Annotated[bool, typer.Option("--dashboard", help="Start the local Ray's dashboard, and say where it is.")]
-Minutes = Annotated[float | None, typer.Option(help="Stop training after this long, instead of what CONFIG says.")]
-Steps = Annotated[int | None, typer.Option(help="Stop after this many actions, instead of what CONFIG says.")]
-Seed = Annotated[int | None, typer.Option(help="Another seed than CONFIG's.")]
-Runners = Annotated[int | None, typer.Option(min=0, help="Sampling processes, instead of what CONFIG says.")]
-Gpus = Annotated[float | None, typer.Option(min=0, help="GPUs of the learner, instead of what CONFIG says.")]
+Dashboard = Annotated[bool, typer.Option("--dashboard", help="Start the local Ray's dashboard and print its URL.")]
+Minutes = Annotated[float | None, typer.Option(help="Maximum training time. Overrides CONFIG.")]
+Steps = Annotated[int | None, typer.Option(help="Maximum number of agent steps. Overrides CONFIG.")]
+Seed = Annotated[int | None, typer.Option(help="Random seed. Overrides CONFIG.")]
+Runners = Annotated[int | None, typer.Option(min=0, help="Number of sampling processes. Overrides CONFIG.")]
+Gpus = Annotated[float | None, typer.Option(min=0, help="Number of GPUs for the learner. Overrides CONFIG.")]
+
+
+def check_env(
+    config: Config,
+    episodes: Annotated[int, typer.Option(min=1, help="Number of episodes, each played several times.")] = 3,
+    steps: Annotated[int, typer.Option(min=1, help="Maximum number of steps per episode.")] = 2000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Test a league's environment against the contract.
+
+    Plays episodes with random legal actions. Exits 1 on a violation; notes do not affect the exit code.
+
+    Next step: `league train CONFIG`.
+    """
+    from league.config import LeagueConfig
+    from league.environments.conformance import examine
+
+    league = LeagueConfig.load(find(config))
+    found = examine(league, episodes, steps, seed)
+    if as_json:
+        emit(asdict(found) | {"passed": found.passed})
+    else:
+        if found.lengths:
+            state = "no global state" if found.state_size is None else f"a global state of {found.state_size:,} numbers"
+            say(
+                f"{league.environment.entry_point}: {found.api}, {found.agents} agents, {state}, episodes of"
+                f" {min(found.lengths)} to {max(found.lengths)} steps, {found.steps_per_second:,.0f} steps per second"
+            )
+        if found.findings:
+            table(("severity", "finding"), ((finding.severity, str(finding)) for finding in found.findings))
+        if found.passed:
+            say("The environment passes all checks." if not found.findings else "The environment passes, with notes.")
+    raise typer.Exit(0 if found.passed else 1)
+
+
+Parent = Annotated[
+    str | None,
+    typer.Option("--from", metavar="REF", help="Continue from this version, such as connect_four@3 or @champion."),
+]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Resume an interrupted run, or a completed one with a larger budget.")
+]
+Job = Annotated[
+    bool, typer.Option("--job", help="Submit a Ray job. --address is the cluster's dashboard, http://HOST:8265.")
+]
 
 
 def train(
     config: Config,
-    parent: Annotated[
-        str | None,
-        typer.Option("--from", metavar="REF", help="Train on from this version, e.g. connect_four@3 or @champion."),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the run that was interrupted, or with a larger budget.")
-    ] = False,
+    parent: Parent = None,
+    resume: Resume = False,
     address: Address = None,
-    job: Annotated[
-        bool,
-        typer.Option("--job", help="Run this as a Ray job: --address is the cluster's dashboard, http://HOST:8265."),
-    ] = False,
+    job: Job = False,
     minutes: Minutes = None,
     steps: Steps = None,
     seed: Seed = None,
@@ -60,58 +100,49 @@ def train(
     object_store: ObjectStore = None,
     dashboard: Dashboard = False,
 ) -> None:
-    """Train a league's policies and publish a version at each checkpoint.
+    """Train a league's policies and publish versions.
 
-    Each version holds one ONNX graph per policy, proven to act as the trained network does. Curves are written for
-    TensorBoard below LEAGUE_HOME/runs. Ctrl-C publishes what there is and ends; after that, or after any other end
-    that was none, `league train CONFIG --resume` goes on.
+    A version is published at each checkpoint. It contains one ONNX graph per policy, tested for the same actions as the
+    trained network. TensorBoard logs are written to LEAGUE_HOME/runs. Ctrl-C publishes the current state and exits;
+    `league train CONFIG --resume` continues after an interruption.
 
-    As a job, training goes on when this command ends; an environment of your own must be installed on the cluster.
+    A job continues when this command exits. Custom environments must be installed on the cluster.
 
-    Next: `league nightly CONFIG` finds out which version is the strongest, and promotes it.
+    Next step: `league nightly CONFIG` finds the strongest version and promotes it.
     """
-    settings = _given(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus)
-    league = LeagueConfig.load(config).with_training(**settings)
+    settings = _without_none(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus)
+    league = _load(config, settings)
     if job:
-        _show_token()
-    from training.cluster import LocalRay, check_unlimited
-
-    local = LocalRay(cpus, object_store, dashboard)
-    if job:
-        if address is None:
-            raise ConfigError("--job needs --address http://HOST:8265, the address of the cluster's dashboard")
-        check_unlimited(local)
-        options = _given(**{"from": parent}, **settings)
-        _submit(address, config, [f"--{name}={value}" for name, value in options.items()] + ["--resume"] * resume)
+        options = _without_none(**{"from": parent}, **settings)
+        _submit(address, find(config), options, resume, (cpus, object_store, dashboard))
         return
-    from league.refs import CheckpointRef, of_league
-    from league.registry.registry import Registry
-    from training.run import train as run
+    from league.ray_cluster import LocalRay
+    from training.runs.train import train as run
 
-    with _ended_by_ctrl_c():
+    with _exit_on_interrupt():
         published = run(
             league,
-            registry=Registry.open(),
+            registry=open_registry(),
             parent=None if parent is None else CheckpointRef.parse(of_league(parent, league.league)),
             resume=resume,
             address=address,
-            local=local,
-            config_path=config,
+            local=LocalRay(cpus, object_store, dashboard),
+            config_path=find(config),
             console=console,
         )
-    if not published:
-        say("Nothing was published: the run ended before its first checkpoint.")
-        return
-    say(f"\nPublished {', '.join(version.ref for version in published)}.")
-    say(f"Next: league nightly {config}   (who is the strongest?)")
+    if published:
+        say(f"\nPublished {', '.join(version.ref for version in published)}.")
+        say(f"Next: league nightly {config}   (find the strongest version)")
+    else:
+        say("No version was published: the run ended before its first checkpoint.")
 
 
 def sweep(
     config: Config,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep that was interrupted.")] = False,
-    publish: Annotated[bool, typer.Option(help="Publish the best trial's last checkpoint as a version.")] = True,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume an interrupted sweep.")] = False,
+    publish: Annotated[bool, typer.Option(help="Publish the last checkpoint of the best trial as a version.")] = True,
     samples: Annotated[
-        int | None, typer.Option(min=1, help="Draws of the random parameters, instead of what CONFIG says.")
+        int | None, typer.Option(min=1, help="Number of samples of the random parameters. Overrides CONFIG.")
     ] = None,
     address: Address = None,
     minutes: Minutes = None,
@@ -123,37 +154,38 @@ def sweep(
     object_store: ObjectStore = None,
     dashboard: Dashboard = False,
 ) -> None:
-    """Train once for each combination of settings that CONFIG's `sweep` names, and find the best.
+    """Train with each combination of settings and report the best.
 
-    Prints all trials, and the best one's settings as they are written in the league's file. Curves of each trial are
-    written for TensorBoard below LEAGUE_HOME/sweeps. Killed in the middle? `league sweep CONFIG --resume` goes on.
+    Runs one trial per combination of the values in CONFIG's `sweep` section. Prints all trials, and the settings of the
+    best one as YAML. TensorBoard logs are written to LEAGUE_HOME/sweeps. `league sweep CONFIG --resume` continues after
+    an interruption.
     """
-    league = LeagueConfig.load(config)
-    league = league.with_training(**_given(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus))
+    from league.ray_cluster import LocalRay
+    from training.sweeps.sweep import sweep as run
+
+    league = _load(config, _without_none(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus))
     if samples is not None and league.sweep is not None:
         league = league.model_copy(update={"sweep": league.sweep.model_copy(update={"samples": samples})})
-    from league.registry.registry import Registry
-    from training.cluster import LocalRay
-    from training.sweep import sweep as run
-
-    with _ended_by_ctrl_c():
+    with _exit_on_interrupt():
         report = run(
             league,
-            registry=Registry.open(),
+            registry=open_registry(),
             resume=resume,
             publish_best=publish,
             address=address,
             local=LocalRay(cpus, object_store, dashboard),
-            config_path=config,
+            config_path=find(config),
             console=console,
         )
-    _tell(report, config)
+    _show(report, config)
     if not report.is_whole:
         raise typer.Exit(INTERRUPTED)
 
 
-def _tell(report: "SweepReport", config: Path) -> None:
-    from training.search import nested
+def _show(report: "SweepReport", config: str) -> None:
+    import yaml
+
+    from training.sweeps.search_space import nested
 
     names = list(report.trials[0].settings)
     table(
@@ -170,58 +202,75 @@ def _tell(report: "SweepReport", config: Path) -> None:
             for trial in report.trials
         ],
     )
-    say(f"\nCurves: tensorboard --logdir {report.path}")
+    say(f"\nPlot the metrics: tensorboard --logdir {report.path}")
     if not report.is_whole:
-        say(f"Not all trials are over. To go on: league sweep {config} --resume")
+        say(f"Some trials are incomplete. To continue: league sweep {config} --resume")
     elif report.best is None:
-        say("No trial has a score: none finished an episode. Give them more steps.")
+        say("No trial has a score, as none completed an episode. Increase the number of steps.")
     else:
-        say(f"Trial {report.best.number} is the best. Its settings:\n")
+        say(f"Best trial: {report.best.number}. Settings:\n")
         say(yaml.safe_dump({"training": nested(report.best.settings)}, sort_keys=False, default_flow_style=None))
     if report.version is not None:
-        say(f"Published it as {report.version.ref}.")
+        say(f"Published as {report.version.ref}.")
 
 
 def _note(error: Exception | None, is_open: bool, ended_early: bool) -> str:
     if error is not None:
         return str(error)
-    return "not over" if is_open else "ended early" if ended_early else ""
+    return "incomplete" if is_open else "ended early" if ended_early else ""
 
 
 def _show_token() -> None:
-    """Ray 2.60 asks for a token at each dashboard by default, but shows the one that this user has only if it was told
-    to before it was imported."""
+    """Let Ray send the user's token to the dashboard. Ray 2.60 reads this setting when it is imported."""
     if os.environ.keys() & TOKENS or Path("~/.ray/auth_token").expanduser().exists():
         os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
-def _submit(address: str, config: Path, arguments: list[str]) -> None:
+def _submit(
+    address: str | None,
+    config: Path,
+    options: dict[str, object],
+    resume: bool,
+    local: tuple[int | None, int | None, bool],
+) -> None:
+    _show_token()
+    from league.ray_cluster import LocalRay, check_unlimited
     from league.settings import Storage
-    from training.job import submit
+    from training.runs.job_submission import submit
 
-    with _ended_by_ctrl_c():
+    if address is None:
+        raise ConfigError("--job requires --address http://HOST:8265, the URL of the cluster's dashboard")
+    check_unlimited(LocalRay(*local))
+    arguments = [f"--{name}={value}" for name, value in options.items()] + ["--resume"] * resume
+    with _exit_on_interrupt():
         submit(address, config, arguments, Storage.from_environment(), say)
 
 
 @contextmanager
-def _ended_by_ctrl_c() -> Iterator[None]:
-    """Ctrl-C is no fault: say what there is to say, and end. What says nothing ends at once."""
+def _exit_on_interrupt() -> Iterator[None]:
+    """Turn Ctrl-C into a message and exit code 130. Without a message the process exits at once."""
     try:
         yield
     except KeyboardInterrupt as end:
         if not str(end):
-            _end_at_once()
+            _exit_at_once()
         say(f"\n{end}")
         raise typer.Exit(INTERRUPTED) from end
 
 
-def _end_at_once() -> NoReturn:
-    """A version may be in the making on a thread of its own. Python would end that thread by force, below Ray's
-    handlers, which take that for a crash. Nothing is lost: --resume publishes it."""
+def _exit_at_once() -> NoReturn:
+    """Exit without stopping threads. Python would end a publishing thread by force, which Ray's handlers report as a
+    crash. --resume publishes the version."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(INTERRUPTED)
 
 
-def _given(**options: object) -> dict[str, object]:
+def _load(config: str, settings: dict[str, object]) -> "LeagueConfig":
+    from league.config import LeagueConfig
+
+    return LeagueConfig.load(find(config)).with_training(**settings)
+
+
+def _without_none(**options: object) -> dict[str, object]:
     return {name: value for name, value in options.items() if value is not None}

@@ -3,45 +3,41 @@
 import getpass
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
 from cli.output import elo, emit, say, table
 from league.errors import ConfigError, InvalidReference
 from league.refs import CHAMPION, CheckpointRef, check_alias, check_slug
-from league.registry.following import await_followers
-from league.registry.registry import Registry
-from league.registry.rows import AliasEvent, VersionRow
 
-LeagueName = Annotated[str, typer.Argument(metavar="LEAGUE", help="The league's name, such as connect_four.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of a table.")]
-Ref = Annotated[str, typer.Argument(metavar="REF", help="Which version, such as connect_four@3.")]
-Reason = Annotated[str, typer.Option(help="Why; kept in the history.")]
-Actor = Annotated[str | None, typer.Option(help="Who; kept in the history. Default: you.")]
-Wait = Annotated[bool, typer.Option("--wait", help="Return when every live replica serves it; exit 1 if one does not.")]
-Timeout = Annotated[float, typer.Option(min=0, help="Seconds that --wait waits.")]
+if TYPE_CHECKING:
+    from evaluation.results import Standing
+    from league.registry.registry import Registry
+    from league.registry.storage.rows import AliasEvent, VersionRow
+
+Ref = Annotated[str, typer.Argument(metavar="REF", help="Version, such as connect_four@3.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Wait until every live replica serves it; exit 1 on timeout.")]
 
 
 def versions(league: LeagueName, as_json: AsJson = False) -> None:
     """List a league's versions with their aliases and ratings.
 
-    A rating is Elo above `script:random` from all matches played so far, with its 95 % interval; – means not yet rated.
+    Ratings are Elo relative to `script:random` with 95 % intervals, from all recorded matches; – means not rated yet.
     """
-    from evaluation.standings import standings
-
-    registry = Registry.open()
-    rows = registry.versions(check_slug("league", league))
-    rated = {standing.ref: standing for standing in standings(registry, league)}
+    registry = open_registry()
+    rows = registry.versions.all(check_slug("league", league))
+    rated = _ratings(registry, league)
     documents = [_document(row, rated.get(row.ref)) for row in rows]
     if as_json:
         emit({"league": league, "versions": documents})
         return
     if not rows:
-        say(f"{league} has no version yet: league train CONFIG")
+        say(f"{league} has no versions yet. Create one: league train CONFIG")
         return
     table(
-        ("version", "aliases", "rating", "games", "steps", "parent", "made", "note"),
+        ("version", "aliases", "rating", "games", "steps", "parent", "created", "note"),
         [
             (
                 row.number,
@@ -58,7 +54,18 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
     )
 
 
-def _document(row: VersionRow, standing: Any) -> dict[str, Any]:
+def _ratings(registry: "Registry", league: str) -> "dict[str, Standing]":
+    """Return the leaderboard by reference. Without games, SciPy is not imported."""
+    from league.results.ledger import Ledger
+
+    if not Ledger(registry).counts(league):
+        return {}
+    from evaluation.matches.leaderboard import compute_leaderboard
+
+    return {standing.ref: standing for standing in compute_leaderboard(registry, league)}
+
+
+def _document(row: "VersionRow", standing: Any) -> dict[str, Any]:
     return {
         "version": row.number,
         "aliases": list(row.aliases),
@@ -75,15 +82,15 @@ def _document(row: VersionRow, standing: Any) -> dict[str, Any]:
 
 def note(
     ref: Ref,
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="What people shall know of it; '' takes the note away.")],
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="New text; an empty string clears the note.")],
     actor: Actor = None,
 ) -> None:
-    """Write of a version what was tried in it, or came of it: `league versions` and the pages show that.
+    """Set or clear the note of a version.
 
-    It takes the place of what was written before.
+    Notes are shown by `league versions` and on the web pages. The new text replaces the previous one.
     """
-    row = Registry.open().note(CheckpointRef.parse(ref), text, actor=actor or getpass.getuser())
-    say(f"{row.ref}: {row.note.text if row.note else 'there is no note any more'}")
+    row = open_registry().versions.set_note(CheckpointRef.parse(ref), text, actor=actor or getpass.getuser())
+    say(f"{row.ref}: {row.note.text if row.note else 'note cleared'}")
 
 
 def promote(
@@ -91,7 +98,9 @@ def promote(
     alias: Annotated[str, typer.Option(help="The alias to move.")] = CHAMPION,
     expected: Annotated[
         str | None,
-        typer.Option(metavar="VERSION", help="Refuse unless the alias points here now (`none`: nowhere)."),
+        typer.Option(
+            metavar="VERSION", help="Fail unless the alias currently points to this version (`none`: to no version)."
+        ),
     ] = None,
     reason: Reason = "promoted by hand",
     actor: Actor = None,
@@ -99,15 +108,15 @@ def promote(
     timeout: Timeout = 30.0,
     as_json: AsJson = False,
 ) -> None:
-    """Make a version the champion (or move another alias to it).
+    """Make a version the champion, or move another alias to it.
 
-    Every serving replica follows within a second; --wait returns when all have said so. Without --expected the move is
-    against what the alias is now, so of two promotions at the same moment one wins and the other is told.
+    Replicas serve the new version within a second; --wait waits for their confirmation. Without --expected, the current
+    version of the alias is expected, so only one of two concurrent promotions succeeds.
     """
-    registry = Registry.open()
-    version = registry.resolve(CheckpointRef.parse(ref))
-    current = registry.aliases(version.league).get(check_alias(alias))
-    event = registry.set_alias(
+    registry = open_registry()
+    version = registry.versions.resolve(CheckpointRef.parse(ref))
+    current = registry.aliases.current(version.league).get(check_alias(alias))
+    event = registry.aliases.set(
         version.league,
         alias,
         version.number,
@@ -122,7 +131,7 @@ def _expected(text: str) -> int | None:
     if text == "none":
         return None
     if not text.isdigit():
-        raise InvalidReference(f"--expected {text!r}: a version number, or `none`, was expected")
+        raise InvalidReference(f"--expected {text!r}: expected a version number or `none`")
     return int(text)
 
 
@@ -134,41 +143,45 @@ def rollback(
     timeout: Timeout = 30.0,
     as_json: AsJson = False,
 ) -> None:
-    """Return to the champion before the present one."""
-    registry = Registry.open()
-    event = registry.rollback(check_slug("league", league), actor=actor or getpass.getuser(), reason=reason)
+    """Restore the previous champion.
+
+    Moves the alias `champion` to the version that it pointed to before, and records the move in the history.
+    """
+    registry = open_registry()
+    event = registry.aliases.rollback(check_slug("league", league), actor=actor or getpass.getuser(), reason=reason)
     _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
 
 
-def _followers(registry: Registry, event: AliasEvent, timeout: float) -> list[str]:
-    return await_followers(registry, event.league, event.alias, event.version, timeout)
+def _followers(registry: "Registry", event: "AliasEvent", timeout: float) -> list[str]:
+
+    return registry.changes.wait_for_alias(event.league, event.alias, event.version, timeout)
 
 
-def _moved(event: AliasEvent, as_json: bool, replicas: list[str] | None) -> None:
-    """Say what has moved, and who follows if that was waited for."""
+def _moved(event: "AliasEvent", as_json: bool, replicas: list[str] | None) -> None:
+    """Print the move of an alias, and the replicas that have confirmed it."""
     if as_json:
         emit(asdict(event) | ({} if replicas is None else {"replicas": replicas}))
         return
     if event.previous == event.version:
-        say(f"{event.league}@{event.alias} is version {event.version} already.")
+        say(f"{event.league}@{event.alias} already points to version {event.version}.")
     else:
         before = "nothing" if event.previous is None else f"version {event.previous}"
-        say(f"{event.league}@{event.alias} is now version {event.version} (before: {before}).")
+        say(f"{event.league}@{event.alias} now points to version {event.version} (before: {before}).")
     if replicas is not None:
         say(f"All {len(replicas)} replicas serve it.")
 
 
 def history(
     league: LeagueName,
-    alias: Annotated[str, typer.Option(help="Whose history.")] = CHAMPION,
+    alias: Annotated[str, typer.Option(help="Name of the alias.")] = CHAMPION,
     at: Annotated[
-        str | None, typer.Option(help="Only what was in force at this time, e.g. '2026-03-03 14:00'.")
+        str | None, typer.Option(help="Show only the entry in effect at this time, such as '2026-03-03 14:00'.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show which version was champion when, who moved it, why, and on which verdict."""
+    """Show when and why an alias moved, and who moved it."""
     when = None if at is None else _moment(at)
-    events = Registry.open().history(check_slug("league", league), check_alias(alias), when)
+    events = open_registry().aliases.history(check_slug("league", league), check_alias(alias), when)
     if as_json:
         emit({"league": league, "alias": alias, "events": [asdict(event) for event in events]})
         return
@@ -176,7 +189,7 @@ def history(
         say(f"{league}@{alias} has no history{'' if at is None else ' at that time'}.")
         return
     table(
-        ("when", "version", "before", "who", "why", "verdict"),
+        ("time", "version", "before", "actor", "reason", "verdict"),
         [(event.at, event.version, event.previous, event.actor, event.reason, event.verdict) for event in events],
     )
 

@@ -1,1 +1,1 @@
-"""Who is stronger, how sure are we, and may it be promoted."""
+"""Evaluation of versions: matches, ratings, statistical gates, nightly runs, reports and playback."""

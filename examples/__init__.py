@@ -1,1 +1,1 @@
-"""Environments to learn from and to start from."""
+"""Example environments for tutorials, tests and benchmarks."""

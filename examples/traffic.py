@@ -1,13 +1,13 @@
-"""Cars and traffic lights at a crossing: an RLlib MultiAgentEnv of two kinds of agents with different spaces.
+"""Cars and traffic lights at a crossing: an RLlib MultiAgentEnv with two kinds of agents and spaces.
 
-Two roads cross. On each, cars stand in line at random distances, and a light stands before the crossing. In each step
-a car waits or drives one cell, and a light chooses its colour for the next step. A car that drives from distance 1
-passes the crossing and leaves. What anybody does concerns others: a green light alone lets cars pass, two of them are
-dangerous, and a car that passes at red may hit one of the other road. All is deterministic but the first distances.
+On each of two crossing roads, cars wait in line at random distances before a traffic light. In each step, a car waits
+or drives one cell, and a light sets its colour for the next step. A car that drives from distance 1 passes the crossing
+and leaves. Agents depend on each other: cars only pass safely at green, two green lights are dangerous, and a car that
+passes at red may collide with the other road's. Everything but the initial distances is deterministic.
 
 | | reward in each step |
 |---|---|
-| car | −1 until it has passed; −10 for passing at red; −20 for passing together with one of the other road |
+| car | −1 until it has passed; −10 for passing at red; −20 for passing together with a car of the other road |
 | light | −½ for each car that has not passed; −5 if both are green |
 """
 
@@ -25,17 +25,18 @@ RED, GREEN = 0, 1
 AT_RED, CRASH, BOTH_GREEN, WAITING = -10.0, -20.0, -5.0, -0.5
 
 Distances = tuple[tuple[int, ...], ...]
-"""road → car → cells to the crossing; 0 has passed. The first car of a road is the nearest."""
+"""road → car → cells to the crossing; 0 if it has passed. The first car of a road is the nearest."""
 Colours = tuple[int, ...]
 
 
 class Crossing(MultiAgentEnv):
     """Agents `car_<road>_<place>` and `light_<road>`.
 
-    A car observes Box(6 + cars,) float32: its distance, the colour before it, the other road's colour, the distance of
-    the car ahead (0: none), its road and place, then the distances on the other road. A light observes MultiDiscrete:
-    all distances, its own road's first, its colour, the other's, and its road, so that the two, who share a policy,
-    need not do the same where they see the same. Both act Discrete(2): wait or drive, red or green.
+    A car observes Box(6 + cars,) float32: its distance, its light's colour, the other light's colour, the distance of
+    the
+    car ahead (0: none), its road and place, then the distances on the other road. A light observes MultiDiscrete: all
+    distances, its own road's first, its colour, the other's, and its road, so that the two lights can act differently
+    although they share a policy. All act Discrete(2): wait or drive, red or green.
     """
 
     def __init__(self, cars: int = 2, length: int = 4, steps: int = 20, render_mode: str | None = None) -> None:
@@ -58,7 +59,7 @@ class Crossing(MultiAgentEnv):
         seed: int | None = None,
         options: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Draw distances; both lights are red."""
+        """Draw initial distances; both lights are red."""
         self.distances = self.starts[int(np.random.default_rng(seed).integers(len(self.starts)))]
         self.colours: Colours = (RED,) * ROADS
         self.time = 0
@@ -66,7 +67,7 @@ class Crossing(MultiAgentEnv):
         return self._observations(), {}
 
     def step(self, actions: dict[str, int]) -> tuple[dict[str, Any], ...]:
-        """One step of everybody who is still there."""
+        """Take a step of all agents that are present."""
         drives = tuple(tuple(actions.get(f"car_{road}_{i}", 0) for i in range(self.cars)) for road in range(ROADS))
         chosen = tuple(actions[light] for light in self.lights)
         before = self.distances
@@ -84,7 +85,7 @@ class Crossing(MultiAgentEnv):
         return observations, paid, terminated, truncated, {}
 
     def render(self) -> NDArray:
-        """(height, width, 3) uint8: the two roads, their lights, and the cars as squares."""
+        """Return (height, width, 3) uint8: the roads, their lights, and the cars as squares."""
         cell, cells = 24, 2 * self.length + 1
         picture = np.full((cells * cell, cells * cell, 3), 40, np.uint8)
         middle = slice(self.length * cell, (self.length + 1) * cell)
@@ -123,18 +124,18 @@ class Crossing(MultiAgentEnv):
 
 
 def crossing(**kwargs: Any) -> Crossing:
-    """The entry point for configurations."""
+    """Entry point for configurations."""
     return Crossing(**kwargs)
 
 
 def starts(cars: int, length: int) -> list[Distances]:
-    """All first distances; each is equally likely."""
+    """Return all initial distances; they are equally likely."""
     one_road = list(combinations(range(1, length + 1), cars))
     return [tuple(both) for both in product(one_road, repeat=ROADS)]
 
 
 def move(distances: Distances, colours: Colours, drives: Distances) -> tuple[Distances, tuple[tuple[float, ...], ...]]:
-    """Distances after a step, and each car's reward; 0 for those that have passed before."""
+    """Return the distances after a step, and each car's reward; 0 for cars that passed earlier."""
     passing = [
         any(distance == 1 and drive for distance, drive in zip(*road, strict=True))
         for road in zip(distances, drives, strict=True)
@@ -151,7 +152,7 @@ def move(distances: Distances, colours: Colours, drives: Distances) -> tuple[Dis
             reward = -1.0
             target = distance - 1 if drive else distance
             if i and target and now[i - 1] == target:
-                target = distance  # the car ahead stands there
+                target = distance  # the car ahead is there
             if target == 0:
                 reward += (AT_RED if colours[road] == RED else 0.0) + (CRASH if all(passing) else 0.0)
             now.append(target)
@@ -162,14 +163,16 @@ def move(distances: Distances, colours: Colours, drives: Distances) -> tuple[Dis
 
 
 def lights_reward(distances: Distances, colours: Colours) -> float:
-    """What each light gets for a step that begins so."""
+    """Return each light's reward for a step that starts in this state."""
     left = sum(distance > 0 for road in distances for distance in road)
     return WAITING * left + (BOTH_GREEN if all(colours) else 0.0)
 
 
 def optimum(cars: int = 2, length: int = 4, steps: int = 20) -> float:
-    """The largest expected return per agent of an episode that any joint policy can have, by dynamic programming over
-    all that may happen: Bellman, 1957, V(s, t) = max_a [r(s, a) + V(s', t + 1)], averaged over the starts."""
+    """Return the maximum expected return per agent over all joint policies, by dynamic programming.
+
+    Bellman, 1957: V(s, t) = max_a [r(s, a) + V(s', t + 1)], averaged over the initial states.
+    """
 
     @cache
     def value(distances: Distances, colours: Colours, time: int) -> float:

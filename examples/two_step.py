@@ -1,14 +1,14 @@
-"""The two-step game of the QMIX paper, for two agents that are paid together: what a sum of values cannot say.
+"""The two-step game of the QMIX paper: two cooperating agents whose value is not a sum of agent values.
 
-In the first step the first agent chooses which of two matrix games is played in the second one; what the other agent
-does then is of no account. The second step pays by both actions, to both agents alike, and ends the episode.
+In the first step, the first agent selects one of two matrix games; the other agent's action has no effect. The second
+step pays both agents equally by both actions, and ends the episode.
 
 | game | payoffs, row: action of the first agent, column: of the second |
 |---|---|
 | A | 7 everywhere |
 | B | 0 1 / 1 8 |
 
-The best play chooses B, and then both the second action: 8. Agents whose values are added take B for the worse game
+Optimal play selects B and then the second action twice: 8. Agents whose values are added underestimate B
 (Rashid et al., 2018, arXiv 1803.11485, section 5).
 """
 
@@ -28,31 +28,33 @@ PAYOFFS = {GAME_A: np.full((2, 2), 7.0), GAME_B: np.array([[0.0, 1.0], [1.0, 8.0
 
 
 def values(gamma: float) -> NDArray:
-    """(3, 2, 2): the value of each pair of actions in each state, by the first agent's action, then the second's, with
-    the best play after it. Bellman: Q(s₁, u) = γ max Q(s₂, ·)."""
+    """Return the optimal values of action pairs, (3, 2, 2): state, first agent's action, second agent's action.
+
+    Bellman: Q(s₁, u) = γ max Q(s₂, ·).
+    """
     later = [gamma * PAYOFFS[game].max() for game in (GAME_A, GAME_B)]
     return np.stack([np.repeat(later, 2).reshape(2, 2), PAYOFFS[GAME_A], PAYOFFS[GAME_B]])
 
 
 class _Game:
-    """The rules, whatever the API."""
+    """The rules, independent of the API."""
 
     state = FIRST
 
     def play(self, first: int, second: int) -> tuple[float, bool]:
-        """Both act: what each is paid, and whether the episode is over."""
+        """Play both actions; return each agent's reward, and whether the episode is over."""
         if self.state == FIRST:
             self.state = GAME_A if first == 0 else GAME_B
             return 0.0, False
         return float(PAYOFFS[self.state][first, second]), True
 
     def one_hot(self) -> NDArray:
-        """(3,) float32 of the state; the last one's after the end."""
+        """Return the one-hot state, (3,) float32; after the end, the last one."""
         return np.eye(STATES, dtype=np.float32)[self.state]
 
 
 class TwoStep(ParallelEnv):
-    """As a PettingZoo Parallel environment. Both agents observe the state, one-hot, which is the global state, too."""
+    """A PettingZoo Parallel environment. Both agents observe the one-hot state, which is also the global state."""
 
     metadata = {"name": "two_step", "render_modes": []}  # noqa: RUF012  # PettingZoo's name and form
     render_mode = None
@@ -71,7 +73,7 @@ class TwoStep(ParallelEnv):
         return self._action
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:  # noqa: ARG002
-        """Nothing is random."""
+        """Reset; nothing is random."""
         self.agents, self._game = list(AGENTS), _Game()
         return self._observations(), {agent: {} for agent in AGENTS}
 
@@ -94,7 +96,7 @@ class TwoStep(ParallelEnv):
 
 
 class RLlibTwoStep(MultiAgentEnv):
-    """As an RLlib MultiAgentEnv: observations (3,) float32 as above; the global state is in the agents' infos."""
+    """An RLlib MultiAgentEnv: observations as above; the global state is in the agents' infos."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,7 +112,7 @@ class RLlibTwoStep(MultiAgentEnv):
         seed: int | None = None,  # noqa: ARG002
         options: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Nothing is random."""
+        """Reset; nothing is random."""
         self.agents, self._game = list(AGENTS), _Game()
         return self._seen()
 
@@ -125,10 +127,10 @@ class RLlibTwoStep(MultiAgentEnv):
 
 
 def parallel_env() -> TwoStep:
-    """The entry point for configurations: PettingZoo's API."""
+    """Entry point for configurations: PettingZoo's API."""
     return TwoStep()
 
 
 def multi_agent_env() -> RLlibTwoStep:
-    """The entry point for configurations: RLlib's API."""
+    """Entry point for configurations: RLlib's API."""
     return RLlibTwoStep()

@@ -1,6 +1,6 @@
-"""A league, whole, in one YAML file: environment, policies, sides, play, training and gate.
+"""Configuration of a league, read from one YAML file: environment, policies, sides, matches, training and gate.
 
-Unknown keys are refused, everything is frozen, and an error names the file, the key and what was expected.
+All models are frozen and reject unknown keys. Errors name the file, the key and the expected value.
 """
 
 import difflib
@@ -11,81 +11,47 @@ from typing import Any, Literal, Self, get_args, get_origin
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
-from league.errors import ConfigError, InvalidReference
-from league.interface import digest
-from league.parts import Part
+from league.environment_config import JSON, EnvironmentConfig, Part
+from league.errors import ConfigError, InvalidReference, one_line
 from league.refs import check_slug
 from league.training_config import ALGORITHMS, PPOConfig, TrainingConfig
 
-JSON = dict[str, Any]
+RENAMED_KEYS = {"copies": "num_envs"}
+"""Former key → current key."""
 ONE_POLICY: dict[str, tuple[str, ...]] = {"shared": ("*",)}
 
 
-class WrapperConfig(Part):
-    """One SuperSuit wrapper by name, `{name: {argument: value}}` in YAML, applied in the order of the list."""
-
-    name: str
-    kwargs: JSON = Field(default={})
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_yaml(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return {"name": value}
-        if isinstance(value, dict) and len(value) == 1 and "name" not in value:
-            name, kwargs = next(iter(value.items()))
-            return {"name": name, "kwargs": kwargs or {}}
-        return value
-
-
-class EnvironmentConfig(Part):
-    """Which environment is played, and with which wrappers."""
-
-    entry_point: str
-    """A PettingZoo module (`pettingzoo.classic.connect_four_v3`) or a function (`package.module:function`)."""
-    api: Literal["aec", "parallel", "rllib"] | None = None
-    """PettingZoo's AEC or Parallel API, or RLlib's MultiAgentEnv. By default that of what a function returns; a module
-    with `parallel_env` is taken as Parallel, one with `env` alone as AEC."""
-    kwargs: JSON = Field(default={})
-    """Arguments of the environment's constructor."""
-    wrappers: tuple[WrapperConfig, ...] = ()
-
-    def digest(self) -> str:
-        """SHA-256 of the environment: results of environments with other digests are never mixed."""
-        return digest(self.model_dump(mode="json"))
-
-
 class PlayConfig(Part):
-    """How matches are played."""
+    """Settings of matches."""
 
     opening_plies: int = Field(default=0, ge=0)
-    """Random legal steps at the start of each game. A deterministic game between greedy policies needs some:
-    without them it repeats one game for ever."""
+    """Random legal steps at the start of each game. Without them, greedy policies repeat one game of a deterministic
+    environment."""
     scoring: Literal["game", "side"] | None = None
-    """Whom a contestant is compared with: its opponents in the same game, or the other contestant on the same side of
-    the block's other game. By default `game` where there are several sides and all are alike, else `side`."""
-    copies: int = Field(default=32, ge=1)
-    """Games stepped together in one worker. Has no influence on any result."""
+    """What a contestant's return is compared with. game: the returns of its opponents in the same game. side: the
+    return of the other contestant on the same side in the block's other game. By default `game` if there are several
+    equivalent sides, else `side`."""
+    num_envs: int = Field(default=32, ge=1)
+    """Games stepped in parallel in one worker. Does not influence results."""
     max_moves: int = Field(default=10_000, ge=1)
-    """Steps of the environment after which a game counts as hung and the match fails; where several agents act at once,
-    their actions are one step."""
+    """Environment steps after which a game counts as hung and its match fails. Simultaneous actions of several agents
+    are one step."""
     game_seconds: float = Field(default=600.0, gt=0, allow_inf_nan=False)
-    """Seconds of the environment's own work on one game after which it counts as hung, too: of its reset and its steps,
-    and not of the other games that are stepped beside it."""
+    """Seconds of environment time (resets and steps of this game alone) after which a game counts as hung."""
 
 
-LARGEST_NORMALIZED_ELO = 190
-"""Farther hypotheses have no usable test: see evaluation/sequential.py."""
+MAX_NORMALIZED_ELO = 190
+"""Bound for hypotheses with a usable test; see evaluation/statistics/sequential.py."""
 
 
 class AnchorConfig(Part):
-    """Somebody held out of training, to whom a challenger must not be inferior."""
+    """An opponent for the non-inferiority test of a candidate."""
 
     ref: str
-    """A script (`script:one_ply`), a version (`connect_four@3`), or an alias, which is pinned when a verdict opens;
-    `@3` and `@gold` are short for those of the league itself."""
+    """A script (`script:one_ply`), a version (`connect_four@3`), or an alias, which is resolved when the verdict is
+    opened. `@3` and `@gold` refer to the league itself."""
     margin: float | None = Field(default=None, gt=0)
-    """By how much it may be weaker; by default the gate's."""
+    """Non-inferiority margin; by default the gate's `margin`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -94,46 +60,47 @@ class AnchorConfig(Part):
 
 
 class GateConfig(Part):
-    """What a challenger must show to be promoted. See docs/statistics.md."""
+    """The statistical test for promotions. See docs/statistics.md."""
 
     model: Literal["logistic", "normalized", "returns"] = "normalized"
-    """What a block counts: its score, in logistic or normalized Elo (GSPRT), or the difference of returns (betting)."""
+    """The observed quantity of a block: its score in logistic or normalized Elo (GSPRT), or its difference of returns
+    (test by betting)."""
     elo0: float = 0.0
-    """H0: the challenger is this much stronger than the champion, in Elo of `model`."""
+    """H0: strength of the candidate relative to the champion, in Elo of `model`."""
     elo1: float = 30.0
-    """H1: the challenger is this much stronger."""
+    """H1: strength of the candidate relative to the champion."""
     return0: float = 0.0
-    """H0 of the model `returns`: its mean return is at most this much greater."""
+    """H0 of the model `returns`: upper bound of the mean difference of returns."""
     return1: float = 0.0
-    """H1 of the model `returns`: its mean return is at least this much greater."""
+    """H1 of the model `returns`: lower bound of the mean difference of returns."""
     return_bound: float | None = Field(default=None, gt=0)
-    """No block's returns differ by more; `returns` needs it."""
+    """Maximum absolute difference of returns in a block. Required by the model `returns`."""
     alpha: float = Field(default=0.05, gt=0, lt=0.5)
-    """Probability of promoting any challenger under H0 in a year of nights."""
+    """Probability of promoting at least one candidate under H0 in a year of nightly runs."""
     nights: int | None = Field(default=365, ge=1)
-    """Nights of a year, over which alpha is spent in equal parts; the candidates of a night share its part. Null: every
-    verdict has all of alpha for itself."""
+    """Nightly runs per year, among which alpha is divided equally; the candidates of a run share its part. Null: each
+    verdict uses the full alpha."""
     beta: float = Field(default=0.05, gt=0, lt=0.5)
-    """Probability of rejecting a challenger under H1."""
+    """Probability of rejecting a candidate under H1."""
     max_blocks: int = Field(default=4000, ge=1)
-    """Blocks of one test after which it is `inconclusive` and the champion stays."""
+    """Blocks after which a test ends as `inconclusive` and the champion stays."""
     anchors: tuple[AnchorConfig, ...] = ()
-    """Those to whom a challenger must not be inferior, besides earlier champions."""
+    """Opponents of non-inferiority tests, in addition to previous champions."""
     earlier_champions: int = Field(default=2, ge=0)
-    """How many champions before the present one are anchors, too."""
+    """Number of previous champions that are anchors."""
     margin: float = Field(default=50.0, gt=0)
-    """How much weaker than an anchor a challenger may be, in Elo of `model`, or in returns."""
+    """Non-inferiority margin, in Elo of `model` or in returns."""
     confirmation_blocks: int = Field(default=200, ge=0)
-    """Fresh blocks against the champion of before, played after a promotion: how much was really gained."""
+    """Blocks against the previous champion after a promotion, for an unbiased estimate of the improvement."""
     forfeits: bool = False
-    """Whether a challenger may be promoted that forfeited a game, by an illegal action or a crash."""
+    """Whether a candidate that forfeited a game (illegal action or crash) may be promoted."""
     shadow_agreement: float | None = Field(default=None, ge=0, le=1)
-    """Share of mirrored observations on which the challenger must act as the champion does; null asks for none. Like
-    `latency_ms`, it applies where there is a champion, whose requests can be mirrored."""
+    """Minimum fraction of mirrored observations for which candidate and champion choose the same action; null for no
+    minimum. Like `latency_ms`, it applies only if the league has a champion."""
     latency_ms: float | None = Field(default=None, gt=0)
-    """Milliseconds of the processor within which the challenger must compute 95 % of mirrored requests."""
+    """Maximum of the 95th percentile of the candidate's CPU time per mirrored request, in milliseconds."""
     shadow_observations: int = Field(default=1000, ge=1)
-    """Mirrored observations without which those two are not known."""
+    """Minimum number of mirrored observations for these two criteria."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -143,16 +110,16 @@ class GateConfig(Part):
             return self
         if not self.elo0 < self.elo1:
             raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
-        if self.model == "normalized" and max(-self.elo0, self.elo1, *margins) > LARGEST_NORMALIZED_ELO:
+        if self.model == "normalized" and max(-self.elo0, self.elo1, *margins) > MAX_NORMALIZED_ELO:
             raise ValueError(
-                f"elo0, elo1 and margins must lie within ±{LARGEST_NORMALIZED_ELO} (normalized Elo),"
+                f"elo0, elo1 and margins must lie within ±{MAX_NORMALIZED_ELO} (normalized Elo),"
                 f" got {self.elo0:g}, {self.elo1:g} and {max(margins):g}"
             )
         return self
 
     def _check_returns(self, margin: float) -> None:
         if self.return_bound is None:
-            raise ValueError("the model returns needs return_bound: by how much the returns of a block can differ")
+            raise ValueError("model: returns requires return_bound, the maximum difference of returns in a block")
         if not -self.return_bound < self.return0 <= self.return1 < self.return_bound:
             raise ValueError(
                 f"return0 and return1 must lie within ±{self.return_bound:g} (return_bound), return0 first,"
@@ -162,52 +129,53 @@ class GateConfig(Part):
             raise ValueError(f"margin must be smaller than return_bound ({self.return_bound:g}), got {margin:g}")
 
     def against_anchor(self, margin: float | None) -> Self:
-        """The test of non-inferiority: H0 is being weaker by the margin, H1 being as strong."""
+        """Return the settings of a non-inferiority test. H0: weaker by the margin; H1: equally strong."""
         below = -(self.margin if margin is None else margin)
         zero = {"return0": below, "return1": 0.0} if self.model == "returns" else {"elo0": below, "elo1": 0.0}
         return self.model_copy(update=zero)
 
     def of_one_verdict(self, alpha: float) -> Self:
-        """The same for a verdict that spends this much of alpha."""
+        """Return the settings of one verdict with error probability `alpha`."""
         return self.model_copy(update={"alpha": alpha, "nights": None})
 
 
 class AshaConfig(Part):
-    """Asynchronous successive halving: bad trials end early (Li et al., 2020, arXiv 1810.05934)."""
+    """Early stopping by asynchronous successive halving (Li et al., 2020, arXiv 1810.05934)."""
 
     grace_steps: int = Field(default=50_000, ge=1)
-    """Actions that each trial gets."""
+    """Minimum number of actions per trial."""
     reduction_factor: int = Field(default=3, ge=2)
-    """One of this many trials goes on at each rung."""
+    """At each rung, one in this many trials continues."""
 
 
 class SweepConfig(Part):
-    """A search over training settings: `league sweep`."""
+    """Search over training settings (`league sweep`)."""
 
     parameters: dict[str, JSON | list[Any]] = Field(min_length=1)
-    """Training setting → a list of values (all are tried), or one of `{choice: [..]}`, `{uniform: [low, high]}`,
-    `{loguniform: [low, high]}`, `{randint: [low, high]}`. A setting of one policy is `per_policy.<id>.<setting>`."""
+    """Training setting → a list of values (grid search), or a distribution: `{choice: [..]}`, `{uniform: [low, high]}`,
+    `{loguniform: [low, high]}`, `{randint: [low, high]}`. Settings of one policy are `per_policy.<id>.<setting>`."""
     samples: int = Field(default=1, ge=1)
-    """Draws of the random parameters, for each combination of the lists."""
+    """Samples of the random parameters for each combination of the lists."""
     concurrent: int = Field(default=1, ge=1)
-    """Trials at once, as far as there are CPUs."""
+    """Maximum number of concurrent trials, also limited by the CPUs."""
     metric: str = "return"
-    """What is compared: a curve of the run, `return` or `<policy>/return`."""
+    """Metric of the run by which trials are compared, such as `return` or `<policy>/return`."""
     mode: Literal["max", "min"] = "max"
     asha: AshaConfig | None = None
-    """End bad trials early; null lets each use its whole budget."""
+    """Early stopping; null trains each trial to its full budget."""
 
 
 class LeagueConfig(Part):
-    """One league. Only `league` and `environment` are required."""
+    """Configuration of a league. Only `league` and `environment` are required."""
 
     league: str
+    """Name of the league: a-z, 0-9, `_` and `-`."""
     environment: EnvironmentConfig
     policies: dict[str, tuple[str, ...]] | str = Field(default=ONE_POLICY)
-    """policy id → agents, by name or pattern (`player_*`); the first policy whose pattern fits takes the agent. Or a
-    function `package.module:function`: agent → policy id."""
+    """Policy id → agents, by name or pattern (`player_*`); the first match determines an agent's policy. Alternatively
+    a function `package.module:function` from agent to policy id."""
     sides: dict[str, tuple[str, ...]] | None = None
-    """side → agents, by name or pattern; by default each agent is a side of its own."""
+    """Side → agents, by name or pattern. By default each agent is a separate side."""
     play: PlayConfig = PlayConfig()
     training: TrainingConfig = PPOConfig()
     gate: GateConfig = GateConfig()
@@ -224,34 +192,34 @@ class LeagueConfig(Part):
         if isinstance(value, str) and not all(part.strip() for part in value.partition(":")):
             raise ValueError("expected policy ids with their agents, or a function package.module:function")
         if isinstance(value, dict) and not value:
-            raise ValueError("must name at least one")
+            raise ValueError("expected at least one entry")
         for key in value if isinstance(value, dict) else ():
             _slug("name", key)
         return value
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a league's file. Raises ConfigError."""
+        """Read a YAML file. Raises ConfigError if it cannot be read, or the configuration is invalid."""
         try:
             document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+            raise ConfigError(f"{path}: not a YAML file: {one_line(error)}") from error
         return cls.from_mapping(document, source=str(path))
 
     @classmethod
     def from_mapping(cls, document: Any, source: str = "configuration") -> Self:
-        """Check a league's settings. `source` names them in errors. Raises ConfigError."""
+        """Validate a mapping, as parsed from YAML. Raises ConfigError, whose message names `source`."""
         if not isinstance(document, Mapping):
-            raise ConfigError(f"{source}: expected keys such as 'league' and 'environment' at the top")
+            raise ConfigError(f"{source}: expected a mapping with keys such as 'league' and 'environment'")
         try:
             return cls.model_validate(document)
         except ValidationError as error:
-            raise ConfigError(f"{source}: {_sentence(cls, error)}") from error
+            raise ConfigError(f"{source}: {_describe(cls, error)}") from error
 
     def with_training(self, **settings: Any) -> Self:
-        """The same league with some training settings replaced, checked anew."""
+        """Return the configuration with some training settings replaced. Raises ConfigError if it is invalid."""
         training = self.training.model_dump(by_alias=True) | settings
         return self.from_mapping(self.model_dump(by_alias=True) | {"training": training}, source=self.league)
 
@@ -263,20 +231,22 @@ def _slug(kind: str, value: str) -> str:
         raise ValueError(str(error)) from error
 
 
-def _sentence(model: type[BaseModel], error: ValidationError) -> str:
-    """The first faults of a ValidationError in a person's words."""
-    return "; ".join(_fault(model, detail) for detail in error.errors()[:3])
+def _describe(model: type[BaseModel], error: ValidationError) -> str:
+    """The first errors of a ValidationError as a sentence."""
+    return "; ".join(_describe_one(model, detail) for detail in error.errors()[:3])
 
 
-def _fault(model: type[BaseModel], detail: Any) -> str:
+def _describe_one(model: type[BaseModel], detail: Any) -> str:
     path, known_by = [str(part) for part in detail["loc"]], model
     if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
-        # Pydantic names the member of the union, too.
+        # Pydantic includes the member of the union in the path.
         known_by = ALGORITHMS[path.pop(1)]
     key = ".".join(path) or "file"
     match detail["type"]:
         case "missing":
-            return f"{key}: missing, it is required"
+            return f"{key}: missing, but required"
+        case "extra_forbidden" if path[-1] in RENAMED_KEYS:
+            return f"{key}: this key has been renamed to {RENAMED_KEYS[path[-1]]!r}"
         case "extra_forbidden":
             known = _known_keys(known_by, path[:-1] if known_by is model else path[1:-1])
             guess = difflib.get_close_matches(path[-1], known, n=1)
@@ -293,7 +263,7 @@ def _fault(model: type[BaseModel], detail: Any) -> str:
 def _known_keys(model: type[BaseModel], path: list[str]) -> list[str]:
     for part in path:
         if part.isdigit():
-            continue  # a place in a list, whose members are of the model already
+            continue  # the index of a list whose item model is already current
         fields = {field.alias or name: field for name, field in model.model_fields.items()}
         annotation = fields[part].annotation if part in fields else None
         while get_origin(annotation) is not None and get_args(annotation):

@@ -1,344 +1,236 @@
-"""The error hierarchy. Errors are raised low and translated once, at the edge (the CLI's exit code, the HTTP status).
+"""The exceptions of the program, with stable error codes for the HTTP API.
 
-LeagueError
-├── InvalidInput              the caller's mistake
-│   ├── ConfigError             a league's YAML file, or a setting
-│   ├── InvalidReference        text that is no reference
-│   ├── ObservationError        an array that does not fit its space
-│   ├── IllegalMask             an action mask that is not one, or allows nothing
-│   ├── IllegalAction           an action outside the mask or the space
-│   ├── InvalidReward           a reward that is no finite number
-│   ├── InvalidState            recurrent state that no reply gave, or that is another version's
-│   ├── BodyTooLarge            a request, or a batch in it, beyond the limit
-│   └── EnvironmentMismatch     an environment, script or version that does not belong together
-├── NotFound
-│   ├── UnknownLeague
-│   ├── UnknownVersion
-│   ├── VersionRetired          a version that is served no more
-│   ├── UnknownAlias
-│   ├── UnknownPolicy
-│   ├── UnknownEvaluation
-│   ├── UnknownRun
-│   ├── UnknownVerdict
-│   ├── UnknownMatch
-│   └── UnknownKey
-├── Conflict                  the world has moved on
-│   ├── AliasMoved              a compare-and-set lost
-│   ├── InterfaceChanged        other spaces or policy ids than the league's versions have
-│   ├── LedgerRefusal           a result that breaks its schedule
-│   ├── NothingToRollBack
-│   ├── NameTaken
-│   ├── KeyReused               an Idempotency-Key that stands for another call
-│   └── AlreadyRunning          a second one of what may run once
-├── Unauthenticated           no API key where one is needed, or one that opens nothing
-├── Forbidden                 an API key that is not for this
-├── RateLimited               an API key that calls more often than it may
-├── Overloaded                more requests at once than a server takes
-│   └── TooManyEvaluations      more evaluations at once than it takes
-├── DeadlineExceeded          a request that was not answered in its time
-├── ArtifactCorrupt           a file whose digest is not the manifest's
-├── GameHung                  a game that does not end
-├── BoundExceeded             returns that differ by more than a gate was told they can
-├── GameCrashed               a game whose environment raised
-├── WorkerLost                worker processes that die again and again
-├── VerdictRefuted            a verdict whose record is not what its games say
-├── ParityError               an exported graph that acts otherwise than the trained module
-├── NotReady                  a policy that nothing serves yet
-│   └── NoStudio                a server without what plays games
-├── RemoteError               a policy server that cannot be reached or failed
-└── StorageError              disk full, read-only, database gone
+Errors are raised where they occur and translated once: by the CLI to an exit code, by the server to an HTTP status.
 """
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 
 class LeagueError(Exception):
-    """A fault that a person is told in one sentence. `code` is stable: clients may rely on it."""
+    """Base class. The message is one sentence for the user; `code` is stable, so clients may rely on it."""
 
     code: ClassVar[str] = "league_error"
 
+    def __init_subclass__(cls, *, code: str | None = None) -> None:
+        # Ray derives a class without a code from that of an error in a remote task.
+        cls.code = code or cls.code
 
-class InvalidInput(LeagueError):
-    """What the caller gave cannot be used."""
 
-    code = "invalid_input"
+class InvalidInput(LeagueError, code="invalid_input"):
+    """The input is invalid."""
 
 
-class ConfigError(InvalidInput):
-    """A configuration that is refused; the message names the file, the key and what was expected."""
+class ConfigError(InvalidInput, code="invalid_config"):
+    """A configuration is invalid. The message names the file, the key and the expected value."""
 
-    code = "invalid_config"
 
+class InvalidReference(InvalidInput, code="invalid_reference"):
+    """A reference is malformed. Valid ones: `connect_four@3`, `connect_four@champion`, `script:random`."""
 
-class InvalidReference(InvalidInput):
-    """Text that is no reference such as `connect_four@3`, `connect_four@champion` or `script:random`."""
 
-    code = "invalid_reference"
+class ObservationError(InvalidInput, code="invalid_observation"):
+    """The shape, dtype or values of an observation do not fit its space."""
 
 
-class ObservationError(InvalidInput):
-    """An observation whose shape, dtype or values do not fit its space."""
+class IllegalMask(InvalidInput, code="illegal_mask"):
+    """An action mask contains values other than 0 and 1, or allows no action."""
 
-    code = "invalid_observation"
 
+class IllegalAction(InvalidInput, code="illegal_action"):
+    """An action is outside its space or its mask."""
 
-class IllegalMask(InvalidInput):
-    """An action mask that holds something other than 0 and 1, or allows no action."""
 
-    code = "illegal_mask"
+class InvalidReward(InvalidInput, code="invalid_reward"):
+    """A reward is not a finite number."""
 
 
-class IllegalAction(InvalidInput):
-    """An action outside its space or its mask."""
+class InvalidState(InvalidInput, code="invalid_state"):
+    """A recurrent state is malformed, or belongs to another policy or version."""
 
-    code = "illegal_action"
 
+class BodyTooLarge(InvalidInput, code="body_too_large"):
+    """A request body or batch exceeds the limit."""
 
-class InvalidReward(InvalidInput):
-    """A reward that is no finite number: nothing can be learned from it, and no return computed."""
 
-    code = "invalid_reward"
+class EnvironmentMismatch(InvalidInput, code="environment_mismatch"):
+    """An environment, script or version does not fit the league."""
 
 
-class InvalidState(InvalidInput):
-    """Recurrent state that no reply gave, or that belongs to another policy or version."""
+class NotFound(LeagueError, code="not_found"):
+    """A named object does not exist."""
 
-    code = "invalid_state"
 
+class UnknownLeague(NotFound, code="unknown_league"):
+    """No league with this name is registered."""
 
-class BodyTooLarge(InvalidInput):
-    """A body, or a batch in it, beyond the limit."""
 
-    code = "body_too_large"
+class UnknownVersion(NotFound, code="unknown_version"):
+    """The league has no ready version with this number."""
 
 
-class EnvironmentMismatch(InvalidInput):
-    """An environment, script or version that does not fit the league."""
+class VersionRetired(NotFound, code="version_retired"):
+    """A version is not served any more; episodes that are pinned to it cannot continue."""
 
-    code = "environment_mismatch"
 
+class UnknownAlias(NotFound, code="unknown_alias"):
+    """The league has no alias with this name."""
 
-class NotFound(LeagueError):
-    """A thing that was named does not exist."""
 
-    code = "not_found"
+class UnknownPolicy(NotFound, code="unknown_policy"):
+    """The version has no policy with this id."""
 
 
-class UnknownLeague(NotFound):
-    """No league of that name is registered."""
+class UnknownEvaluation(NotFound, code="unknown_evaluation"):
+    """The league has no evaluation with this number."""
 
-    code = "unknown_league"
 
+class UnknownRun(NotFound, code="unknown_run"):
+    """The league has no training run with this name."""
 
-class UnknownVersion(NotFound):
-    """The league has no ready version of that number."""
 
-    code = "unknown_version"
+class UnknownVerdict(NotFound, code="unknown_verdict"):
+    """No verdict with this id exists."""
 
 
-class VersionRetired(NotFound):
-    """A version that was served once and is no more: an episode that is pinned to it cannot go on."""
+class UnknownMatch(NotFound, code="unknown_match"):
+    """The ledger has no match with this id, or the match has no such game."""
 
-    code = "version_retired"
 
+class UnknownKey(NotFound, code="unknown_key"):
+    """No API key with this name exists."""
 
-class UnknownAlias(NotFound):
-    """The league has no alias of that name."""
 
-    code = "unknown_alias"
+class Conflict(LeagueError, code="conflict"):
+    """The current state differs from the one that the request assumes."""
 
 
-class UnknownPolicy(NotFound):
-    """The version has no policy of that id."""
+class AliasMoved(Conflict, code="alias_moved"):
+    """A compare-and-set of an alias failed because the alias had been moved."""
 
-    code = "unknown_policy"
 
-
-class UnknownEvaluation(NotFound):
-    """The league has no evaluation of that number."""
-
-    code = "unknown_evaluation"
-
-
-class UnknownRun(NotFound):
-    """The league has no training run of that name."""
-
-    code = "unknown_run"
-
-
-class UnknownVerdict(NotFound):
-    """There is no verdict of that id."""
-
-    code = "unknown_verdict"
-
-
-class UnknownMatch(NotFound):
-    """The ledger has no match of that id, or the match no such game."""
-
-    code = "unknown_match"
-
-
-class UnknownKey(NotFound):
-    """There is no API key of that name."""
-
-    code = "unknown_key"
-
-
-class Conflict(LeagueError):
-    """The state is not the one that the caller acted on."""
-
-    code = "conflict"
-
-
-class AliasMoved(Conflict):
-    """A compare-and-set of an alias lost against another."""
-
-    code = "alias_moved"
-
-
-class InterfaceChanged(Conflict):
+class InterfaceChanged(Conflict, code="interface_changed"):
     """Spaces or policy ids differ from those of the league's versions."""
 
-    code = "interface_changed"
+
+class LedgerConflict(Conflict, code="ledger_conflict"):
+    """A match is incomplete or not part of its schedule."""
 
 
-class LedgerRefusal(Conflict):
-    """A match that its schedule did not ask for, or that is not whole."""
-
-    code = "ledger_refusal"
+class NothingToRollBack(Conflict, code="nothing_to_roll_back"):
+    """The alias has no previous version."""
 
 
-class NothingToRollBack(Conflict):
-    """The alias has no earlier version to return to."""
-
-    code = "nothing_to_roll_back"
+class NameTaken(Conflict, code="name_taken"):
+    """A name that must be unique is already in use."""
 
 
-class NameTaken(Conflict):
-    """A name that is to be used once was used."""
-
-    code = "name_taken"
+class KeyReused(Conflict, code="idempotency_key_reused"):
+    """An Idempotency-Key was already used for a different request."""
 
 
-class KeyReused(Conflict):
-    """An Idempotency-Key that was used for another call."""
-
-    code = "idempotency_key_reused"
+class AlreadyRunning(Conflict, code="already_running"):
+    """Another process holds an exclusive task or port."""
 
 
-class AlreadyRunning(Conflict):
-    """Another process does what only one may do."""
-
-    code = "already_running"
+class Unauthenticated(LeagueError, code="unauthenticated"):
+    """An API key is missing or invalid."""
 
 
-class Unauthenticated(LeagueError):
-    """No API key where one is needed, or one that opens nothing."""
-
-    code = "unauthenticated"
+class Forbidden(LeagueError, code="forbidden"):
+    """The API key lacks the required scope."""
 
 
-class Forbidden(LeagueError):
-    """An API key that is not for this."""
-
-    code = "forbidden"
-
-
-class RateLimited(LeagueError):
-    """An API key that calls more often than it may; `wait` is in seconds."""
-
-    code = "rate_limited"
+class RateLimited(LeagueError, code="rate_limited"):
+    """The API key exceeded its rate limit. `wait`: seconds until the next request is accepted."""
 
     def __init__(self, message: str, wait: float = 1.0) -> None:
         super().__init__(message)
         self.wait = wait
 
 
-class Overloaded(LeagueError):
-    """More requests at once than a replica takes."""
-
-    code = "overloaded"
+class Overloaded(LeagueError, code="overloaded"):
+    """The replica has more concurrent requests than it accepts."""
 
 
-class TooManyEvaluations(Overloaded):
-    """More evaluations that are queued or running than a server takes."""
-
-    code = "too_many_evaluations"
+class TooManyEvaluations(Overloaded, code="too_many_evaluations"):
+    """More evaluations are queued or running than the server accepts."""
 
 
-class DeadlineExceeded(LeagueError):
-    """A request that was not answered in the time that it had."""
-
-    code = "deadline_exceeded"
+class DeadlineExceeded(LeagueError, code="deadline_exceeded"):
+    """A request was not answered within its timeout."""
 
 
-class ArtifactCorrupt(LeagueError):
-    """A file of a version is missing or has another digest than its manifest says."""
-
-    code = "artifact_corrupt"
+class ArtifactCorrupt(LeagueError, code="artifact_corrupt"):
+    """A file of a version is missing, or its digest differs from the manifest."""
 
 
-class GameHung(LeagueError):
-    """A game of a match that has not ended after `play.max_moves` steps, or `play.game_seconds` of its environment."""
-
-    code = "game_hung"
+class GameHung(LeagueError, code="game_hung"):
+    """A game has not ended after `play.max_moves` steps or `play.game_seconds` of environment time."""
 
 
-class BoundExceeded(LeagueError):
-    """Returns of a block that differ by more than `gate.return_bound`."""
-
-    code = "bound_exceeded"
+class BoundExceeded(LeagueError, code="bound_exceeded"):
+    """The returns in a block differ by more than `gate.return_bound`."""
 
 
-class GameCrashed(LeagueError):
-    """A game of a match whose environment raised, in a reset or at a legal action."""
-
-    code = "game_crashed"
+class GameCrashed(LeagueError, code="game_crashed"):
+    """The environment of a game raised an exception in a reset or after a legal action."""
 
 
-class VerdictRefuted(LeagueError):
-    """A verdict whose record is not what the games in the ledger say."""
-
-    code = "verdict_refuted"
+class VerdictRefuted(LeagueError, code="verdict_refuted"):
+    """The record of a verdict contradicts the games in the ledger."""
 
 
-class WorkerLost(LeagueError):
-    """The processes that were to do a piece of work died, one after another."""
-
-    code = "worker_lost"
+class WorkerLost(LeagueError, code="worker_lost"):
+    """The worker processes of a task died repeatedly."""
 
 
-class ParityError(LeagueError):
-    """An exported graph does not act as the trained module does."""
-
-    code = "parity_failed"
+class ParityError(LeagueError, code="parity_failed"):
+    """An exported graph and the trained module choose different actions."""
 
 
-class NotReady(LeagueError):
-    """A policy that exists but is not served (yet)."""
-
-    code = "not_ready"
+class NotReady(LeagueError, code="not_ready"):
+    """A policy exists but is not served yet."""
 
 
-class NoStudio(NotReady):
-    """A server that was deployed without the studio, which plays games."""
-
-    code = "no_studio"
+class NoEvaluationService(NotReady, code="no_evaluation_service"):
+    """The server was deployed without an evaluation service, or the service is unreachable."""
 
 
-class RemoteError(LeagueError):
-    """A policy server that cannot be reached, or that failed."""
-
-    code = "remote_error"
+class RemoteError(LeagueError, code="remote_error"):
+    """A policy server is unreachable or failed."""
 
 
-class StorageError(LeagueError):
+class StorageError(LeagueError, code="storage_error"):
     """The database or the artefact store cannot be read or written."""
 
-    code = "storage_error"
+
+def one_line(error: BaseException, with_type: bool = False, first_line: bool = False) -> str:
+    """Return the message of an error on one line, or the name of its type if the message is empty.
+
+    with_type: put the name of the type before the message. first_line: leave out the others, which may be a traceback.
+    """
+    text, kind = str(error).strip(), type(error).__name__
+    message = " ".join((text.partition("\n")[0] if first_line else text).split())
+    return f"{kind}: {message}" if with_type and message else message or kind
+
+
+def last_line(text: str) -> str:
+    """Return the last line that is not blank, or an empty string."""
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+
+
+def to_document(error: LeagueError) -> dict[str, str]:
+    """Return an error as data, for another process or the database."""
+    return {"code": error.code, "message": str(error)}
+
+
+def from_document(document: Mapping[str, Any]) -> LeagueError:
+    """Return the error that `to_document` returned the data of."""
+    return BY_CODE[document["code"]](document["message"])
 
 
 BY_CODE: dict[str, type[LeagueError]] = {
     error.code: error for error in list(vars().values()) if isinstance(error, type) and issubclass(error, LeagueError)
 }
-"""What a code that came from another process stands for."""
+"""Error code → exception class."""

@@ -1,4 +1,4 @@
-"""Latencies as counts in buckets of microseconds: cheap to add to, to merge, and to read quantiles from."""
+"""Latency histograms with fixed buckets, which can be merged and queried for quantiles."""
 
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
@@ -7,12 +7,12 @@ BOUNDS = (
     25, 50, 75, 100, 150, 200, 300, 500, 750,
     1_000, 2_000, 5_000, 10_000, 25_000, 50_000, 100_000, 250_000, 1_000_000, 5_000_000,
 )  # fmt: skip
-"""Upper bounds of the buckets, in microseconds; a last bucket takes what took longer."""
+"""Upper bounds of the buckets, in microseconds. One more bucket holds larger values."""
 _NANOSECONDS = tuple(1000 * bound for bound in BOUNDS)
 
 
 class Histogram:
-    """Counts per bucket, and the sum of all that was added, in nanoseconds."""
+    """Counts per bucket, and the sum of all values in nanoseconds."""
 
     __slots__ = ("counts", "ns")
 
@@ -21,24 +21,24 @@ class Histogram:
         self.ns = ns
 
     def add(self, ns: int) -> None:
-        """Count something that took so many nanoseconds."""
+        """Add a duration in nanoseconds."""
         self.counts[bisect_left(_NANOSECONDS, ns)] += 1
         self.ns += ns
 
     def merge(self, counts: Sequence[int], ns: int) -> None:
-        """Add what another has counted."""
+        """Add the counts and the sum of another histogram."""
         self.counts = [mine + other for mine, other in zip(self.counts, counts, strict=True)]
         self.ns += ns
 
     @property
     def count(self) -> int:
-        """How often something was added."""
+        """Number of values."""
         return sum(self.counts)
 
     def quantile(self, share: float) -> float | None:
-        """Milliseconds within which `share` of all was done: the bound of a bucket, so never too little.
+        """Return an upper bound of a quantile in milliseconds: the bound of its bucket.
 
-        None without anything added; infinite beyond the last bound.
+        None if the histogram is empty; infinity in the last bucket.
         """
         wanted, seen = share * self.count, 0
         if not self.count:

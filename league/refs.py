@@ -1,4 +1,4 @@
-"""References: the one way to name a version, a policy or a script.
+"""References to versions, policies and scripts.
 
 | text                    | record                                        |
 |-------------------------|-----------------------------------------------|
@@ -20,14 +20,14 @@ MAX_VERSION = 2**31 - 1
 
 
 def check_slug(kind: str, text: str) -> str:
-    """Return `text` if it may name a league, a policy, a side or an alias; raise InvalidReference otherwise."""
+    """Return `text` if it is a valid name of a league, policy, side or alias; raise InvalidReference otherwise."""
     if not SLUG.fullmatch(text):
         raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'")
     return text
 
 
 def parse_version(text: str) -> int | str:
-    """A version number or an alias: `"7"` → 7, `"champion"` → `"champion"`."""
+    """Parse a version number or an alias: `"7"` → 7, `"champion"` → `"champion"`. Raises InvalidReference."""
     if text.isascii() and text.isdigit():
         number = int(text) if len(text) <= 10 else MAX_VERSION + 1
         if not 1 <= number <= MAX_VERSION:
@@ -37,7 +37,7 @@ def parse_version(text: str) -> int | str:
 
 
 def check_alias(text: str) -> str:
-    """Return `text` if it may name an alias: a slug that is never all digits."""
+    """Return `text` if it is a valid alias: a slug with at least one non-digit; raise InvalidReference otherwise."""
     if text.isdigit():
         raise InvalidReference(f"alias {text!r} must not be all digits: that is a version number")
     return check_slug("alias", text)
@@ -54,7 +54,7 @@ class CheckpointRef:
     def parse(cls, text: str) -> "CheckpointRef":
         league, at, version = text.partition("@")
         if not at:
-            raise InvalidReference(f"{text!r} names no version: expected LEAGUE@NUMBER or LEAGUE@ALIAS")
+            raise InvalidReference(f"{text!r} contains no version: expected LEAGUE@NUMBER or LEAGUE@ALIAS")
         return cls(check_slug("league", league), parse_version(version))
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ class ScriptRef:
     def parse(cls, text: str) -> "ScriptRef":
         scheme, _, name = text.partition(":")
         if scheme != "script":
-            raise InvalidReference(f"{text!r} names no script: expected script:NAME")
+            raise InvalidReference(f"{text!r} is not a script: expected script:NAME")
         return cls(check_slug("script", name))
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class ScriptRef:
 
 @dataclass(frozen=True, slots=True)
 class PolicyRef:
-    """A served model: a league, and one of its policies where a version has several."""
+    """A policy of a league; `policy` is optional if the league has one."""
 
     league: str
     policy: str | None = None
@@ -95,10 +95,10 @@ class PolicyRef:
 
 
 def parse_ref(text: str) -> CheckpointRef | ScriptRef:
-    """Read any contestant: `connect_four@7`, `connect_four@champion` or `script:random`."""
+    """Parse the reference of a contestant: `connect_four@7`, `connect_four@champion` or `script:random`."""
     return ScriptRef.parse(text) if text.startswith("script:") else CheckpointRef.parse(text)
 
 
 def of_league(ref: str, league: str) -> str:
-    """`@3` is short for a version of the league itself."""
+    """Expand `@3` to `LEAGUE@3`."""
     return league + ref if ref.startswith("@") else ref

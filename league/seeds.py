@@ -1,4 +1,4 @@
-"""Every random choice descends from a recorded seed along a named path."""
+"""Derives seeds and random generators from a recorded seed and a path."""
 
 import zlib
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def derive(seed: int, *path: int | str) -> int:
-    """A seed in [0, 2^63) that depends on `seed` and on each part of `path`.
+    """Return a seed in [0, 2^63) that depends on `seed` and on each part of `path`.
 
     Uses NumPy's SeedSequence (O'Neill's seed_seq), whose outputs for different spawn keys are independent.
     """
@@ -15,7 +15,7 @@ def derive(seed: int, *path: int | str) -> int:
 
 
 def generator(seed: int, *path: int | str) -> np.random.Generator:
-    """A generator of its own for `path` below `seed`."""
+    """Return the random generator of `path` below `seed`."""
     return np.random.Generator(np.random.PCG64(_sequence(seed, path)))
 
 

@@ -1,4 +1,4 @@
-"""Where a user's leagues live: three environment variables, each with a default."""
+"""Storage locations: home directory, database and artefact store, from three environment variables."""
 
 import os
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from league.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Storage:
-    """The home directory, the database and the artefact store. All paths are absolute."""
+    """Locations of the home directory, the database and the artefact store. All paths are absolute."""
 
     home: Path
     database_url: str
@@ -17,7 +17,7 @@ class Storage:
 
     @classmethod
     def at(cls, home: Path | str) -> "Storage":
-        """SQLite and a directory of artefacts inside `home`."""
+        """Return a SQLite database and an artefact directory inside `home`."""
         home = Path(home).expanduser().absolute()
         return cls(home, f"sqlite:///{home / 'league.db'}", home / "artifacts")
 
@@ -33,7 +33,7 @@ class Storage:
         )
 
     def check_reach(self, machines: set[str]) -> None:
-        """Raise ConfigError if several machines (by address) cannot share this: SQLite, or artefacts in the home."""
+        """Raise ConfigError if several machines cannot share the storage: SQLite, or artefacts in `home`."""
         is_shared = not self.database_url.startswith("sqlite") and not self.artifacts.is_relative_to(self.home)
         if len(machines) > 1 and not is_shared:
             raise ConfigError(
@@ -42,7 +42,7 @@ class Storage:
             )
 
     def export(self) -> None:
-        """Pin the three variables in this process, so that Ray's workers, started elsewhere, read the same."""
+        """Set the three variables in this process, so that Ray's workers inherit them."""
         os.environ["LEAGUE_HOME"] = str(self.home)
         os.environ["LEAGUE_DATABASE_URL"] = self.database_url
         os.environ["LEAGUE_ARTIFACTS"] = str(self.artifacts)

@@ -1,4 +1,4 @@
-"""The packages that decide how a policy is trained, exported and served: verified versions and installed ones."""
+"""Verified and installed versions of the packages that affect training, export and serving."""
 
 from importlib.metadata import PackageNotFoundError, version
 
@@ -16,14 +16,15 @@ VERIFIED = {
     "onnxscript": "0.7.2",
     "starlette": "1.10.0",
     "uvicorn": "0.54.0",
+    "websockets": "17.4",
     "pydantic": "2.14.3",
     "sqlalchemy": "2.1.9",
 }
-"""The pins of constraints.txt that every test and benchmark ran on."""
+"""Versions in constraints.txt, with which all tests and benchmarks were run."""
 
 
 def installed() -> dict[str, str]:
-    """package → installed version, of those in VERIFIED that are installed. A local build tag (`+cpu`) is kept."""
+    """Return the versions of the installed packages in VERIFIED, with local build tags (`+cpu`)."""
     found = {}
     for package in VERIFIED:
         try:

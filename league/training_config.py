@@ -1,15 +1,15 @@
-"""The settings of training: what all algorithms share, then those of each one."""
+"""The `training` section of a league's configuration: common settings and one class per algorithm."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from league.parts import Part
+from league.environment_config import Part
 
 
 class ConvolutionConfig(Part):
-    """One convolution over the planes of an observation, without padding."""
+    """A convolution without padding over image-like observations."""
 
     filters: int = Field(ge=1)
     kernel: int = Field(default=3, ge=1)
@@ -17,21 +17,21 @@ class ConvolutionConfig(Part):
 
 
 class RecurrenceConfig(Part):
-    """A long short-term memory between the hidden layers and the heads (Hochreiter and Schmidhuber, 1997)."""
+    """An LSTM between the hidden layers and the heads (Hochreiter and Schmidhuber, 1997)."""
 
     width: int = Field(default=128, ge=1)
     sequence: int = Field(default=20, ge=1)
-    """Steps through which gradients flow back."""
+    """Steps of truncated backpropagation through time."""
 
 
 class OpponentConfig(Part):
-    """Somebody who plays the other sides in a share of the episodes, and does not learn."""
+    """A fixed policy that controls the other sides in a fraction of the episodes and does not learn."""
 
     ref: str
-    """A script (`script:random`), a version (`connect_four@3`), or an alias, which is pinned when training begins;
-    `@3` and `@champion` are short for those of the league itself."""
+    """A script (`script:random`), a version (`connect_four@3`), or an alias, which is resolved when training starts.
+    `@3` and `@champion` refer to the league itself."""
     share: float = Field(gt=0, le=1)
-    """Of the episodes. What is left of 1 is self-play."""
+    """Fraction of the episodes. The remaining episodes are self-play."""
 
     @model_validator(mode="before")
     @classmethod
@@ -40,15 +40,15 @@ class OpponentConfig(Part):
 
 
 class PhaseConfig(Part):
-    """A part of training in which some policies learn and the others stay as they are."""
+    """A phase of training in which only some policies learn."""
 
     policies: tuple[str, ...] = Field(min_length=1)
     iterations: int = Field(ge=1)
-    """Updates until the next phase; after the last one the first follows again."""
+    """Number of updates. The phases are repeated in order."""
 
 
 class PolicySettings(Part):
-    """Settings of one policy that differ from the league's. See PPOConfig."""
+    """Settings of PPO for one policy; null for the common value. See PPOConfig."""
 
     lr: float | None = Field(default=None, gt=0)
     gamma: float | None = Field(default=None, ge=0, le=1)
@@ -58,71 +58,80 @@ class PolicySettings(Part):
 
 
 class TrainingSettings(Part):
-    """What is set alike for every algorithm."""
+    """Settings common to all algorithms."""
 
     seed: int = Field(default=0, ge=0)
+    """Seed of the run, from which all random choices are derived."""
     steps: int = Field(default=1_000_000, ge=1)
-    """Actions of all agents after which training ends."""
+    """Number of actions of all agents after which training ends."""
     minutes: float | None = Field(default=None, gt=0)
-    """Wall-clock limit of training; it ends at whichever of the two limits comes first."""
+    """Wall-clock limit of training, in addition to `steps`."""
     checkpoint_every: int | None = Field(default=200_000, ge=1)
-    """Actions between two published versions, null for no such cadence. The end of training publishes one too."""
+    """Number of actions between published versions; null disables this trigger. The end of training also publishes."""
     checkpoint_minutes: float | None = Field(default=None, gt=0)
-    """Wall-clock minutes of training between two published versions; the sooner of the two counts."""
+    """Wall-clock minutes between published versions; the earlier of the two triggers applies."""
     runners: int = Field(default=1, ge=0)
-    """Sampling processes; 0 samples in the learner's process."""
-    copies: int = Field(default=32, ge=1)
-    """Environment copies stepped together in each runner."""
+    """Number of sampling processes (env runners); 0 samples in the learner's process."""
+    num_envs: int = Field(default=32, ge=1)
+    """Environments stepped in parallel in each runner."""
     lr: float = Field(default=3e-4, gt=0)
+    """Learning rate of Adam."""
     gamma: float = Field(default=0.99, ge=0, le=1)
+    """Discount factor per turn of an agent."""
     grad_clip: float = Field(default=0.5, gt=0)
+    """Maximum global norm of the gradient."""
     convolutions: tuple[ConvolutionConfig, ...] = ()
-    """Layers over those parts of the observation that are planes, (height, width, channels). Others are flattened."""
+    """Convolutions for image-like parts of the observation, (height, width, channels). Other parts are flattened."""
     hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
     """Widths of the hidden layers."""
     normalize_observations: bool = False
-    """Shift and scale each number of the observations by its running mean and deviation, inside the exported graph."""
+    """Normalize each observation feature by its running mean and standard deviation, inside the exported graph."""
     policies_to_train: tuple[str, ...] | tuple[PhaseConfig, ...] | None = None
-    """The policies that learn, or phases that follow one another in a circle; null for all. The others play on with the
-    weights that they have: those of the version that training began from (`--from`), else their initial ones."""
+    """The policies that learn, or repeated phases; null for all. Other policies keep their weights: those of the parent
+    version (`--from`), or their initial weights."""
     opponents: tuple[OpponentConfig, ...] = ()
-    """Who plays against the learners in some episodes: one side, drawn anew in each, learns, and the opponent has all
-    others."""
+    """Fixed opponents. In their episodes one random side learns, and the opponent controls all others."""
     gpus: float = Field(default=0, ge=0)
-    """GPUs of the learner; a fraction shares one."""
+    """GPUs of the learner; a fraction shares a GPU."""
     runner_gpus: float = Field(default=0, ge=0)
-    """GPUs of each runner, for its inference."""
+    """GPUs of each runner for inference."""
     crashes: int = Field(default=3, ge=0)
-    """Times in a row that a copy of the environment may raise and is built anew; its episode is not learned from."""
+    """Maximum number of consecutive exceptions after which an environment is recreated; the next one ends training."""
     opening_plies: int = Field(default=0, ge=0)
-    """Up to this many random legal moves begin each episode. They are not learned from, but lead to positions that
-    self-play alone would not visit."""
+    """Maximum number of random legal moves at the start of each episode. They are excluded from training and lead to
+    positions that self-play alone would not visit."""
 
     @model_validator(mode="after")
     def _shares_fit(self) -> Self:
         if (total := sum(opponent.share for opponent in self.opponents)) > 1 + 1e-9:
-            raise ValueError(f"the shares of opponents must not exceed 1, got {total:g}")
+            raise ValueError(f"the shares of opponents must sum to at most 1, got {total:g}")
         return self
 
 
 class PPOConfig(TrainingSettings):
-    """Proximal policy optimisation by self-play (Schulman et al., 2017, arXiv 1707.06347)."""
+    """Proximal policy optimisation (Schulman et al., 2017, arXiv 1707.06347)."""
 
     algorithm: Literal["ppo"] = "ppo"
     train_batch_size: int = Field(default=2048, ge=1)
     """Actions per update."""
     minibatch_size: int = Field(default=256, ge=1)
+    """Actions per gradient step."""
     epochs: int = Field(default=4, ge=1)
+    """Passes over each train batch."""
     lambda_: float = Field(default=0.95, ge=0, le=1, alias="lambda")
+    """λ of generalised advantage estimation."""
     clip: float = Field(default=0.2, gt=0)
+    """Clipping range of the probability ratio."""
     entropy: float = Field(default=0.05, ge=0)
+    """Coefficient of the entropy bonus."""
     value_loss: float = Field(default=0.5, ge=0)
+    """Coefficient of the value loss."""
     recurrence: RecurrenceConfig | None = None
-    """A memory over the steps of an episode, null for none."""
+    """Recurrent layer; null for none."""
     shared_encoder: bool = False
-    """All policies share the convolutions and hidden layers, each has heads of its own."""
+    """Share the convolutions and hidden layers among all policies. Heads are separate."""
     per_policy: dict[str, PolicySettings] = Field(default={})
-    """policy id → settings that differ for it."""
+    """Policy id → settings that differ from the common ones."""
 
     @model_validator(mode="after")
     def _minibatch_fits(self) -> Self:
@@ -133,58 +142,58 @@ class PPOConfig(TrainingSettings):
     @model_validator(mode="after")
     def _encoder_fits(self) -> Self:
         if self.shared_encoder and self.recurrence is not None:
-            raise ValueError("shared_encoder has no memory: leave recurrence out")
+            raise ValueError("shared_encoder does not support recurrence")
         return self
 
 
 class PrioritiesConfig(Part):
-    """Transitions with large errors are sampled more often (Schaul et al., 2016, arXiv 1511.05952)."""
+    """Prioritised experience replay (Schaul et al., 2016, arXiv 1511.05952)."""
 
     alpha: float = Field(default=0.6, gt=0, le=1)
-    """How much more: probabilities are proportional to |error|^α."""
+    """Sampling probabilities are proportional to |TD error|^α."""
     beta: float = Field(default=0.4, ge=0, le=1)
-    """How far the importance weights make up for it at the beginning; at the end of training wholly."""
+    """Initial exponent of the importance weights; it increases to 1 until the end of training."""
 
 
 class ExplorationConfig(Part):
-    """How much is explored: from `initial` to `final` in a straight line over `steps` actions."""
+    """Linear exploration schedule from `initial` to `final` over `steps` actions."""
 
     initial: float = Field(default=1.0, ge=0)
     final: float = Field(default=0.05, ge=0)
     steps: int = Field(default=100_000, ge=1)
-    """Actions of all agents, those of the versions that training began from included."""
+    """Number of actions of all agents, including those of parent versions."""
 
     def at(self, steps: int) -> float:
-        """After so many actions."""
+        """Return the value after a number of actions."""
         return self.initial + (self.final - self.initial) * min(steps / self.steps, 1.0)
 
 
 class OffPolicyConfig(TrainingSettings):
-    """What algorithms share that learn from a replay buffer."""
+    """Settings common to algorithms with a replay buffer."""
 
     grad_clip: float = Field(default=10.0, gt=0)
     replay_capacity: int = Field(default=100_000, ge=1)
-    """Transitions that are kept, the newest: of each policy, or joint ones of all agents."""
+    """Capacity of the replay buffer: transitions of each policy, or joint transitions of all agents."""
     replay_in_checkpoint: bool = True
-    """Whether versions carry the buffer along. Without, training that goes on from one begins with an empty buffer, and
-    differs from a training that was not interrupted."""
+    """Whether checkpoints include the replay buffer. Without it, resumed training starts with an empty buffer and
+    differs from uninterrupted training."""
     learning_starts: int = Field(default=1_000, ge=1)
-    """Transitions in the buffer before which nothing is learned."""
+    """Number of transitions in the buffer at which learning starts."""
     batch_size: int = Field(default=256, ge=1)
     """Transitions per gradient step."""
     update_every: int = Field(default=64, ge=1)
-    """Actions of all agents between two rounds of learning; at least one of each copy is taken."""
+    """Actions of all agents between two rounds of learning; at least one per environment."""
     updates: int = Field(default=4, ge=1)
     """Gradient steps per round."""
     target_every: int = Field(default=500, ge=1)
-    """Gradient steps between two updates of the target networks."""
+    """Gradient steps between updates of the target networks."""
     target_rate: float = Field(default=1.0, gt=0, le=1)
-    """How far the target networks then move to the networks that learn: 1 copies them, less is Polyak's average."""
+    """Interpolation factor of target updates: 1 copies the weights; smaller values are Polyak averaging."""
     n_step: int = Field(default=1, ge=1)
-    """Steps whose rewards are summed before the value of what follows is estimated; fewer where an episode ends."""
+    """Steps of n-step returns; fewer at the end of an episode."""
     exploration: ExplorationConfig = ExplorationConfig()
     priorities: PrioritiesConfig | None = None
-    """Prioritised replay, null for uniform."""
+    """Prioritised replay; null for uniform sampling."""
 
     @model_validator(mode="after")
     def _buffer_fits(self) -> Self:
@@ -194,11 +203,11 @@ class OffPolicyConfig(TrainingSettings):
 
 
 class QLearningConfig(OffPolicyConfig):
-    """What algorithms share that choose the action of the largest value."""
+    """Settings common to algorithms with action values."""
 
     double: bool = True
-    """The network that learns chooses the next action, the target network values it (van Hasselt, Guez and Silver,
-    2016, arXiv 1509.06461)."""
+    """Double Q-learning: the online network selects the next action and the target network evaluates it (van Hasselt,
+    Guez and Silver, 2016, arXiv 1509.06461)."""
 
     @model_validator(mode="after")
     def _probabilities(self) -> Self:
@@ -208,12 +217,14 @@ class QLearningConfig(OffPolicyConfig):
 
 
 class DistributionalConfig(Part):
-    """Values as distributions over atoms: C51 (Bellemare, Dabney and Munos, 2017, arXiv 1707.06887)."""
+    """Categorical value distributions, C51 (Bellemare, Dabney and Munos, 2017, arXiv 1707.06887)."""
 
     atoms: int = Field(default=51, ge=2)
+    """Number of atoms."""
     low: float
-    """Smallest return that an atom stands for."""
+    """Return of the first atom."""
     high: float
+    """Return of the last atom."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -227,75 +238,78 @@ class DQNConfig(QLearningConfig):
 
     algorithm: Literal["dqn"]
     dueling: bool = True
-    """Values of states and advantages of actions have heads of their own (Wang et al., 2016, arXiv 1511.06581)."""
+    """Separate heads for state values and advantages (Wang et al., 2016, arXiv 1511.06581)."""
     noisy: bool = False
-    """Explore by noise in the weights of the heads, too (Fortunato et al., 2018, arXiv 1706.10295)."""
+    """Noisy heads, in addition to ε-greedy exploration (Fortunato et al., 2018, arXiv 1706.10295)."""
     distributional: DistributionalConfig | None = None
+    """Value distributions; null for expected values."""
 
 
 class GatedRecurrenceConfig(Part):
-    """A gated recurrent unit before the head (Cho et al., 2014, arXiv 1406.1078), which also reads the last action."""
+    """A GRU before the head (Cho et al., 2014, arXiv 1406.1078), whose input includes the previous action."""
 
     width: int = Field(default=64, ge=1)
     sequence: int = Field(default=50, ge=1)
-    """Steps that are learned from together. Episodes up to this length are learned from whole; of longer ones, parts
-    that begin at its multiples, with what was remembered there when they were played."""
+    """Length of training sequences. Longer episodes are split at its multiples; each part starts from the recurrent
+    state recorded during sampling."""
 
 
 class QMIXConfig(QLearningConfig):
-    """Values of actions that are mixed to a value of the team's (Rashid et al., 2018, arXiv 1803.11485)."""
+    """QMIX: agents' values mixed to a team value (Rashid et al., 2018, arXiv 1803.11485)."""
 
     algorithm: Literal["qmix"]
     mixer: Literal["qmix", "vdn", "none"] = "qmix"
-    """How: by a monotonic network that the global state decides, by their sum (Sunehag et al., 2017, arXiv 1706.05296),
-    or not at all: each agent then learns by itself, from its own rewards."""
+    """qmix: a monotonic network conditioned on the global state. vdn: the sum (Sunehag et al., 2017, arXiv 1706.05296).
+    none: independent learning from each agent's own rewards."""
     mixing_width: int = Field(default=32, ge=1)
-    """Of the hidden layer of the mixing network."""
+    """Width of the mixing network's hidden layer."""
     groups: dict[str, tuple[str, ...]] | None = None
-    """Group → the agents whose values are mixed, as names or patterns; null: the league's sides."""
+    """Group → agents whose values are mixed, as names or patterns; null for the league's sides."""
     recurrence: GatedRecurrenceConfig | None = None
-    """A memory over the steps of an episode, null for none. Transitions of `batch_size` are then sequences."""
+    """Recurrent layer; null for none. With it, `batch_size` counts sequences."""
 
     @model_validator(mode="after")
     def _sequences_fit(self) -> Self:
         if self.recurrence is not None and (self.n_step > 1 or self.priorities is not None):
-            raise ValueError("recurrence learns from whole sequences: leave n_step at 1 and priorities out")
+            raise ValueError("recurrence requires n_step 1 and no priorities")
         return self
 
 
 class MADDPGConfig(OffPolicyConfig):
-    """Actors with critics that see all agents (Lowe et al., 2017, arXiv 1706.02275), with the settings of the authors'
-    implementation (openai/maddpg), which counts steps of an environment of three agents."""
+    """MADDPG (Lowe et al., 2017, arXiv 1706.02275).
+
+    Defaults are those of the authors' implementation (openai/maddpg), converted from steps of an environment with three
+    agents to actions.
+    """
 
     algorithm: Literal["maddpg"]
     lr: float = Field(default=0.01, gt=0)
     gamma: float = Field(default=0.95, ge=0, le=1)
     grad_clip: float = Field(default=0.5, gt=0)
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1)
-    """Widths of the hidden layers, of actors and critics."""
+    """Widths of the hidden layers of actors and critics."""
     replay_capacity: int = Field(default=1_000_000, ge=1)
     learning_starts: int = Field(default=25_600, ge=1)
     batch_size: int = Field(default=1024, ge=1)
-    """Transitions of each policy's step, which draws its own."""
+    """Transitions per gradient step of each policy; every policy samples its own batch."""
     update_every: int = Field(default=300, ge=1)
     updates: int = Field(default=1, ge=1)
     target_every: int = Field(default=1, ge=1)
     target_rate: float = Field(default=0.01, gt=0, le=1)
     exploration: ExplorationConfig = ExplorationConfig(initial=0.3, final=0.1, steps=1_000_000)
-    """Deviation of the noise on the actions of a Box, whose bounds are -1 and 1 for it. Choices are drawn at random by
-    their logits, and take none."""
+    """Standard deviation of the noise on Box actions scaled to [-1, 1]. Discrete actions are sampled from their logits
+    without additional noise."""
     critic: Literal["centralised", "own"] = "centralised"
-    """What critics see: all agents' observations and actions, or their own agent's alone, which is DDPG."""
+    """Input of critics: observations and actions of all agents, or those of their own agent (DDPG)."""
     temperature: float = Field(default=1.0, gt=0)
-    """Of the Gumbel-softmax that gradients pass through to choices."""
+    """Temperature of the Gumbel-softmax for gradients through discrete actions."""
     regularization: float = Field(default=0.001, ge=0)
-    """How much the squares of the actors' answers, before masks and bounds, add to their loss."""
+    """Coefficient of the mean squared actor output, before masks and bounds, in the actor loss."""
     theta: float | None = Field(default=None, gt=0, le=1)
-    """Let the noise be an Ornstein-Uhlenbeck process that returns to 0 at this rate (0.15 in the DDPG paper); null for
-    independent noise."""
+    """Mean-reversion rate of Ornstein-Uhlenbeck noise (0.15 in the DDPG paper); null for independent noise."""
 
 
-# Each algorithm: a class above, and a member of the three below.
+# A new algorithm needs a class above and an entry in each of the three definitions below.
 
 AnyTraining = PPOConfig | DQNConfig | QMIXConfig | MADDPGConfig
 ALGORITHMS: dict[str, type[TrainingSettings]] = {
@@ -319,4 +333,4 @@ TrainingConfig = Annotated[
     | Annotated[MADDPGConfig, Tag("maddpg")],
     Discriminator(_algorithm),
 ]
-"""The settings of one algorithm, told apart by `algorithm`."""
+"""Settings of one algorithm, discriminated by `algorithm`."""

@@ -1,0 +1,1 @@
+"""The policy server on Ray Serve: HTTP API, gRPC, streams and web pages."""

@@ -1,10 +1,10 @@
-"""The composition root that deploy.yaml names: a deployment whose replicas hold every served policy, and the studio.
+"""Composes a replica, and builds the Ray Serve application that deploy.yaml names.
 
     HAProxy → replica: uvicorn → Ray Serve → the Starlette application below
-                                               └ what needs an environment: → the studio, by handle
+                                               └ requests that need an environment → the evaluation service, by handle
 
-A request is answered in the process that it first reaches. Requests for actions do without Ray Serve's part on that way
-(middleware.py).
+A request is answered in the process that it reaches first. Inference requests bypass Ray Serve's request path
+(serve_app.runtime.serve_bypass).
 """
 
 import gc
@@ -14,7 +14,6 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from importlib import import_module
 
-import ray
 from ray import serve
 from ray.serve import Application
 from ray.serve.handle import DeploymentHandle
@@ -25,118 +24,105 @@ from starlette.routing import Route, WebSocketRoute
 from league.errors import ConfigError
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app import http_protocol, websocket_protocol
-from serve_app.access_log import AccessLog
-from serve_app.alias_watcher import AliasWatcher
-from serve_app.doors import Doors, Guarded
-from serve_app.error_handlers import ErrorHandlers
-from serve_app.events import Events
-from serve_app.exposure import serves_other_machines
-from serve_app.inference_protocol.catalogue import Catalogue
-from serve_app.inference_protocol.grpc_handlers import offer
+from serve_app.access.access_control import AccessControl, AccessControlMiddleware
+from serve_app.access.access_log import AccessLog
+from serve_app.access.api_keys import ApiKeyCache, ApiKeyWatcher
+from serve_app.access.errors import ErrorHandlers
+from serve_app.evaluation_client import EvaluationClient, ServeEvaluationClient
+from serve_app.inference.stream_session import StreamDependencies
+from serve_app.inference_protocol import grpc_handlers
+from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import RestRoutes
-from serve_app.keyring import Keyring, KeyWatcher
-from serve_app.live import Live
-from serve_app.loading import load
-from serve_app.metrics import Metrics
-from serve_app.middleware import shorten
-from serve_app.models import Models
-from serve_app.reporting import Reporter
-from serve_app.routes.action import ActionRoute, Shortcut
-from serve_app.routes.docs import DocsRoutes
+from serve_app.models.alias_slots import AliasSlots
+from serve_app.models.alias_watcher import AliasWatcher
+from serve_app.models.resolver import ModelResolver
+from serve_app.models.shadow import Shadow
+from serve_app.models.traffic_split import TrafficSplit
+from serve_app.models.version_cache import VersionCache, load
+from serve_app.observability.metrics import Metrics
+from serve_app.observability.metrics_reporter import MetricsReporter
+from serve_app.routes.action import ActionDispatch, ActionRoute
+from serve_app.routes.aliases import AliasRoutes
 from serve_app.routes.evaluations import EvaluationRoutes
-from serve_app.routes.events import EventRoutes
+from serve_app.routes.events import EventBroker, EventRoutes
 from serve_app.routes.games import GameRoutes
-from serve_app.routes.health import HealthRoutes
-from serve_app.routes.history import HistoryRoutes
-from serve_app.routes.key import KeyRoute
 from serve_app.routes.leagues import LeagueRoutes
-from serve_app.routes.matches import MatchRoutes
-from serve_app.routes.metrics import MetricsRoute
-from serve_app.routes.notes import NoteRoutes
-from serve_app.routes.pages import PageRoutes
-from serve_app.routes.promotion import PromotionRoutes
+from serve_app.routes.pages import DocsRoutes, PageRoutes
+from serve_app.routes.results import ResultRoutes
 from serve_app.routes.runs import RunRoutes
-from serve_app.routes.standings import StandingsRoutes
+from serve_app.routes.status import StatusRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
 from serve_app.routes.verdicts import VerdictRoutes
-from serve_app.settings import ServeSettings
-from serve_app.shadow import Shadow
-from serve_app.streams import StreamParts
-from serve_app.studio import Studio, StudioHandle
-from serve_app.traffic import Traffic
-from serve_app.versions import Versions
+from serve_app.runtime import ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
+from serve_app.settings import ServeSettings, is_exposed
 
 LOOPBACK = "127.0.0.1"
-GAME = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
-SWITCH = 0.0005
-"""Seconds after which a thread that looks at the database, or computes a shadow, gives way to the event loop. Python's
-default of 5 ms would be the time that the slowest requests wait."""
+GAME_PATH = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
+SWITCH_INTERVAL = 0.0005
+"""Thread switch interval in seconds. With Python's default of 5 ms, threads that query the database or compute a shadow
+would delay the slowest requests by as much."""
 
 
 def build_app(args: ServeSettings) -> Application:
     """The Serve application. `args` in deploy.yaml are fields of ServeSettings."""
     deployment = serve.deployment(serve.ingress()(PolicyServer))
-    return deployment.bind(args, _studio(args))
+    return deployment.bind(args, _evaluation_service(args))
 
 
-def _studio(args: ServeSettings) -> Application | None:
-    """The deployment that plays games: found by its name, for a replica must load nothing of it. Raises ConfigError."""
-    if args.studio is None:
+def _evaluation_service(args: ServeSettings) -> Application | None:
+    """The evaluation service, imported by name so that serve_app does not depend on it. Raises ConfigError."""
+    if args.evaluation_service is None:
         return None
-    module, _, name = args.studio.partition(":")
+    module, _, name = args.evaluation_service.partition(":")
     try:
         bound: Application = getattr(import_module(module), name)(args.evaluation_workers, args.evaluations_at_once)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"deploy.yaml: args: studio {args.studio!r} cannot be imported: {error}") from error
+        raise ConfigError(
+            f"deploy.yaml: args: evaluation_service {args.evaluation_service!r} cannot be imported: {error}"
+        ) from error
     return bound
 
 
-def _node_address() -> str:
-    """The address by which Ray, and so HAProxy, knows this node."""
-    here = ray.get_runtime_context().get_node_id()
-    return str(next(node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] == here))
+class PolicyServer(ray_serve.AsgiReplica):
+    """The Ray Serve deployment: one replica. LEAGUE_HOME and related variables locate its leagues."""
 
-
-class PolicyServer:
-    """One replica. Where its leagues live, LEAGUE_HOME and its siblings say."""
-
-    def __init__(self, settings: ServeSettings, studio: DeploymentHandle | None = None) -> None:
-        sys.setswitchinterval(SWITCH)
-        replica = serve.get_replica_context().replica_id.unique_id
-        # A replica that starts while the database is elsewhere must not put an empty one into its place.
+    def __init__(self, settings: ServeSettings, evaluation_service: DeploymentHandle | None = None) -> None:
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        # A replica that starts while the database is missing must not create an empty one.
         registry = Registry.open(Storage.from_environment(), create=False)
-        self._server = Server(
+        self._replica = Replica(
             registry,
             settings,
-            replica,
-            machine=_node_address(),
-            is_exposed=serves_other_machines(),
-            studio=studio and StudioHandle(studio, settings.timeout),
+            ray_serve.replica_id(),
+            machine=ray_serve.node_address(),
+            is_exposed=is_exposed(ray_serve.listening_host()),
+            evaluation_client=evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
         )
 
-    def __serve_build_asgi_app__(self) -> Starlette:
-        application = self._server.application()
-        shorten(application)
-        http_protocol.install(self._server.events.end)
-        websocket_protocol.install(self._server.settings.max_body)
-        offer(self._server.inference_service)
-        gc.freeze()  # what is loaded by now stays: looking through it again and again would stop the event loop
+    def build(self) -> Starlette:
+        """The application of this replica."""
+        application = self._replica.application()
+        serve_bypass.install(application)
+        uvicorn_http.install(self._replica.events.end)
+        uvicorn_websocket.install(self._replica.settings.max_body)
+        grpc_handlers.install(self._replica.inference_service)
+        gc.freeze()  # permanent objects: collecting them again and again would stall the event loop
         return application
 
     def check_health(self) -> None:
-        """Ray Serve replaces a replica that no longer follows the registry."""
-        if not self._server.watcher.is_ready:
+        """Called by Ray Serve, which replaces a replica that no longer follows the registry."""
+        if not self._replica.watcher.is_ready:
             raise RuntimeError("the alias watcher has stopped")
 
 
-class Server:
-    """The parts of a replica, put together. Knows nothing of Ray.
+class Replica:
+    """The components of a replica. Independent of Ray.
 
-    `machine` is the address of its node; `is_exposed`: whether other machines reach it; `studio`: what plays games.
+    `machine` is the address of its node; `is_exposed`: whether other machines reach it;
+    `evaluation_client`: None without an evaluation service.
     """
 
     def __init__(
@@ -146,36 +132,38 @@ class Server:
         replica: str,
         machine: str = LOOPBACK,
         is_exposed: bool = False,
-        studio: Studio | None = None,
+        evaluation_client: EvaluationClient | None = None,
     ) -> None:
         self.registry = registry
         self.settings = settings
         self.replica = replica
-        self.versions = Versions(
+        self.versions = VersionCache(
             partial(load, registry, inline=settings.inline), settings.cached_versions, settings.retry
         )
-        self.live = Live(self.versions)
-        self.traffic = Traffic(self.live)
+        self.alias_slots = AliasSlots(self.versions)
+        self.traffic = TrafficSplit(self.alias_slots)
         self.access_log = _access_log(registry, settings, replica)
-        self.shadow = Shadow(self.live, self.traffic, settings)
-        self.metrics = Metrics(self.live, self.traffic, self.shadow)
-        self.errors = ErrorHandlers(settings.retry, self.metrics.failed)
-        self.models = Models(registry, self.live, self.versions, self.traffic)
-        self.watcher = AliasWatcher(registry, self.live, self.traffic, replica, settings)
-        self.keyring = Keyring()
-        self.key_watcher = KeyWatcher(registry, self.keyring, settings)
-        self.doors = Doors(self.keyring, settings, is_exposed)
+        self.shadow = Shadow(self.alias_slots, self.traffic, settings)
+        self.metrics = Metrics(self.alias_slots, self.traffic, self.shadow)
+        self.errors = ErrorHandlers(settings.retry, self.metrics.count_error)
+        self.models = ModelResolver(registry, self.alias_slots, self.versions, self.traffic)
+        self.watcher = AliasWatcher(registry, self.alias_slots, self.traffic, replica, settings)
+        self.api_keys = ApiKeyCache()
+        self.api_key_watcher = ApiKeyWatcher(registry, self.api_keys, settings)
+        self.access = AccessControl(self.api_keys, settings, is_exposed)
         self.action = ActionRoute(self.models, self.shadow, self.metrics, settings, replica)
-        parts = StreamParts(self.models, self.live, self.traffic, self.shadow, self.metrics, self.doors, settings)
-        self.stream = StreamRoute(parts, replica)
+        dependencies = StreamDependencies(
+            self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
+        )
+        self.stream = StreamRoute(dependencies, replica)
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
-        self.reporter = Reporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
-        self.evaluations = EvaluationRoutes(self.models, settings, studio)
-        self.games = GameRoutes(self.models, settings, studio)
-        self.events = Events(self.models, settings)
-        self.catalogue = Catalogue(self.models, self.versions, self.inference, settings)
+        self.reporter = MetricsReporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
+        self.evaluations = EvaluationRoutes(self.models, settings, evaluation_client)
+        self.games = GameRoutes(self.models, settings, evaluation_client)
+        self.events = EventBroker(self.models, settings)
+        self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
-            self.inference, self.catalogue, self.watcher, self.doors, settings, machine, self.metrics.failed
+            self.inference, self.catalogue, self.watcher, self.access, settings, machine, self.metrics.count_error
         )
 
     def _in_flight(self) -> dict[str, int]:
@@ -188,67 +176,69 @@ class Server:
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
-        leagues = LeagueRoutes(self.models)
-        standings = StandingsRoutes(self.models)
-        verdicts = VerdictRoutes(self.models)
-        matches = MatchRoutes(self.models)
-        runs = RunRoutes(self.models)
-        history = HistoryRoutes(self.models)
-        promotion = PromotionRoutes(self.models, self.settings)
-        notes = NoteRoutes(self.models, self.settings)
-        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
-        health = HealthRoutes(self.watcher, self.replica)
-        events = EventRoutes(self.events, self.doors)
-        docs = DocsRoutes(self.live, self.doors, self.settings)
+        docs = DocsRoutes(self.alias_slots, self.access, self.settings)
+        status = StatusRoutes(self.models, self.watcher, self.access, self.replica)
         open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
         return Starlette(
             routes=[
                 Route("/v1/policies/{model}/action", self.action, methods=["POST"]),
                 WebSocketRoute("/v1/policies/{model}/stream", self.stream),
                 *open_inference.routes(),
-                Route("/v1/leagues", leagues.leagues),
-                Route("/v1/leagues/{league}", leagues.league),
-                Route("/v1/leagues/{league}/versions", leagues.versions),
-                Route("/v1/leagues/{league}/versions/{version}/note", notes.put, methods=["PUT"]),
-                Route("/v1/leagues/{league}/standings", standings.standings),
-                Route("/v1/leagues/{league}/payoff", standings.payoff),
-                Route("/v1/leagues/{league}/ratings", standings.ratings),
-                Route("/v1/leagues/{league}/verdicts", verdicts.every),
-                Route("/v1/leagues/{league}/verdicts/{verdict}", verdicts.one),
-                Route("/v1/leagues/{league}/matches", matches.every),
-                Route("/v1/leagues/{league}/matches/{schedule}/{position}", matches.one),
-                Route("/v1/leagues/{league}/runs", runs.every),
-                Route("/v1/leagues/{league}/runs/{run}", runs.one),
-                Route("/v1/leagues/{league}/aliases/{alias}/history", history.history),
-                Route("/v1/leagues/{league}/aliases/{alias}", promotion.move, methods=["POST"]),
-                Route("/v1/leagues/{league}/rollback", promotion.roll_back, methods=["POST"]),
-                Route("/v1/leagues/{league}/traffic", traffic.show),
-                Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
-                Route("/v1/leagues/{league}/evaluations", self.evaluations.every),
-                Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
-                Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.one),
-                Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
-                Route("/v1/leagues/{league}/evaluations/{evaluation}/events", events.evaluation),
-                Route("/v1/leagues/{league}/events", events.league),
-                Route(GAME, self.games.recording),
-                Route(f"{GAME}/film.gif", self.games.film),
-                Route("/v1/leagues/{league}/playable", self.games.table),
-                Route("/v1/leagues/{league}/play", self.games.play, methods=["POST"]),
-                Route("/v1/key", KeyRoute(self.doors).key),
+                *self._league_routes(),
+                Route("/v1/key", status.key),
                 Route("/docs", docs.docs),
                 Route("/openapi.json", docs.openapi),
-                Route("/metrics", MetricsRoute(self.models).metrics),
-                Route("/v1/health/live", health.live),
-                Route("/v1/health/ready", health.ready),
+                Route("/metrics", status.metrics),
+                Route("/v1/health/live", status.live),
+                Route("/v1/health/ready", status.ready),
                 *PageRoutes().routes(),
             ],
             middleware=[
-                Middleware(Guarded, self.doors, self.errors, self.settings, self.access_log),
-                Middleware(Shortcut, self.action),
+                Middleware(AccessControlMiddleware, self.access, self.errors, self.settings, self.access_log),
+                Middleware(ActionDispatch, self.action),
             ],
-            exception_handlers=self.errors.table(),
+            exception_handlers=self.errors.handlers(),
             lifespan=self._running,
         )
+
+    def _league_routes(self) -> list[Route]:
+        leagues = LeagueRoutes(self.models, self.settings)
+        results = ResultRoutes(self.models)
+        verdicts = VerdictRoutes(self.models)
+        runs = RunRoutes(self.models)
+        aliases = AliasRoutes(self.models, self.settings)
+        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
+        events = EventRoutes(self.events, self.access)
+        return [
+            Route("/v1/leagues", leagues.page),
+            Route("/v1/leagues/{league}", leagues.get),
+            Route("/v1/leagues/{league}/versions", leagues.versions),
+            Route("/v1/leagues/{league}/versions/{version}/note", leagues.put_note, methods=["PUT"]),
+            Route("/v1/leagues/{league}/leaderboard", results.leaderboard),
+            Route("/v1/leagues/{league}/payoff", results.payoff),
+            Route("/v1/leagues/{league}/ratings", results.ratings),
+            Route("/v1/leagues/{league}/verdicts", verdicts.page),
+            Route("/v1/leagues/{league}/verdicts/{verdict}", verdicts.get),
+            Route("/v1/leagues/{league}/matches", results.matches),
+            Route("/v1/leagues/{league}/matches/{schedule}/{position}", results.match),
+            Route("/v1/leagues/{league}/runs", runs.page),
+            Route("/v1/leagues/{league}/runs/{run}", runs.get),
+            Route("/v1/leagues/{league}/aliases/{alias}/history", aliases.history),
+            Route("/v1/leagues/{league}/aliases/{alias}", aliases.move, methods=["POST"]),
+            Route("/v1/leagues/{league}/rollback", aliases.roll_back, methods=["POST"]),
+            Route("/v1/leagues/{league}/traffic", traffic.show),
+            Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
+            Route("/v1/leagues/{league}/evaluations", self.evaluations.page),
+            Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
+            Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.get),
+            Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
+            Route("/v1/leagues/{league}/evaluations/{evaluation}/events", events.evaluation),
+            Route("/v1/leagues/{league}/events", events.league),
+            Route(GAME_PATH, self.games.recording),
+            Route(f"{GAME_PATH}/video.gif", self.games.video),
+            Route("/v1/leagues/{league}/playable", self.games.playability),
+            Route("/v1/leagues/{league}/play", self.games.play, methods=["POST"]),
+        ]
 
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:
@@ -256,7 +246,7 @@ class Server:
             async with AsyncExitStack() as running:
                 if self.access_log is not None:
                     await running.enter_async_context(self.access_log.writing())
-                await running.enter_async_context(self.key_watcher.watching())
+                await running.enter_async_context(self.api_key_watcher.watching())
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
                 await running.enter_async_context(self.events.watching())

@@ -1,18 +1,55 @@
-"""What tests of several packages share."""
+"""Fixtures and settings shared by the tests of several packages."""
 
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
 
-# Tests time nothing: other work on the machine must not fail one.
+from league.registry.storage import database
+from tests.support.schema import migrated_once
+
+# Tests do not measure time: other load on the machine must not make one fail.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+ROOT = Path(__file__).parents[1]
+SHARED = ("ray_session", "ray_server")
+"""Session fixtures that take long to set up."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Distribute files among the processes; files that share a Ray session or a server go to the same process."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class BySharedResource(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return _shared_resource(nodeid.partition("::")[0])
+
+    return BySharedResource(config, log)
+
+
+@cache
+def _shared_resource(file: str) -> str:
+    text = (ROOT / file).read_text()
+    shared = next((fixture for fixture in SHARED if fixture in text), file)
+    return "browser" if file.startswith("tests/browser/") else shared
+
+
+@pytest.fixture(autouse=True, scope="session")
+def schema() -> Iterator[None]:
+    """Run migrations, the slowest part of many tests, once in a process."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(database, "_apply", migrated_once(database._apply))
+        yield
 
 
 @pytest.fixture(scope="session")
 def ray_session() -> Iterator[None]:
-    """One Ray of two CPUs for all tests that need one."""
+    """One Ray with two CPUs for all tests that need it."""
     import ray
 
     ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")

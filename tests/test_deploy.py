@@ -1,7 +1,10 @@
-"""What is deployed agrees: with deploy.yaml, with the metrics that there are, and with what operators are told."""
+"""The deployment files agree with deploy.yaml, with the exported metrics, and with the documentation for operators."""
 
 import json
 import re
+import subprocess
+import sys
+import tomllib
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -9,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from serve_app.exposition import METRICS
+from serve_app.observability.prometheus import METRICS
 from serve_app.settings import ServeSettings
 
 ROOT = Path(__file__).parent.parent
@@ -29,12 +32,12 @@ OPERATIONS = (ROOT / "docs/operations.md").read_text()
 
 
 def exports() -> dict[str, str]:
-    """The environment that deploy.yaml lists."""
+    """The environment variables in the comments of deploy.yaml."""
     found = re.findall(r"^#\s+export (\w+)=(\"[^\"]*\"|\S+)", (ROOT / "deploy.yaml").read_text(), flags=re.M)
     return {name: value.strip('"') for name, value in found}
 
 
-def test_the_cluster_serves_what_one_machine_does() -> None:
+def test_the_cluster_serves_like_a_single_machine() -> None:
     expected = json.loads(json.dumps(DEPLOY))
     expected["http_options"]["host"] = "0.0.0.0"
     expected["applications"][0]["args"] |= {"grpc_local_only": False}
@@ -43,7 +46,7 @@ def test_the_cluster_serves_what_one_machine_does() -> None:
 
 
 @pytest.mark.parametrize("document", [DEPLOY, SERVED], ids=["deploy.yaml", "kuberay.yaml"])
-def test_ray_and_our_settings_take_it(document: Any) -> None:
+def test_both_files_are_valid_for_ray_and_our_settings(document: Any) -> None:
     from ray.serve.schema import ServeDeploySchema
 
     ServeDeploySchema.model_validate(document)
@@ -54,17 +57,17 @@ def test_ray_and_our_settings_take_it(document: Any) -> None:
 
 
 @pytest.mark.parametrize("template", [HEAD, WORKERS["template"]], ids=["head", "workers"])
-def test_every_pod_has_the_environment_the_files_and_the_image(template: Any) -> None:
+def test_each_pod_has_the_environment_the_files_and_the_image(template: Any) -> None:
     (container,) = template["spec"]["containers"]
     environment = {entry["name"]: entry.get("value") for entry in container["env"]}
-    wanted = exports()
-    assert {name: value for name, value in environment.items() if name in wanted and name != "LEAGUE_HOME"} == {
+    expected = exports()
+    assert {name: value for name, value in environment.items() if name in expected and name != "LEAGUE_HOME"} == {
         name: value
-        for name, value in wanted.items()
+        for name, value in expected.items()
         if name not in ("LEAGUE_HOME", "RAY_AUTH_MODE")  # the operator sets the latter, with the token
     }
     assert CLUSTER["authOptions"] == {"mode": "token"}
-    assert "LEAGUE_DATABASE_URL" in environment, "SQLite is for one machine"
+    assert "LEAGUE_DATABASE_URL" in environment, "SQLite supports only one machine"
     (mount,), (volume,) = container["volumeMounts"], template["spec"]["volumes"]
     assert mount["name"] == volume["name"]
     assert str(environment["LEAGUE_ARTIFACTS"]).startswith(mount["mountPath"])
@@ -72,12 +75,12 @@ def test_every_pod_has_the_environment_the_files_and_the_image(template: Any) ->
     assert container["image"] == HEAD["spec"]["containers"][0]["image"]
 
 
-def test_the_pinned_ray_is_the_cluster_s() -> None:
+def test_the_pinned_ray_is_that_of_the_cluster() -> None:
     constraints = (ROOT / "constraints.txt").read_text()
     assert f"ray=={CLUSTER['rayVersion']}\n" in constraints
 
 
-def test_a_drain_takes_one_pod_and_lets_it_finish() -> None:
+def test_draining_evicts_one_pod_at_a_time_after_its_requests() -> None:
     selector = BUDGET["spec"]["selector"]["matchLabels"]
     assert selector.items() <= WORKERS["template"]["metadata"]["labels"].items()
     assert BUDGET["spec"]["maxUnavailable"] < WORKERS["replicas"] == WORKERS["minReplicas"]
@@ -88,7 +91,7 @@ def test_a_drain_takes_one_pod_and_lets_it_finish() -> None:
 
 
 def queries() -> list[tuple[str, str]]:
-    """(where it is, query) of the dashboard and the alerts."""
+    """(panel or alert, query) of the dashboard and the alerts."""
     panels = [(panel["title"], target["expr"]) for panel in DASHBOARD["panels"] for target in panel["targets"]]
     variables = [
         (variable["name"], variable["query"])
@@ -111,20 +114,20 @@ def samples() -> dict[str, tuple[str, ...]]:
 
 
 @pytest.mark.parametrize(("where", "query"), queries())
-def test_each_query_names_metrics_and_labels_that_there_are(where: str, query: str) -> None:
+def test_each_query_uses_existing_metrics_and_labels(where: str, query: str) -> None:
     known = samples()
-    named = re.findall(r"\b(league_\w+)", query)
-    assert named or "up{" in query
-    assert set(named) <= known.keys(), where
+    used = re.findall(r"\b(league_\w+)", query)
+    assert used or "up{" in query
+    assert set(used) <= known.keys(), where
     for name, selector in re.findall(r"\b(league_\w+)\{([^}]*)\}", query):
         assert set(re.findall(r"(\w+)\s*=~?\"", selector)) <= set(known[name]), where
     grouped = chain.from_iterable(re.split(r",\s*", labels) for labels in re.findall(r"by \(([^)]*)\)", query))
-    assert set(grouped) <= set(chain.from_iterable(known[name] for name in named)), where
+    assert set(grouped) <= set(chain.from_iterable(known[name] for name in used)), where
 
 
-def test_every_metric_is_on_the_dashboard_or_in_an_alert() -> None:
-    shown = " ".join(query for _, query in queries())
-    assert {name for name in METRICS if name not in shown} == set()
+def test_each_metric_is_on_the_dashboard_or_in_an_alert() -> None:
+    expressions = " ".join(query for _, query in queries())
+    assert {name for name in METRICS if name not in expressions} == set()
 
 
 def test_panels_do_not_overlap() -> None:
@@ -139,17 +142,17 @@ def test_panels_do_not_overlap() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
 
 
-def test_every_alert_is_explained() -> None:
-    explained = re.findall(r"^\| `(League\w+)` \|", OPERATIONS, flags=re.M)
-    assert explained == [rule["alert"] for rule in RULES]
+def test_each_alert_is_documented() -> None:
+    documented = re.findall(r"^\| `(League\w+)` \|", OPERATIONS, flags=re.M)
+    assert documented == [rule["alert"] for rule in RULES]
     assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in RULES)
 
 
-def test_every_metric_is_explained() -> None:
+def test_each_metric_is_documented() -> None:
     assert set(re.findall(r"^\| `(league_\w+)` \|", OPERATIONS, flags=re.M)) == METRICS.keys()
 
 
-def test_every_serving_setting_is_explained_with_its_default() -> None:
+def test_each_serving_setting_is_documented_with_its_default() -> None:
     rows = dict(re.findall(r"^\| `(\w+)` \| `(.*?)` \|", OPERATIONS, flags=re.M))
     defaults = {name: field.default for name, field in ServeSettings.model_fields.items()}
     assert {name: yaml.safe_load(value) for name, value in rows.items()} == defaults
@@ -159,7 +162,7 @@ JOB = yaml.safe_load((ROOT / "deploy/nightly/cronjob.yaml").read_text())
 POD = JOB["spec"]["jobTemplate"]["spec"]["template"]["spec"]
 
 
-def test_the_night_of_a_cluster_works_on_what_the_cluster_serves() -> None:
+def test_the_nightly_job_uses_the_registry_of_the_cluster() -> None:
     (container,) = POD["containers"]
     (server,) = HEAD["spec"]["containers"]
     assert container["image"] == server["image"]
@@ -172,7 +175,7 @@ def test_the_night_of_a_cluster_works_on_what_the_cluster_serves() -> None:
     assert JOB["spec"]["concurrencyPolicy"] == "Forbid"
 
 
-def test_schedulers_run_commands_that_there_are_and_know_their_exit_codes() -> None:
+def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
     from cli.nightly import BUSY, FAULTS
 
     unit = (ROOT / "deploy/nightly/league-nightly.service").read_text()
@@ -185,3 +188,39 @@ def test_schedulers_run_commands_that_there_are_and_know_their_exit_codes() -> N
     assert re.search(
         r"^OnCalendar=\*-\*-\* \d\d:\d\d$", (ROOT / "deploy/nightly/league-nightly.timer").read_text(), flags=re.M
     )
+
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TRAINING = {"onnx", "onnxscript", "tensorboard", "torch"}
+"""Dependencies that only training imports."""
+
+
+def test_the_server_image_has_all_dependencies_except_those_of_training() -> None:
+    expected = [each for each in PROJECT["dependencies"] if re.split(r"\W", each)[0] not in TRAINING]
+    expected = [each.replace("ray[rllib,serve,tune]", "ray[serve]") for each in expected]
+    listed = (ROOT / "deploy/server-requirements.txt").read_text().splitlines()
+    assert [line for line in listed if line[0] != "#"] == sorted(
+        expected + PROJECT["optional-dependencies"]["postgres"]
+    )
+
+
+def test_serving_and_evaluation_import_no_dependency_of_training() -> None:
+    program = """if True:
+        import importlib, pkgutil, sys
+        for package in ("league", "evaluation", "serve_app", "configs"):
+            for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
+                if not module.name.endswith(("__main__", ".env")):
+                    importlib.import_module(module.name)
+        print(*sys.modules)
+    """
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert process.returncode == 0, process.stderr
+    assert set(process.stdout.split()) & (TRAINING | {"ray.rllib", "ray.tune", "training"}) == set()
+
+
+def test_the_container_images_have_the_deployed_tags() -> None:
+    dockerfile = (ROOT / "Dockerfile").read_text()
+    assert f"--target server --tag {HEAD['spec']['containers'][0]['image']} ." in dockerfile
+    assert PROJECT["version"] in HEAD["spec"]["containers"][0]["image"]
+    assert set(re.findall(r"^FROM \S+ AS (\w+)$", dockerfile, flags=re.M)) >= {"server", "trainer"}
+    assert re.search(r"^USER 1000:1000$", dockerfile, flags=re.M), "Kubernetes checks that the user is not root"

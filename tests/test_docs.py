@@ -1,12 +1,20 @@
-"""The documentation is true: what it names exists, and what it shows parses."""
+"""The documentation is correct: the names in it exist, and its examples are valid."""
 
+import ast
 import re
+import runpy
 import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
 import yaml
+from markdown.extensions.toc import slugify
 from typer.core import TyperGroup
 
 from cli.main import app
@@ -14,25 +22,38 @@ from league.config import LeagueConfig
 from league.training_config import ALGORITHMS
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-ROOMS = ("cli", "evaluation", "examples", "league", "serve_app", "training")
+DOCS = ROOT / "docs"
+README = ROOT / "README.md"
+PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+PACKAGES = ("cli", "evaluation", "examples", "league", "serve_app", "training")
+FOLDERS = (*PACKAGES, "benchmarks", "configs", "deploy", "docs", "scripts", "tests")
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
 
 
 def fenced(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), flags=re.S | re.M)
 
 
+def code(page: Path) -> list[str]:
+    """Text in backquotes outside of fenced blocks."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+    return re.findall(r"`([^`\n]+)`", text)
+
+
 def shell_lines() -> list[tuple[str, str]]:
     lines = []
     for page in PAGES:
         for block in fenced(page, "sh"):
-            lines += [(page.name, line) for line in block.splitlines() if line.strip()]
+            lines += [(name_of(page), line) for line in block.splitlines() if line.strip()]
     return lines
 
 
 @pytest.mark.parametrize(("page", "line"), [pair for pair in shell_lines() if pair[1].startswith("league ")])
-def test_each_command_shown_exists_with_its_options(page: str, line: str) -> None:
+def test_each_shown_command_exists_with_its_options(page: str, line: str) -> None:
     _, name, *arguments = shlex.split(line, comments=True)
     assert name in COMMANDS, f"{page}: {line}"
     command = COMMANDS[name]
@@ -43,44 +64,86 @@ def test_each_command_shown_exists_with_its_options(page: str, line: str) -> Non
     for argument in arguments:
         if argument.startswith("--"):
             assert argument.partition("=")[0] in known, f"{page}: {line}"
+        if re.fullmatch(r"configs/.*", argument):
+            assert (ROOT / argument).exists(), f"{page}: {line}"
 
 
 @pytest.mark.parametrize(("page", "line"), [pair for pair in shell_lines() if pair[1].startswith("make ")])
-def test_each_make_target_shown_exists(page: str, line: str) -> None:
+def test_each_shown_make_target_exists(page: str, line: str) -> None:
     target = shlex.split(line, comments=True)[1]
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), flags=re.M), f"{page}: {line}"
 
 
-def test_every_command_is_in_the_readme() -> None:
-    text = (ROOT / "README.md").read_text()
-    assert {name for name in COMMANDS if f"league {name}" not in text} <= {"demo"}
+def test_each_command_is_in_the_readme() -> None:
+    text = README.read_text()
+    assert [name for name in COMMANDS if f"league {name}" not in text] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_each_link_leads_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()):
-        if not target.startswith(("http:", "https:")):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text().splitlines()) <= 120
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+    return {slugify(heading.replace("`", ""), "-") for heading in re.findall(r"^#+ (.+)$", text, flags=re.M)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_each_link_has_a_target(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", page.read_text()):
+        if target.startswith(("http:", "https:")):
+            continue
+        linked = (page.parent / target).resolve() if target else page
+        assert linked.exists(), f"{name_of(page)} links to {target}"
+        if anchor:
+            assert anchor in anchors(linked), f"{name_of(page)} links to {target}#{anchor}"
+
+
+def test_each_page_is_in_the_navigation() -> None:
+    text = (ROOT / "mkdocs.yml").read_text()
+    listed = re.findall(r"[\w/-]+\.md$", text, flags=re.M)
+    assert sorted(listed) == sorted({*(page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")), *COPIED})
+
+
+COPIED = {"contributing.md", "changelog.md"}
+"""Pages that scripts/mkdocs_hooks.py creates from CONTRIBUTING.md and CHANGELOG.md."""
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_warnings(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    assert (tmp_path / "search/search_index.json").exists()
+    loaded = [
+        link
+        for page in tmp_path.rglob("*.html")
+        for link in re.findall(r"<(?:script|img|link)[^>]* (?:src|href)=\"?(https?://[^\" >]*)", page.read_text())
+    ]
+    assert loaded == [], "the site must work offline"
 
 
 @pytest.mark.parametrize(
     ("page", "block"),
-    [(page.name, block) for page in PAGES for block in fenced(page, "yaml") if block.startswith("league:")],
+    [(name_of(page), block) for page in PAGES for block in fenced(page, "yaml") if block.startswith("league:")],
 )
-def test_each_league_shown_is_a_valid_configuration(page: str, block: str) -> None:
+def test_each_shown_league_is_a_valid_configuration(page: str, block: str) -> None:
     LeagueConfig.from_mapping(yaml.safe_load(block), source=page)
 
 
 def settings_of(heading: str) -> dict[str, str]:
-    """Key → default, as the table below a heading shows them."""
-    _, _, section = (ROOT / "docs/configuration.md").read_text().partition(f"\n## {heading}\n")
+    """Key → default, from the table below a heading."""
+    _, found, section = (DOCS / "configuration.md").read_text().partition(f"\n## {heading}\n")
+    assert found, heading
     return dict(re.findall(r"^\| `(\w+)` \| `?(.*?)`? \|", section.partition("\n## ")[0], flags=re.M))
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_training_setting_is_documented_with_its_default(name: str) -> None:
+def test_each_training_setting_is_documented_with_its_default(name: str) -> None:
     model = ALGORITHMS[name]
-    rows = settings_of("`training`, whatever the algorithm") | settings_of(f"`training` with `algorithm: {name}`")
+    rows = settings_of("`training`: all algorithms") | settings_of(f"`training` with `algorithm: {name}`")
     fields = {field.alias or key for key, field in model.model_fields.items()}
     assert set(rows) == fields
     for key in fields:
@@ -91,22 +154,130 @@ def test_every_training_setting_is_documented_with_its_default(name: str) -> Non
         assert model.model_validate({"algorithm": name, key: shown}).model_dump(by_alias=True)[key] == default
 
 
-def test_every_file_has_a_caption_in_the_architecture_page() -> None:
-    text = (ROOT / "docs/architecture.md").read_text()
+def test_the_module_index_is_current() -> None:
+    expected = runpy.run_path(str(ROOT / "scripts/generate_module_index.py"))["page"]()
+    assert (DOCS / "modules.md").read_text() == expected, "run `make generate`"
+
+
+def test_each_module_is_in_the_module_index() -> None:
     files = {
-        path.relative_to(ROOT).as_posix()
-        for room in ROOMS
-        for path in (ROOT / room).rglob("*.py")
-        if path.name != "__init__.py" and "versions" not in path.parent.name
+        name_of(path)
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+        if path.name != "__init__.py" and path.parent.name != "versions"
     }
-    captioned = set(re.findall(r"^\| `([\w/]+\.py)` \|", text, flags=re.M))
-    assert captioned == files
+    listed = re.findall(r"^\| `([\w/]+\.py)` \| \S", (DOCS / "modules.md").read_text(), flags=re.M)
+    assert sorted(listed) == sorted(files)
 
 
-def test_every_environment_variable_of_ours_is_documented() -> None:
+@cache
+def top_level_names(module: Path) -> set[str]:
+    """Names defined at the top level of a module, and those that it imports."""
+    names = set()
+    for node in ast.parse(module.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.ImportFrom | ast.Import):
+            names |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Assign):
+            names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            names.add(node.target.id)
+    return names
+
+
+def exists(dotted: str) -> bool:
+    """Whether a dotted name is a package, a module, or defined in one."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        path = ROOT.joinpath(*parts[:length])
+        module = path.with_suffix(".py") if path.with_suffix(".py").exists() else path / "__init__.py"
+        if module.exists():
+            rest = parts[length:]
+            return not rest or rest[0] in top_level_names(module)
+    return False
+
+
+GENERATED = ("modules.md",)
+SETTINGS = {
+    f"training.{field.alias or key}" for model in ALGORITHMS.values() for key, field in model.model_fields.items()
+}
+"""Keys of a configuration, which look like names of modules."""
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in GENERATED], ids=name_of)
+def test_each_named_module_and_file_exists(page: Path) -> None:
+    packages = "|".join((*PACKAGES, "benchmarks", "tests"))
+    text = page.read_text()
+    quoted = " ".join(code(page))
+    dotted = re.findall(rf"(?<![\w./-])(?:{packages})(?:\.[A-Za-z_]\w*)+", quoted)
+    dotted += re.findall(r"^::: ([\w.]+)$", text, flags=re.M)
+    dotted += re.findall(rf"python -m ((?:{packages})[\w.]*)", text)
+    dotted += re.findall(rf"^from ((?:{packages})[\w.]*) import", text, flags=re.M)
+    files = ("db", "gif", "html", "js", "json", "jsonl", "md", "py", "yaml", "yml")
+    unknown = [name for name in dotted if name.rpartition(".")[2] not in files and not exists(name)]
+    unknown = [name for name in unknown if name not in SETTINGS]
+    paths = re.findall(rf"(?<![\w./-])((?:{'|'.join(FOLDERS)})/[\w./-]*\w)", quoted)
+    unknown += [path for path in paths if not (ROOT / path).exists()]
+    assert unknown == []
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "walkthroughs").glob("*.md")), ids=name_of)
+def test_a_walkthrough_links_to_at_most_five_files(page: Path) -> None:
+    assert 1 <= len(set(re.findall(r"\]\((\.\./\.\./[^)]+)\)", page.read_text()))) <= 5
+
+
+def test_each_route_and_error_of_the_server_is_documented() -> None:
+    text = (DOCS / "http.md").read_text()
+    openapi = yaml.safe_load((ROOT / "serve_app/openapi/openapi.yaml").read_text())
+    known = {
+        (method.upper(), path)
+        for path, calls in openapi["paths"].items()
+        for method in calls
+        if path.startswith("/v1/") and method != "parameters"
+    }
+    calls = set(re.findall(r"\b(GET|POST|PUT|DELETE) +(/v1/[^\s`?]*)", text))
+    assert known - calls == {("GET", "/v1/policies/{model}/stream")}
+    assert {call for call in calls if "…" not in call[1]} <= known
+    codes = set(re.findall(r"`([a-z_]+)`", text.partition("\n## Errors\n")[2].partition("\n## ")[0]))
+    assert codes == set(error_codes(openapi)) | {"method_not_allowed"}
+
+
+def error_codes(node: Any) -> Iterator[str]:
+    """The values of `code` in a part of the OpenAPI document."""
+    if isinstance(node, dict):
+        if isinstance(code := node.get("code"), dict):
+            yield from code.get("enum", ())
+        node = list(node.values())
+    for child in node if isinstance(node, list) else ():
+        yield from error_codes(child)
+
+
+RETIRED = (
+    r"\bstudio",
+    r"\bkeeper\b",
+    r"\bchronicle\b",
+    r"\bkeyring\b",
+    r"\bsitting\b",
+    r"\bexhibition",
+    r"\bhouse\b",
+    r"\bamiss\b",
+    r"\bstrangers?\b",
+    r"who beats whom",
+    r"who stands where",
+)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in GENERATED], ids=name_of)
+def test_no_page_uses_a_retired_term(page: Path) -> None:
+    text = page.read_text()
+    assert [term for term in RETIRED if re.search(term, text, flags=re.I)] == []
+
+
+def test_each_environment_variable_of_ours_is_documented() -> None:
     used = set()
-    for room in ROOMS:
-        for path in (ROOT / room).rglob("*.py"):
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
             used |= set(re.findall(r"\bLEAGUE_[A-Z_]+\b", path.read_text()))
-    readme = (ROOT / "README.md").read_text()
-    assert {name for name in used if name not in readme} == set()
+    listed = re.findall(r"^\| `(LEAGUE_\w+)` \|", (DOCS / "environment-variables.md").read_text(), flags=re.M)
+    assert sorted(listed) == sorted(used)

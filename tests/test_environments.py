@@ -1,126 +1,22 @@
-"""Every environment of PettingZoo 1.27 and mpe2 but Atari: one update, a version, its matches, its actions."""
+"""Each environment of PettingZoo 1.27 and mpe2 except Atari: one update, a version, its matches, its actions."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from evaluation import tournament
-from league.config import LeagueConfig
+from evaluation.matches import tournament
 from league.environments.building import interface
 from league.policies import load
 from league.registry.registry import Registry
 from league.settings import Storage
-from league.spaces import tensors, to_gymnasium
-from training.publish import Checkpoint, publish
-from training.trial import build
-
-TEAM = {"team": ["*"]}
-PIXELS = {"convolutions": [{"filters": 4, "kernel": 8, "stride": 4}]}
-
-
-@dataclass(frozen=True)
-class Case:
-    """What an environment needs besides its name so that a few of its episodes take seconds."""
-
-    entry_point: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
-    sides: dict[str, list[str]] | None = None
-    policies: dict[str, list[str]] | None = None
-    wrappers: tuple[Any, ...] = ()
-    training: dict[str, Any] = field(default_factory=dict)
-
-    def league(self) -> LeagueConfig:
-        document: dict[str, Any] = {
-            "league": self.entry_point.rpartition(".")[2],
-            "environment": {
-                "entry_point": self.entry_point,
-                "kwargs": self.kwargs,
-                "wrappers": list(self.wrappers),
-            },
-            "play": {"copies": 4},
-            "training": {
-                "runners": 0,
-                "copies": 2,
-                "train_batch_size": 64,
-                "minibatch_size": 32,
-                "epochs": 1,
-                "hidden": [16],
-            }
-            | self.training,
-        }
-        if self.sides is not None:
-            document["sides"] = self.sides
-        if self.policies is not None:
-            document["policies"] = self.policies
-        return LeagueConfig.from_mapping(document)
-
-
-CLASSIC = "pettingzoo.classic."
-BUTTERFLY = "pettingzoo.butterfly."
-SISL = "pettingzoo.sisl."
-CASES = [
-    Case(CLASSIC + "chess_v6"),
-    Case(CLASSIC + "connect_four_v3"),
-    Case(CLASSIC + "go_v5", {"board_size": 5}),
-    Case(CLASSIC + "hanabi_v5", sides=TEAM),
-    Case(CLASSIC + "leduc_holdem_v4"),
-    Case(CLASSIC + "rps_v2"),
-    Case(CLASSIC + "texas_holdem_v4"),
-    Case(CLASSIC + "texas_holdem_no_limit_v6"),
-    Case(CLASSIC + "tictactoe_v3"),
-    Case(
-        BUTTERFLY + "cooperative_pong_v6",
-        {"max_cycles": 12},
-        TEAM,
-        {"left": ["paddle_0"], "right": ["paddle_1"]},
-        ({"color_reduction_v0": {"mode": "R"}}, {"resize_v1": {"x_size": 42, "y_size": 42}}, "frame_stack_v1"),
-        PIXELS,
-    ),
-    Case(BUTTERFLY + "knights_archers_zombies_v11", {"max_cycles": 20}, TEAM),
-    Case(
-        BUTTERFLY + "pistonball_v6",
-        {"n_pistons": 5, "max_cycles": 8},
-        TEAM,
-        None,
-        ({"color_reduction_v0": {"mode": "B"}}, {"resize_v1": {"x_size": 42, "y_size": 42}}, "frame_stack_v1"),
-        PIXELS,
-    ),
-    Case(SISL + "multiwalker_v9", {"max_cycles": 20}, TEAM),
-    Case(SISL + "pursuit_v5", {"max_cycles": 10}, TEAM),
-    Case("mpe2.simple_v3", sides=TEAM),
-    Case(
-        "mpe2.simple_adversary_v3",
-        sides={"adversary": ["adversary_*"], "good": ["agent_*"]},
-        policies={"adversary": ["adversary_*"], "good": ["agent_*"]},
-    ),
-    Case(
-        "mpe2.simple_crypto_v3",
-        sides={"eve": ["eve_*"], "good": ["*"]},
-        policies={"eve": ["eve_*"], "bob": ["bob_*"], "alice": ["alice_*"]},
-    ),
-    Case("mpe2.simple_push_v3", policies={"adversary": ["adversary_*"], "good": ["agent_*"]}),
-    Case("mpe2.simple_reference_v3", sides=TEAM),
-    Case(
-        "mpe2.simple_speaker_listener_v4",
-        sides=TEAM,
-        policies={"speaker": ["speaker_*"], "listener": ["listener_*"]},
-    ),
-    Case("mpe2.simple_spread_v3"),
-    Case(
-        "mpe2.simple_tag_v3",
-        sides={"hunters": ["adversary_*"], "hunted": ["agent_*"]},
-        policies={"hunters": ["adversary_*"], "hunted": ["agent_*"]},
-    ),
-    Case(
-        "mpe2.simple_world_comm_v3",
-        sides={"hunters": ["*adversary_*"], "hunted": ["agent_*"]},
-        policies={"leader": ["leadadversary_*"], "hunters": ["adversary_*"], "hunted": ["agent_*"]},
-    ),
-]
+from league.spaces.arrays import tensors
+from league.spaces.conversion import to_gymnasium
+from tests.support.environment_cases import CASES, Case
+from training.export.publish import Checkpoint, publish
+from training.runs.trial import build_algorithm
 
 
 @pytest.fixture
@@ -130,13 +26,24 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
     registry.close()
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.entry_point.rpartition(".")[2])
+QUICK = ("tictactoe_v3", "pistonball_v6", "simple_speaker_listener_v4")
+"""A turn-based environment, one with images, and one with different agents. Testing all others takes long."""
+
+
+def _cases() -> list[Any]:
+    names = {case.entry_point.rpartition(".")[2]: case for case in CASES}
+    return [
+        pytest.param(case, id=name, marks=[] if name in QUICK else pytest.mark.slow) for name, case in names.items()
+    ]
+
+
+@pytest.mark.parametrize("case", _cases())
 @pytest.mark.usefixtures("ray_session")
 def test_trains_publishes_evaluates_and_loads(case: Case, registry: Registry, tmp_path: Path) -> None:
     league = case.league()
-    described = interface(league)
-    registry.register(league, described)
-    algorithm = build(league, described)
+    league_interface = interface(league)
+    registry.leagues.register(league, league_interface)
+    algorithm = build_algorithm(league, league_interface)
     try:
         algorithm.train()
         algorithm.save_to_path(str(tmp_path / "64"))
@@ -147,17 +54,17 @@ def test_trains_publishes_evaluates_and_loads(case: Case, registry: Registry, tm
         Checkpoint(tmp_path / "64", source="run/64", steps=64),
         registry=registry,
         config=league,
-        interface=described,
+        interface=league_interface,
         parent=None,
         git_commit=None,
     )
     assert all(policy.parity.mismatches == 0 for policy in version.manifest.policies.values())
 
     report = tournament.evaluate(league.league, registry=registry, blocks=1)
-    assert {standing.ref for standing in report.standings} >= {version.ref, "script:random"}
+    assert {standing.ref for standing in report.leaderboard} >= {version.ref, "script:random"}
 
-    for policy in described.policy_ids:
-        spaces = described.of_policy(policy)
+    for policy in league_interface.policy_ids:
+        spaces = league_interface.of_policy(policy)
         observation = to_gymnasium(spaces.observation)
         observation.seed(3)
         arrays = tensors(spaces.observation, observation.sample())

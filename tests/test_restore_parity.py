@@ -1,4 +1,4 @@
-"""What a version does in training, in evaluation and over HTTP is the same; `benchmarks.parity`, in short."""
+"""A version acts identically in training, in evaluation and over HTTP: a short form of `benchmarks.parity`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,10 +8,12 @@ import pytest
 from benchmarks.parity import CONFIGS, compare, prepare
 from league.config import LeagueConfig
 from league.registry.registry import Registry
-from league.registry.rows import VersionRow
+from league.registry.storage.rows import VersionRow
 from league.settings import Storage
 from league.training_config import OffPolicyConfig
-from serve_app.launch import running
+from serve_app.runtime.launch import running
+
+pytestmark = pytest.mark.slow
 
 OBSERVATIONS = 300
 PATHS = sorted(CONFIGS.glob("*.yaml"))
@@ -23,21 +25,21 @@ Served = tuple[Registry, str, dict[str, VersionRow]]
 
 @pytest.fixture(scope="module")
 def served(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Every shipped configuration, trained for an update and promoted on one server."""
+    """All shipped configurations, trained for one update and promoted on one server."""
     registry = Registry.open(Storage.at(tmp_path_factory.mktemp("parity")))
-    versions = {path.stem: prepare(path, registry, updates=1, copies=2, **small(path)) for path in PATHS}
+    versions = {path.stem: prepare(path, registry, updates=1, num_envs=2, **small_settings(path)) for path in PATHS}
     with running(registry.storage, replicas=1) as url:
         yield registry, url, versions
     registry.close()
 
 
-def small(path: Path) -> dict[str, int]:
-    """Settings of an update that is over soon."""
+def small_settings(path: Path) -> dict[str, int]:
+    """Settings of a short update."""
     return SMALL_REPLAY if isinstance(LeagueConfig.load(path).training, OffPolicyConfig) else SMALL
 
 
 @pytest.mark.parametrize("name", [path.stem for path in PATHS])
-def test_module_graph_and_endpoint_act_alike(name: str, served: Served) -> None:
+def test_module_graph_and_endpoint_act_identically(name: str, served: Served) -> None:
     registry, url, versions = served
     compared = compare(versions[name], registry, url, OBSERVATIONS)
     assert {each.policy for each in compared} == set(versions[name].manifest.policies)

@@ -1,1 +1,1 @@
-"""League configuration → RLlib → published checkpoint versions."""
+"""RLlib training of a league's policies: algorithms, sampling, sweeps, ONNX export and publishing."""

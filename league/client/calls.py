@@ -1,39 +1,59 @@
-"""The calls of a client, each as a request and how its reply is read: no connection, so both clients share them."""
+"""The calls of the HTTP API: request and response parser of each, independent of the connection."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
-from league.client.answers import Answer, BatchAnswer, answer, batch_answer
-from league.client.encoding import to_json
-from league.client.models import Model
-from league.client.questions import BatchQuestion, Question
+from league.client.requests import ActionRequest, BatchActionRequest, JsonObject, to_json
+from league.client.responses import (
+    ActionResponse,
+    BatchActionResponse,
+    Model,
+    parse_action_response,
+    parse_batch_action_response,
+)
 from league.errors import AliasMoved, InvalidInput
 from league.refs import CheckpointRef, check_alias, check_slug
 
 T = TypeVar("T")
 
-Document = dict[str, Any]
-
 
 @dataclass(frozen=True, slots=True)
-class Call(Generic[T]):
-    """A request that may be repeated. read: the reply's document and replica → what the caller gets."""
+class ApiCall(Generic[T]):
+    """A request that is safe to repeat, and the parser of its response.
+
+    Attributes:
+        path: Path and query string.
+        parse: Body of the response and name of the replica → the result of the call.
+        body: JSON body of a POST request; None for a GET or DELETE request.
+        headers: Additional headers.
+        is_delete: Whether the method is DELETE.
+    """
 
     path: str
-    read: Callable[[Document, str], T]
+    parse: Callable[[JsonObject, str], T]
     body: bytes | None = None
-    """Of a POST; None is a GET."""
     headers: Mapping[str, str] = field(default_factory=dict)
-    is_removal: bool = False
-    """A DELETE, which has no body."""
+    is_delete: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Promotion:
-    """A movement of an alias, as the registry recorded it. kind: `promotion` or `rollback`. verdict: what it rests on,
-    None of one by hand."""
+    """A change of an alias, as recorded in the registry.
+
+    Attributes:
+        league: The league.
+        alias: The alias that was moved.
+        kind: `promotion` or `rollback`.
+        version: The version that the alias points to now.
+        previous: The version that it pointed to before; None if the alias is new.
+        actor: The user or API key that made the change.
+        reason: Text given with the change.
+        at: Time of the change, ISO 8601 in UTC.
+        event: Number of the entry in the audit log.
+        verdict: Digest of the verdict that justifies the change; None for a manual change.
+    """
 
     league: str
     alias: str
@@ -47,123 +67,130 @@ class Promotion:
     verdict: str | None = None
 
 
-def act(model: Model, question: Question) -> Call[Answer]:
-    """Ask for one action."""
-    return Call(
+def act(model: Model, request: ActionRequest) -> ApiCall[ActionResponse]:
+    """Request one action."""
+    return ApiCall(
         f"{model.path}/action{model.query}",
-        lambda reply, replica: answer(reply, replica, question.seed),
-        to_json(question.document),
+        lambda body, replica: parse_action_response(body, replica, request.seed),
+        to_json(request.body),
     )
 
 
-def act_batch(model: Model, question: BatchQuestion) -> Call[BatchAnswer]:
-    """Ask for the actions of a batch."""
-    return Call(
+def act_batch(model: Model, request: BatchActionRequest) -> ApiCall[BatchActionResponse]:
+    """Request the actions of a batch."""
+    return ApiCall(
         f"{model.path}/action{model.query}",
-        lambda reply, replica: batch_answer(reply, replica, question.seed),
-        to_json(question.document),
+        lambda body, replica: parse_batch_action_response(body, replica, request.seed),
+        to_json(request.body),
     )
 
 
-def leagues() -> Call[list[Document]]:
-    """Ask for all leagues."""
-    return Call("/v1/leagues", lambda reply, _: reply["leagues"])
+def leagues() -> ApiCall[list[JsonObject]]:
+    """List all leagues."""
+    return ApiCall("/v1/leagues", lambda body, _: body["leagues"])
 
 
-def league(slug: str) -> Call[Document]:
-    """Ask for one league."""
-    return Call(f"/v1/leagues/{check_slug('league', slug)}", lambda reply, _: reply)
+def league(slug: str) -> ApiCall[JsonObject]:
+    """Describe one league."""
+    return ApiCall(f"/v1/leagues/{check_slug('league', slug)}", lambda body, _: body)
 
 
-def versions(slug: str) -> Call[list[Document]]:
-    """Ask for the versions of a league."""
-    return Call(f"/v1/leagues/{check_slug('league', slug)}/versions", lambda reply, _: reply["versions"])
+def versions(slug: str) -> ApiCall[list[JsonObject]]:
+    """List the versions of a league."""
+    return ApiCall(f"/v1/leagues/{check_slug('league', slug)}/versions", lambda body, _: body["versions"])
 
 
-def health(what: str) -> Call[str]:
-    """Ask a replica whether it is `live` or `ready`; returns its name."""
-    return Call(f"/v1/health/{what}", lambda reply, _: reply["replica"])
+def health(probe: str) -> ApiCall[str]:
+    """Check whether a replica is `live` or `ready`; the result is the replica's name."""
+    return ApiCall(f"/v1/health/{probe}", lambda body, _: body["replica"])
 
 
 ANY: Any = object()
-"""An alias may point anywhere before it is moved."""
+"""Value of `expected` for which an alias is moved unconditionally."""
 
 
-def promote(ref: str, alias: str, expected: int | None, reason: str | None, key: str | None) -> Call[Promotion]:
+def promote(ref: str, alias: str, expected: int | None, reason: str | None, key: str | None) -> ApiCall[Promotion]:
     """Point an alias at a version, `connect_four@3`. Raises InvalidReference or InvalidInput."""
     version = CheckpointRef.parse(ref)
     if not isinstance(version.version, int):
-        raise InvalidInput(f"{ref} is an alias, expected the number of a version to promote")
-    document: Document = {"version": version.version}
+        raise InvalidInput(f"{ref} is an alias, expected a version number")
+    body: JsonObject = {"version": version.version}
     if expected is not ANY:
-        document["expected"] = expected
+        body["expected"] = expected
     path = f"/v1/leagues/{version.league}/aliases/{check_alias(alias)}"
-    return _change(path, document, reason, key)
+    return _move_alias(path, body, reason, key)
 
 
-def rollback(slug: str, reason: str | None, key: str | None) -> Call[Promotion]:
-    """Go back to the champion before."""
-    return _change(f"/v1/leagues/{check_slug('league', slug)}/rollback", {}, reason, key)
+def rollback(slug: str, reason: str | None, key: str | None) -> ApiCall[Promotion]:
+    """Restore the previous champion."""
+    return _move_alias(f"/v1/leagues/{check_slug('league', slug)}/rollback", {}, reason, key)
 
 
-def evaluate(slug: str, asked: Mapping[str, Any], reason: str | None, key: str | None) -> Call[Document]:
-    """Start an evaluation; `asked` is what the body of POST …/evaluations may hold."""
-    document = dict(asked) if reason is None else {**asked, "reason": reason}
+def evaluate(slug: str, options: Mapping[str, Any], reason: str | None, key: str | None) -> ApiCall[JsonObject]:
+    """Start an evaluation. options: further fields of the body of `POST …/evaluations`."""
+    body = dict(options) if reason is None else {**options, "reason": reason}
     headers = {"idempotency-key": key or str(uuid4())}
-    return Call(_evaluations(slug), lambda reply, _: reply, to_json(document), headers)
+    return ApiCall(_evaluations_path(slug), lambda body, _: body, to_json(body), headers)
 
 
-def evaluation(slug: str, number: int) -> Call[Document]:
-    """Ask how an evaluation is."""
-    return Call(f"{_evaluations(slug)}/{number:d}", lambda reply, _: reply)
+def evaluation(slug: str, number: int) -> ApiCall[JsonObject]:
+    """Describe one evaluation."""
+    return ApiCall(f"{_evaluations_path(slug)}/{number:d}", lambda body, _: body)
 
 
-def evaluations(slug: str, before: int | None, limit: int) -> Call[list[Document]]:
-    """Ask for a league's evaluations."""
+def evaluations(slug: str, before: int | None, limit: int) -> ApiCall[list[JsonObject]]:
+    """List the evaluations of a league."""
     older = "" if before is None else f"&before={before:d}"
-    return Call(f"{_evaluations(slug)}?limit={limit:d}{older}", lambda reply, _: reply["evaluations"])
+    return ApiCall(f"{_evaluations_path(slug)}?limit={limit:d}{older}", lambda body, _: body["evaluations"])
 
 
-def stop_evaluation(slug: str, number: int) -> Call[Document]:
-    """Ask for the end of an evaluation."""
-    return Call(f"{_evaluations(slug)}/{number:d}", lambda reply, _: reply, is_removal=True)
+def stop_evaluation(slug: str, number: int) -> ApiCall[JsonObject]:
+    """Stop an evaluation."""
+    return ApiCall(f"{_evaluations_path(slug)}/{number:d}", lambda body, _: body, is_delete=True)
 
 
-def has_ended(told: Document) -> bool:
-    """Whether an evaluation goes on no more."""
-    return told["state"] not in ("queued", "running")
+def has_ended(evaluation: JsonObject) -> bool:
+    """Return whether an evaluation is neither queued nor running."""
+    return evaluation["state"] not in ("queued", "running")
 
 
-def _evaluations(slug: str) -> str:
+def outdated_replicas(league: JsonObject, promotion: Promotion) -> list[str]:
+    """Describe each replica that does not serve a promoted version yet.
+
+    league: the league's description. Raises AliasMoved if the alias points to another version by now.
+    """
+    alias, version = promotion.alias, promotion.version
+    current = league["aliases"].get(alias)
+    if current != version:
+        raise AliasMoved(f"{league['league']}@{alias} has been moved to version {current} meanwhile")
+    if not league["replicas"]:
+        return ["no replica has reported the versions that it serves"]
+    outdated = [each for each in league["replicas"] if each["aliases"].get(alias) != version]
+    return [
+        f"{each['replica']} serves {each['aliases'].get(alias)} ({each['fault'] or 'no error'})" for each in outdated
+    ]
+
+
+def rollout_error(promotion: Promotion, seconds: float, outdated: list[str]) -> str:
+    """Return the error message for a promotion that did not reach every replica in time."""
+    ref = f"{promotion.league}@{promotion.alias}"
+    return f"{ref} is version {promotion.version}, but not every replica serves it after {seconds:g} s: " + "; ".join(
+        outdated
+    )
+
+
+def _evaluations_path(slug: str) -> str:
     return f"/v1/leagues/{check_slug('league', slug)}/evaluations"
 
 
-def late(told: Document, alias: str, version: int) -> list[str]:
-    """The replicas that do not serve a version as `alias` yet, each with why, as a league's document tells; a sentence
-    if there is no replica. Raises AliasMoved if the alias points elsewhere by now."""
-    now = told["aliases"].get(alias)
-    if now != version:
-        raise AliasMoved(f"{told['league']}@{alias} has moved on to version {now} meanwhile")
-    if not told["replicas"]:
-        return ["no replica has said that it serves anything"]
-    behind = [said for said in told["replicas"] if said["aliases"].get(alias) != version]
-    return [f"{said['replica']} serves {said['aliases'].get(alias)} ({said['fault'] or 'no fault'})" for said in behind]
-
-
-def not_everywhere(moved: Promotion, seconds: float, behind: list[str]) -> str:
-    """What is said when waiting for replicas was in vain."""
-    where = f"{moved.league}@{moved.alias} is version {moved.version}"
-    return f"{where}, but after {seconds:g} s not every replica serves it: {'; '.join(behind)}"
-
-
-def _change(path: str, document: Document, reason: str | None, key: str | None) -> Call[Promotion]:
+def _move_alias(path: str, body: JsonObject, reason: str | None, key: str | None) -> ApiCall[Promotion]:
     if reason is not None:
-        document["reason"] = reason
+        body["reason"] = reason
     headers = {"idempotency-key": key or str(uuid4())}
-    return Call(path, _moved, to_json(document), headers)
+    return ApiCall(path, _parse_promotion, to_json(body), headers)
 
 
-def _moved(reply: Document, _: str) -> Promotion:
-    """What a server of a later version says besides is left out."""
+def _parse_promotion(body: JsonObject, _: str) -> Promotion:
+    """Ignores unknown fields, which newer servers may send."""
     known = {each.name for each in fields(Promotion)}
-    return Promotion(**{name: value for name, value in reply.items() if name in known})
+    return Promotion(**{name: value for name, value in body.items() if name in known})

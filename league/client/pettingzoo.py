@@ -1,4 +1,4 @@
-"""A PettingZoo environment, AEC or Parallel, played through the endpoint: one episode, step by step.
+"""Plays one episode of a PettingZoo environment, AEC or Parallel, with policies of a server.
 
     from league.client import Client
     from league.client.pettingzoo import play
@@ -7,8 +7,8 @@
         for step in play(environment, client, {"player_0": "connect_four", "player_1": "connect_four@3"}, seed=7):
             print(step.agent, step.action, step.reward)
 
-The environment must be the league's own, with its wrappers: `league.environments.building` makes it. Nothing of
-PettingZoo is imported here.
+The environment must be the one of the league with its wrappers, as built by `league.environments.building`. This module
+does not import PettingZoo.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -16,10 +16,8 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
-from league.client.answers import Answer
-from league.client.client import Client
-from league.client.episode import GONE, retired
-from league.client.models import Model, parse_model
+from league.client import Client
+from league.client.responses import VERSION_GONE, ActionResponse, Model, episode_interrupted, parse_model
 from league.errors import InvalidInput
 from league.seeds import derive
 
@@ -29,10 +27,17 @@ Player = str | Callable[[Any], Any]
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One agent's step: what it saw, what it did, and what came of that by its next turn or its end.
+    """A step of one agent, from its action to its next turn or its end.
 
-    reward: all that it was given since it acted. next_observation: the last one too, of an agent that is truncated.
-    answer: of the server, with the version, the seed and the probabilities; None if a function has acted.
+    Attributes:
+        agent: Name of the agent.
+        observation: The observation before the action.
+        action: The action.
+        reward: Sum of the rewards since the action.
+        next_observation: The observation at the agent's next turn or end, also for a truncated agent.
+        terminated: Whether the agent has terminated.
+        truncated: Whether the agent was truncated.
+        response: The server's response; None if a function chose the action.
     """
 
     agent: str
@@ -42,7 +47,7 @@ class Step:
     next_observation: Any
     terminated: bool
     truncated: bool
-    answer: Answer | None
+    response: ActionResponse | None
 
 
 def play(
@@ -54,30 +59,41 @@ def play(
     explore: bool = False,
     probabilities: bool = False,
 ) -> Iterator[Step]:
-    """Play one episode. Each model stays at the version of its first answer, and each agent has its recurrent state.
+    """Play one episode. The version of each model is fixed by its first response.
 
-    players: agent → model or function, for every possible agent.
-    seed: of the reset and, if the policies explore, of their draws.
-    probabilities: of all actions, in each step's answer.
-    Raises InvalidInput, VersionRetired, or what `Client.act_batch` raises.
+    Args:
+        environment: A PettingZoo environment.
+        client: Client of the server.
+        players: Model or function for every possible agent. Each agent has its own recurrent state.
+        seed: Seed of the environment's reset and, with `explore`, of the actions.
+        explore: Sample actions instead of taking the most likely ones.
+        probabilities: Include the action probabilities in each step's response.
+
+    Yields:
+        The steps, in the order in which they end.
+
+    Raises:
+        InvalidInput: An agent has no player.
+        VersionRetired: The version of a model is not available any more.
+        LeagueError: See `Client`.
     """
-    table = _Table(client, players, list(environment.possible_agents), seed, explore, probabilities)
+    actors = _Actors(client, players, list(environment.possible_agents), seed, explore, probabilities)
     if hasattr(environment, "agent_iter"):
-        return _turns(environment, table, seed)
-    return _rounds(environment, table, seed)
+        return _play_aec(environment, actors, seed)
+    return _play_parallel(environment, actors, seed)
 
 
 @dataclass
-class _Group:
-    """The agents that one model plays."""
+class _ModelState:
+    """A model and the recurrent states of the agents that it controls."""
 
     model: Model
     states: dict[str, str | None] = field(default_factory=dict)
     steps: int = 0
 
 
-class _Table:
-    """Who plays whom. Agents that act at once by one model are answered in one call."""
+class _Actors:
+    """Chooses the actions of all agents. Agents that act simultaneously with one model share a request."""
 
     def __init__(
         self,
@@ -89,81 +105,83 @@ class _Table:
         probabilities: bool,
     ) -> None:
         if missing := [agent for agent in agents if agent not in players]:
-            raise InvalidInput(f"nobody plays {', '.join(missing)}: name a model for each of {', '.join(agents)}")
+            raise InvalidInput(f"no player for {', '.join(missing)}: specify one for each of {', '.join(agents)}")
         self._client = client
         self._players = players
-        self._numbers = {agent: number for number, agent in enumerate(agents)}
-        self._groups = {name: _Group(parse_model(name)) for name in players.values() if isinstance(name, str)}
+        self._indices = {agent: index for index, agent in enumerate(agents)}
+        self._models = {name: _ModelState(parse_model(name)) for name in players.values() if isinstance(name, str)}
         self._seed = seed
         self._explore = explore
         self._probabilities = probabilities
         self._time = 0
 
-    def act(self, observations: Mapping[str, Any]) -> dict[str, tuple[Any, Answer | None]]:
-        """agent → its action, and the answer that it stands in."""
-        acted: dict[str, tuple[Any, Answer | None]] = {}
-        asked: dict[str, dict[str, Any]] = {}
+    def act(self, observations: Mapping[str, Any]) -> dict[str, tuple[Any, ActionResponse | None]]:
+        """Return the action of each agent, with the server's response."""
+        chosen: dict[str, tuple[Any, ActionResponse | None]] = {}
+        requested: dict[str, dict[str, Any]] = {}
         for agent, observation in observations.items():
             player = self._players[agent]
             if isinstance(player, str):
-                asked.setdefault(player, {})[agent] = observation
+                requested.setdefault(player, {})[agent] = observation
             else:
-                acted[agent] = player(observation), None
-        for name, of_group in asked.items():
-            acted |= self._ask(self._groups[name], of_group)
+                chosen[agent] = player(observation), None
+        for name, of_model in requested.items():
+            chosen |= self._request(self._models[name], of_model)
         self._time += 1
-        return acted
+        return chosen
 
-    def _ask(self, group: _Group, observations: dict[str, Any]) -> dict[str, tuple[Any, Answer | None]]:
+    def _request(
+        self, controlled: _ModelState, observations: dict[str, Any]
+    ) -> dict[str, tuple[Any, ActionResponse | None]]:
         agents = list(observations)
-        states = [group.states.get(agent) for agent in agents]
-        seeds = None if self._seed is None else [derive(self._seed, self._numbers[a], self._time) for a in agents]
+        states = [controlled.states.get(agent) for agent in agents]
+        seeds = None if self._seed is None else [derive(self._seed, self._indices[a], self._time) for a in agents]
         try:
             batch = self._client.act_batch(
-                str(group.model),
+                str(controlled.model),
                 list(observations.values()),
                 explore=self._explore,
                 seed=seeds,
                 probabilities=self._probabilities,
                 state=states if any(states) else None,
             )
-        except GONE as error:
-            if not group.steps:
+        except VERSION_GONE as error:
+            if not controlled.steps:
                 raise
-            raise retired(group.model, group.steps, error) from error
-        group.model, group.steps = group.model.at(batch.version), group.steps + 1
-        answers = [batch.answer(row) for row in range(len(agents))]
-        group.states |= {agent: answer.state for agent, answer in zip(agents, answers, strict=True)}
-        return {agent: (answer.action, answer) for agent, answer in zip(agents, answers, strict=True)}
+            raise episode_interrupted(controlled.model, controlled.steps, error) from error
+        controlled.model, controlled.steps = controlled.model.at(batch.version), controlled.steps + 1
+        responses = [batch.response(row) for row in range(len(agents))]
+        controlled.states |= {agent: response.state for agent, response in zip(agents, responses, strict=True)}
+        return {agent: (response.action, response) for agent, response in zip(agents, responses, strict=True)}
 
 
-def _turns(environment: Any, table: _Table, seed: int | None) -> Iterator[Step]:
-    """An AEC environment: an agent's step ends at its own next turn."""
+def _play_aec(environment: Any, actors: _Actors, seed: int | None) -> Iterator[Step]:
+    """An agent's step ends at its next turn."""
     environment.reset(seed=seed)
-    begun: dict[str, tuple[Any, Any, Answer | None]] = {}
+    pending: dict[str, tuple[Any, Any, ActionResponse | None]] = {}
     for agent in environment.agent_iter():
         observation, reward, terminated, truncated, _ = environment.last()
-        observation = deepcopy(observation)  # some environments write the next one into the same array
-        if agent in begun:
-            before, action, answer = begun.pop(agent)
-            yield Step(agent, before, action, float(reward), observation, terminated, truncated, answer)
+        observation = deepcopy(observation)  # some environments reuse the array
+        if agent in pending:
+            before, action, response = pending.pop(agent)
+            yield Step(agent, before, action, float(reward), observation, terminated, truncated, response)
         action = None
         if not (terminated or truncated):
-            action, answer = table.act({agent: observation})[agent]
-            begun[agent] = observation, action, answer
+            action, response = actors.act({agent: observation})[agent]
+            pending[agent] = observation, action, response
         environment.step(action)
 
 
-def _rounds(environment: Any, table: _Table, seed: int | None) -> Iterator[Step]:
-    """A Parallel environment: all agents act at once."""
+def _play_parallel(environment: Any, actors: _Actors, seed: int | None) -> Iterator[Step]:
+    """All agents act simultaneously."""
     observations, _ = environment.reset(seed=seed)
     while environment.agents:
         before = deepcopy({agent: observations[agent] for agent in environment.agents})
-        acted = table.act(before)
+        chosen = actors.act(before)
         observations, rewards, terminations, truncations, _ = environment.step(
-            {agent: action for agent, (action, _) in acted.items()}
+            {agent: action for agent, (action, _) in chosen.items()}
         )
-        for agent, (action, answer) in acted.items():
+        for agent, (action, response) in chosen.items():
             yield Step(
                 agent,
                 before[agent],
@@ -172,5 +190,5 @@ def _rounds(environment: Any, table: _Table, seed: int | None) -> Iterator[Step]
                 deepcopy(observations[agent]),
                 bool(terminations[agent]),
                 bool(truncations[agent]),
-                answer,
+                response,
             )

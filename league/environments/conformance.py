@@ -1,45 +1,71 @@
-"""Does an environment keep to the contract that training and matches rely on? `league check-env` asks it here.
+"""Checks environments (`league check-env`): spaces, seeding, masks, rewards, global state and PettingZoo's API tests.
 
-Random legal actions are played, and what comes back is held against the spaces, against itself (the same seed must
-bring the same episode) and against PettingZoo's own tests. A *fault* makes results wrong or runs fail; a *note* is
-worth knowing.
+Episodes are played with random legal actions. A *fault* leads to wrong results or failing runs; a *note* is a warning.
 """
 
 import contextlib
+import copy
 import io
 import math
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.test import api_test, parallel_api_test
 
 from league.config import LeagueConfig
+from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import action_space, build, describe, observation_space
-from league.environments.copies import Copy, Observation, Report, copy_of
-from league.environments.random_actions import RandomActions
-from league.errors import IllegalMask, LeagueError
+from league.errors import IllegalMask, LeagueError, one_line
 from league.interface import Interface
-from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space, check_mask, from_gymnasium, inputs, tensors
+from league.seeds import derive
+from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space, inputs
+from league.spaces.arrays import check_mask, tensors
+from league.spaces.conversion import from_gymnasium
+
+
+class RandomActions:
+    """Samples random legal actions that depend only on the episode's seed and the agent's turns."""
+
+    def __init__(self, spaces: Sequence[gymnasium.Space[Any]]) -> None:
+        self._spaces = [copy.deepcopy(space) for space in spaces]
+
+    def seed(self, seed: int) -> None:
+        """Start an episode."""
+        for agent, space in enumerate(self._spaces):
+            space.seed(derive(seed, agent) % 2**31)
+
+    def draw(self, agent: int, mask: NDArray | None) -> Any:
+        """Sample a legal action of an agent: an int, or an array in the dtype of its space."""
+        space = self._spaces[agent]
+        match space:
+            case gymnasium.spaces.Discrete():
+                return int(space.sample(mask=None if mask is None else (mask != 0).astype(np.int8)))
+            case gymnasium.spaces.MultiDiscrete() if mask is not None:
+                parts = np.split((mask != 0).astype(np.int8), np.cumsum(space.nvec)[:-1])
+                return space.sample(mask=tuple(parts))
+        return space.sample()
+
 
 ENOUGH_TURNS = 20
-"""Of an agent, for saying that it always sees the same."""
+"""Minimum turns of an agent for the check that its observations change."""
 CYCLES = 50
-"""Of PettingZoo's own tests."""
+"""Number of cycles of PettingZoo's API tests."""
 
 Severity = Literal["fault", "note"]
 Trace = list[tuple[int, bytes, float, bool, bool]]
-"""Everything that an episode has reported, in order."""
+"""All reports of an episode, in order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is amiss, as a sentence that says what was expected, and the agents that it concerns."""
+    """A problem, with the expected behaviour and the affected agents."""
 
     severity: Severity
     text: str
@@ -54,7 +80,7 @@ class Finding:
 
 @dataclass(slots=True)
 class Examination:
-    """What was found, each thing once; how long the episodes were, and how fast."""
+    """Distinct findings, the lengths of the episodes and the speed."""
 
     findings: list[Finding] = field(default_factory=list)
     api: str = ""
@@ -62,14 +88,15 @@ class Examination:
     lengths: list[int] = field(default_factory=list)
     steps_per_second: float = 0.0
     state_size: int | None = None
-    """Numbers of the global state; None where there is none."""
+    """Size of the global state; None without one."""
 
     @property
     def passed(self) -> bool:
-        """Whether nothing worse than a note was found."""
+        """Whether no fault was found."""
         return all(finding.severity == "note" for finding in self.findings)
 
     def add(self, severity: Severity, text: str, agent: str | None = None) -> None:
+        """Add a finding, or an agent to an equal finding."""
         known = next((each for each in self.findings if (each.severity, each.text) == (severity, text)), None)
         if known is None:
             known = Finding(severity, text)
@@ -79,7 +106,7 @@ class Examination:
 
 
 def examine(config: LeagueConfig, episodes: int = 3, steps: int = 2000, seed: int = 0) -> Examination:
-    """Play `episodes` episodes of at most `steps` steps each, twice. Never raises for what the environment does."""
+    """Play episodes of at most `steps` steps, each twice. Never raises exceptions of the environment."""
     found = Examination()
     try:
         env = build(config.environment)
@@ -88,23 +115,27 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int = 2000, seed: in
         found.add("fault", str(error))
         return found
     except Exception as error:
-        found.add("fault", f"{config.environment.entry_point} cannot be made: {_told(error)}")
+        found.add("fault", f"{config.environment.entry_point} cannot be created: {one_line(error, with_type=True)}")
         return found
     found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
     found.agents = len(interface.agents)
     for agent, spaces in interface.agents.items():
-        if not _can_be_acted_in(spaces.action):
-            found.add("fault", "acts in a space that no policy has: expected Discrete, MultiDiscrete or Box", agent)
+        if not _is_supported(spaces.action):
+            found.add(
+                "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
+            )
     try:
         _play(env, interface, config, found, episodes, steps, seed)
     except LeagueError as error:
         found.add("fault", str(error))
     except Exception as error:
-        found.add("fault", f"the environment raised while it was played with legal actions: {_told(error)}")
+        found.add(
+            "fault", f"the environment raised an exception after legal actions: {one_line(error, with_type=True)}"
+        )
     finally:
         env.close()
     if found.passed:
-        _pettingzoos_own(build(config.environment), found)
+        _run_pettingzoo_tests(build(config.environment), found)
     return found
 
 
@@ -112,35 +143,37 @@ def _play(
     env: Any, interface: Interface, config: LeagueConfig, found: Examination, episodes: int, steps: int, seed: int
 ) -> None:
     checks = [_Check(agent, env, found) for agent in env.possible_agents]
-    copy = copy_of(env, checks)
+    adapter = adapter_for(env, checks)
     actions = RandomActions([action_space(env, agent) for agent in env.possible_agents])
     began = time.perf_counter()
-    first = [_episode(copy, interface, actions, found, seed + i, steps) for i in range(episodes)]
+    first = [_episode(adapter, interface, actions, found, seed + i, steps) for i in range(episodes)]
     found.lengths = [len(trace) for trace in first]
     found.steps_per_second = sum(found.lengths) / (time.perf_counter() - began)
-    # Once the clock has stopped: a global state may be a large picture.
+    # After the timing, because a global state may be a large image.
     again = [
-        _episode(copy, interface, actions, found, seed + i, steps, states=True) for i in reversed(range(episodes))
+        _episode(adapter, interface, actions, found, seed + i, steps, states=True) for i in reversed(range(episodes))
     ][::-1]
-    fresh = copy_of(build(config.environment), checks)
+    fresh = adapter_for(build(config.environment), checks)
     anew = _episode(fresh, interface, actions, found, seed, steps)
     fresh.close()
     if first != again:
-        found.add("fault", "the same seed brings another episode after others were played: reset must clear everything")
+        found.add("fault", "the same seed gives another episode after other episodes: reset must clear all state")
     elif first[0] != anew:
-        found.add("fault", "the same seed brings another episode in another copy: all randomness must follow the seed")
-    _check_blindness(first, env, found)
+        found.add(
+            "fault", "the same seed gives another episode in a new environment: all randomness must depend on the seed"
+        )
+    _check_constant_observations(first, env, found)
     starts = {trace[0][1] for trace in first if trace}
     if episodes > 1 and len(starts) == 1 and not config.play.opening_plies:
         found.add(
             "note",
-            "every seed brings the same first observation: if nothing later is random either, greedy policies repeat"
-            " one game for ever, unless play.opening_plies makes openings",
+            "every seed gives the same first observation: unless later events are random, greedy policies repeat one"
+            " game; set play.opening_plies for random openings",
         )
 
 
 def _episode(
-    copy: Copy,
+    adapter: EnvAdapter,
     interface: Interface,
     actions: RandomActions,
     found: Examination,
@@ -148,14 +181,13 @@ def _episode(
     steps: int,
     states: bool = False,
 ) -> Trace:
-    """One episode of random legal actions, which follow from the seed and the agents' turns. states: look at the global
-    state at each step."""
+    """Play an episode with random legal actions. states: check the global state at each step."""
     agents, trace = list(interface.agents), []
-    reports = copy.reset(seed)
+    reports = adapter.reset(seed)
     actions.seed(seed)
     for _ in range(steps):
         if states:
-            _check_state(copy, found)
+            _check_state(adapter, found)
         moves = []
         for agent, observation, reward, terminated, truncated in reports:
             trace.append((agent, _bytes(observation), reward, terminated, truncated))
@@ -164,19 +196,21 @@ def _episode(
                 moves.append((agent, actions.draw(agent, observation.get(ACTION_MASK))))
         if not moves:
             return trace
-        reports = copy.step(moves)
-    found.add("note", f"an episode has not ended after {steps} steps")
+        reports = adapter.step(moves)
+    found.add("note", f"an episode did not end within {steps} steps")
     return trace
 
 
-def _can_be_acted_in(space: Space) -> bool:
+def _is_supported(space: Space) -> bool:
     """Discrete, MultiDiscrete, or a Box of floats."""
     return isinstance(space, Discrete | MultiDiscrete) or (isinstance(space, Box) and np.dtype(space.dtype).kind == "f")
 
 
-def _check_blindness(traces: list[Trace], env: Any, found: Examination) -> None:
-    """Who sees the same in the second half of each episode, when stacks of frames are full: no picture stays the same,
-    but a game of one state may."""
+def _check_constant_observations(traces: list[Trace], env: Any, found: Examination) -> None:
+    """Find agents whose observation never changes in the second half of an episode, when frame stacks are full.
+
+    A constant image is a fault; a constant vector is a note, because a game may have a single state.
+    """
     for index, agent in enumerate(env.possible_agents):
         seen = [[observation for reporting, observation, *_ in trace if reporting == index] for trace in traces]
         turns = max(map(len, seen))
@@ -185,14 +219,12 @@ def _check_blindness(traces: list[Trace], env: Any, found: Examination) -> None:
         space = observation_space(env, agent)
         if isinstance(space, gymnasium.spaces.Box) and len(space.shape) > 1:
             text = (
-                f"observes the same picture all the time, for {turns} turns: expected one that changes; some"
-                " environments draw only with `kwargs: {render_mode: rgb_array}`"
+                f"observes a constant image for {turns} turns; some environments draw only with"
+                " `kwargs: {render_mode: rgb_array}`"
             )
             found.add("fault", text, agent)
         else:
-            found.add(
-                "note", f"observes the same all through an episode: it cannot tell its {turns} turns apart", agent
-            )
+            found.add("note", f"observes a constant value in an episode of {turns} turns", agent)
 
 
 def _check_report(agent: str, report: Report, found: Examination) -> None:
@@ -200,7 +232,7 @@ def _check_report(agent: str, report: Report, found: Examination) -> None:
     if not math.isfinite(reward):
         found.add("fault", f"got a reward of {reward}, expected a finite number", agent)
     if terminated and truncated:
-        found.add("note", "was terminated and truncated at once: it counts as terminated", agent)
+        found.add("note", "was both terminated and truncated: treated as terminated", agent)
     if ACTION_MASK in observation and not (terminated or truncated):
         try:
             check_mask(observation[ACTION_MASK][np.newaxis])
@@ -211,18 +243,19 @@ def _check_report(agent: str, report: Report, found: Examination) -> None:
             found.add("fault", f"observes NaN or infinity in {name}", agent)
 
 
-def _check_state(copy: Copy, found: Examination) -> None:
-    """Centralised learners read the global state as one row of numbers, always of one size."""
+def _check_state(adapter: EnvAdapter, found: Examination) -> None:
+    """Centralised learners need a global state of a fixed size."""
     try:
-        told = copy.state()
-        state = None if told is None else np.asarray(told, dtype=np.float32)
+        raw_state = adapter.state()
+        state = None if raw_state is None else np.asarray(raw_state, dtype=np.float32)
     except Exception as error:
-        found.add("note", f"its global state cannot be read, which only centralised learners need: {_told(error)}")
+        reason = one_line(error, with_type=True)
+        found.add("note", f"its global state, which only centralised learners need, cannot be read: {reason}")
         return
     if state is None:
         return
     if found.state_size not in (None, state.size):
-        expected = f"{found.state_size}: expected always as many"
+        expected = f"{found.state_size}: expected a fixed size"
         found.add("fault", f"its global state has {state.size} numbers, after {expected}")
     if not np.isfinite(state).all():
         found.add("fault", "its global state has NaN or infinity")
@@ -230,7 +263,7 @@ def _check_state(copy: Copy, found: Examination) -> None:
 
 
 class _Check:
-    """Splits an agent's observations, and holds them against its space."""
+    """Splits an agent's observations into arrays, and checks them against its space."""
 
     def __init__(self, agent: str, env: Any, found: Examination) -> None:
         self._agent, self._found = agent, found
@@ -242,17 +275,21 @@ class _Check:
 
     def __call__(self, value: Any) -> Observation:
         if self._kept is not None and _changed(*self._kept):
-            self._found.add("note", "its observations are written over later: they are copied here", self._agent)
+            self._found.add(
+                "note", "its observations are modified after they are returned: they are copied", self._agent
+            )
         arrays = tensors(self._space, value)
         for name, leaf in self._leaves.items():
             if arrays[name].shape != leaf.shape:
                 shape, expected = list(arrays[name].shape), list(leaf.shape)
-                self._found.add("fault", f"observes {name} of shape {shape}, its space says {expected}", self._agent)
+                self._found.add(
+                    "fault", f"observes {name} with shape {shape}, but its space has {expected}", self._agent
+                )
         if not self._gymnasium.contains(value):
             self._found.add(
                 "note",
-                f"observes what its space {str(self._gymnasium)[:80]} does not contain: other bounds or another dtype;"
-                " values are taken as they are, in the space's dtype",
+                f"observations are not in its space {str(self._gymnasium)[:80]}: the bounds or the dtype differ;"
+                " values are cast to the dtype of the space",
                 self._agent,
             )
         copies = {name: np.array(array) for name, array in arrays.items()}
@@ -268,8 +305,8 @@ def _bytes(observation: Observation) -> bytes:
     return b"".join(np.ascontiguousarray(array).tobytes() for array in observation.values())
 
 
-def _pettingzoos_own(env: Any, found: Examination) -> None:
-    """PettingZoo's tests of its API. They guard more than is relied on here, so that a failure is a note."""
+def _run_pettingzoo_tests(env: Any, found: Examination) -> None:
+    """Run PettingZoo's API tests. They check more than is required here, so failures are notes."""
     try:
         with _silence():
             if isinstance(env, AECEnv):
@@ -277,7 +314,7 @@ def _pettingzoos_own(env: Any, found: Examination) -> None:
             elif isinstance(env, ParallelEnv):
                 parallel_api_test(env, num_cycles=CYCLES)
     except Exception as error:
-        found.add("note", f"PettingZoo's own API test fails: {_told(error)}")
+        found.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")
     finally:
         env.close()
 
@@ -287,7 +324,3 @@ def _silence() -> Iterator[None]:
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         yield
-
-
-def _told(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"

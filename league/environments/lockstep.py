@@ -1,4 +1,4 @@
-"""n copies of an environment in lockstep, whatever its API: PettingZoo's AEC or Parallel, or RLlib's MultiAgentEnv."""
+"""Steps n environments of any API in lockstep and batches their observations."""
 
 import contextlib
 import logging
@@ -11,13 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from league.config import EnvironmentConfig
+from league.environment_config import EnvironmentConfig
+from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import action_space, build, observation_space
-from league.environments.copies import Copy, Observation, Report, copy_of
-from league.environments.legality import check_actions
-from league.environments.stepping import Batch, BatchedEnvironment, Ending, Group, NextEpisode, Turn
-from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError
-from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, from_gymnasium, inputs, tensors
+from league.environments.stepping import Batch, BatchedEnvironment, Ending, Group, NextEpisode, Turn, check_actions
+from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError, one_line
+from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, inputs
+from league.spaces.arrays import tensors
+from league.spaces.conversion import from_gymnasium
 
 logger = logging.getLogger(__name__)
 
@@ -28,50 +29,52 @@ Rows = dict[Group, tuple[list[int], list[int], list[Observation], list[float]]]
 
 def stepping(
     config: EnvironmentConfig,
-    copies: int,
+    num_envs: int,
     *,
     crashes: int = 0,
     render_mode: str | None = None,
     states: bool = False,
 ) -> BatchedEnvironment:
-    """`copies` environments in lockstep.
+    """Create environments that are stepped in lockstep.
 
-    crashes: how often in a row a copy may raise and is built anew; beyond, its exception goes to the caller.
-    states: give the environment's global states along.
-    render_mode: PettingZoo's, for copies that shall be rendered (`rgb_array`, `human`).
+    Args:
+        config: The environment.
+        num_envs: Number of environments.
+        crashes: Number of consecutive exceptions after which an environment is recreated; the next one is raised.
+        render_mode: PettingZoo's render mode (`rgb_array`, `human`).
+        states: Include global states in the results.
     """
-    return Lockstep(lambda: build(config, render_mode), copies, crashes, states)
+    return Lockstep(lambda: build(config, render_mode), num_envs, crashes, states)
 
 
 class Lockstep:
-    """A loop over copies.
+    """Implements BatchedEnvironment by a loop over environments.
 
-    The episodes of a copy are told apart by their seeds alone: nothing of one reaches the next but the environment
-    object itself, which PettingZoo's contract requires `reset` to clear.
+    Episodes of an environment differ only by their seeds. PettingZoo requires `reset` to clear all other state.
     """
 
-    def __init__(self, make: Callable[[], Any], copies: int, crashes: int = 0, states: bool = False) -> None:
+    def __init__(self, make: Callable[[], Any], num_envs: int, crashes: int = 0, states: bool = False) -> None:
         self._make, self._most_crashes, self._gives_states = make, crashes, states
-        envs = [make() for _ in range(copies)]
+        envs = [make() for _ in range(num_envs)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
         spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.agents]
         self._splits = [_splitter(space) for space in spaces]
         self._inputs = [inputs(space) for space in spaces]
         self._actions = [from_gymnasium(action_space(envs[0], agent)) for agent in self.agents]
-        self._copies: list[Copy] = [copy_of(env, self._splits) for env in envs]
-        self._seeds = [0] * copies
-        self._crashes = [0] * copies
-        self._groups: list[Sequence[Group]] = [()] * copies
+        self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
+        self._seeds = [0] * num_envs
+        self._crashes = [0] * num_envs
+        self._groups: list[Sequence[Group]] = [()] * num_envs
         self._pending: dict[Group, Batch] = {}
         self._abandoned: set[int] = set()
-        self._seconds = [0.0] * copies
+        self._seconds = [0.0] * num_envs
         self._busy: int | None = None
         self._since = 0.0
         self._next_episode: NextEpisode = lambda _: None
 
     @property
-    def copies(self) -> int:
-        return len(self._copies)
+    def num_envs(self) -> int:
+        return len(self._envs)
 
     def start(self, next_episode: NextEpisode) -> Turn:
         self._next_episode = next_episode
@@ -79,142 +82,139 @@ class Lockstep:
         self._busy = None
         turn = Turn()
         rows: Rows = {}
-        for copy in range(self.copies):
-            self._restart(copy, turn, rows)
+        for env in range(self.num_envs):
+            self._restart(env, turn, rows)
         return self._yield(turn, rows)
 
     def step(self, actions: Mapping[Group, NDArray]) -> Turn:
         moves: dict[int, list[tuple[int, Any]]] = {}
         for group, batch in self._pending.items():
             check_actions(batch, actions[group], self._actions[batch.agents[0]], self.agents)
-            for copy, agent, action in zip(batch.copies, batch.agents, _plain(actions[group]), strict=True):
-                moves.setdefault(copy, []).append((agent, action))
+            for env, agent, action in zip(batch.envs, batch.agents, _plain(actions[group]), strict=True):
+                moves.setdefault(env, []).append((agent, action))
         turn = Turn()
         rows: Rows = {}
         abandoned, self._abandoned = self._abandoned, set()
-        for copy in sorted(moves.keys() | abandoned):
-            if copy in abandoned:
-                self._restart(copy, turn, rows)
+        for env in sorted(moves.keys() | abandoned):
+            if env in abandoned:
+                self._restart(env, turn, rows)
                 continue
-            # An agent's policy decides which batch it is in, but not when it acts.
-            acting = sorted(moves[copy], key=itemgetter(0))
+            # The order of actions must not depend on the grouping of agents.
+            acting = sorted(moves[env], key=itemgetter(0))
             try:
-                reports = self._timed(copy, self._copies[copy].step, acting)
+                reports = self._timed(env, self._envs[env].step, acting)
             except LeagueError:
                 raise
             except Exception as error:
-                self._crash(copy, error)
-                turn.crashed.append(copy)
-                self._restart(copy, turn, rows)
+                self._crash(env, error)
+                turn.crashed.append(env)
+                self._restart(env, turn, rows)
             else:
-                self._take(copy, reports, turn, rows)
+                self._sort_reports(env, reports, turn, rows)
         return self._yield(turn, rows)
 
-    def abandon(self, copies: Collection[int]) -> None:
-        self._abandoned.update(copies)
-        kept = {group: batch.rows(batch.without(copies)) for group, batch in self._pending.items()}
-        self._pending = {group: batch for group, batch in kept.items() if batch.copies}
+    def abandon(self, envs: Collection[int]) -> None:
+        self._abandoned.update(envs)
+        kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
+        self._pending = {group: batch for group, batch in kept.items() if batch.envs}
 
-    def assign(self, copy: int, groups: Sequence[Group]) -> None:
-        self._groups[copy] = groups
+    def assign(self, env: int, groups: Sequence[Group]) -> None:
+        self._groups[env] = groups
 
     @property
     def busy(self) -> int | None:
         return self._busy
 
-    def seconds(self, copy: int) -> float:
-        return self._seconds[copy] + (perf_counter() - self._since if self._busy == copy else 0.0)
+    def seconds(self, env: int) -> float:
+        return self._seconds[env] + (perf_counter() - self._since if self._busy == env else 0.0)
 
-    def render(self, copy: int) -> NDArray:
-        picture = self._copies[copy].render()
+    def render(self, env: int) -> NDArray:
+        picture = self._envs[env].render()
         if picture is None:
-            raise EnvironmentMismatch("the environment gives no picture: it has no render_mode 'rgb_array'")
+            raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
         return np.asarray(picture, dtype=np.uint8)
 
     def close(self) -> None:
-        for copy in self._copies:
-            copy.close()
+        for env in self._envs:
+            env.close()
 
-    def _timed(self, copy: int, call: Callable[[Given], list[Report]], given: Given) -> list[Report]:
+    def _timed(self, env: int, call: Callable[[Given], list[Report]], given: Given) -> list[Report]:
         self._since = perf_counter()
-        self._busy = copy
+        self._busy = env
         reports = call(given)
         self._busy = None
-        self._seconds[copy] += perf_counter() - self._since
+        self._seconds[env] += perf_counter() - self._since
         return reports
 
-    def _restart(self, copy: int, turn: Turn, rows: Rows) -> None:
-        episode = self._next_episode(copy)
+    def _restart(self, env: int, turn: Turn, rows: Rows) -> None:
+        episode = self._next_episode(env)
         if episode is None:
             return
-        self._groups[copy] = episode.groups
-        self._seconds[copy] = 0.0
-        # Some environments hand the seed to a signed integer of 32 bits.
-        self._seeds[copy] = episode.seed % 2**31
+        self._groups[env] = episode.groups
+        self._seconds[env] = 0.0
+        # Some environments store the seed as a signed 32-bit integer.
+        self._seeds[env] = episode.seed % 2**31
         while True:
             try:
-                reports = self._timed(copy, self._copies[copy].reset, self._seeds[copy])
+                reports = self._timed(env, self._envs[env].reset, self._seeds[env])
                 break
             except LeagueError:
                 raise
             except Exception as error:
-                self._crash(copy, error)
+                self._crash(env, error)
         if not any(_must_act(report) for report in reports):
-            raise EnvironmentMismatch(
-                f"nobody acts in the episode of seed {self._seeds[copy]}: it is over at its reset"
-            )
-        self._take(copy, reports, turn, rows)
+            raise EnvironmentMismatch(f"the episode with seed {self._seeds[env]} ends at its reset, without an action")
+        self._sort_reports(env, reports, turn, rows)
 
-    def _take(self, copy: int, reports: Sequence[Report], turn: Turn, rows: Rows) -> None:
-        """Sort an agent's report into who must act and who has left; restart an episode that is over."""
+    def _sort_reports(self, env: int, reports: Sequence[Report], turn: Turn, rows: Rows) -> None:
+        """Sort reports into batches and endings, and start the next episode if this one is over."""
         is_over = True
         for agent, observation, reward, terminated, truncated in reports:
             if not math.isfinite(reward):
                 raise InvalidReward(
-                    f"agent {self.agents[agent]} got a reward of {reward} in the episode of seed {self._seeds[copy]},"
+                    f"agent {self.agents[agent]} got a reward of {reward} in the episode with seed {self._seeds[env]},"
                     " expected a finite number"
                 )
             if terminated or truncated:
-                turn.endings.append(Ending(copy, agent, observation, reward, terminated, truncated))
+                turn.endings.append(Ending(env, agent, observation, reward, terminated, truncated))
                 continue
             is_over = False
-            group = self._groups[copy][agent]
+            group = self._groups[env][agent]
             if group not in rows:
                 rows[group] = ([], [], [], [])
-            copies, agents, observations, rewards = rows[group]
-            copies.append(copy)
+            envs, agents, observations, rewards = rows[group]
+            envs.append(env)
             agents.append(agent)
             observations.append(observation)
             rewards.append(reward)
-        if self._gives_states and (state := self._copies[copy].state()) is not None:
+        if self._gives_states and (state := self._envs[env].state()) is not None:
             known = turn.last_states if is_over else turn.states
-            known[copy] = np.array(state, dtype=np.float32).ravel()
+            known[env] = np.array(state, dtype=np.float32).ravel()
         if is_over:
-            turn.finished.append(copy)
-            self._crashes[copy] = 0
-            self._restart(copy, turn, rows)
+            turn.finished.append(env)
+            self._crashes[env] = 0
+            self._restart(env, turn, rows)
 
-    def _crash(self, copy: int, error: Exception) -> None:
-        """Build a copy anew, unless it has crashed too often."""
-        self._crashes[copy] += 1
-        if self._crashes[copy] > self._most_crashes:
+    def _crash(self, env: int, error: Exception) -> None:
+        """Recreate an environment, or raise the error after too many crashes."""
+        self._crashes[env] += 1
+        if self._crashes[env] > self._most_crashes:
             raise error
         logger.warning(
-            "The environment raised in the episode of seed %d and is built anew (%d of %d times in a row): %s: %s",
-            self._seeds[copy],
-            self._crashes[copy],
+            "The environment raised in the episode with seed %d and is recreated (%d of %d consecutive times): %s",
+            self._seeds[env],
+            self._crashes[env],
             self._most_crashes,
-            type(error).__name__,
-            error,
+            one_line(error, with_type=True),
         )
         self._busy = None
         with contextlib.suppress(Exception):
-            self._copies[copy].close()
-        self._copies[copy] = copy_of(self._make(), self._splits)
+            self._envs[env].close()
+        self._envs[env] = adapter_for(self._make(), self._splits)
 
     def _yield(self, turn: Turn, rows: Rows) -> Turn:
-        for group, (copies, agents, observations, rewards) in rows.items():
-            turn.batches[group] = Batch(copies, agents, self._stacked(agents, observations), rewards)
+        for group, (envs, agents, observations, rewards) in rows.items():
+            turn.batches[group] = Batch(envs, agents, self._stacked(agents, observations), rewards)
         self._pending = turn.batches
         return turn
 
@@ -235,7 +235,7 @@ class Lockstep:
         shapes = [np.shape(row[name]) for row in observations]
         row = next((i for i, shape in enumerate(shapes) if shape != leaf.shape), 0)
         return ObservationError(
-            f"agent {self.agents[agents[row]]} observes {name} of shape {list(shapes[row])}, its space says"
+            f"agent {self.agents[agents[row]]} observes {name} with shape {list(shapes[row])}, but its space has"
             f" {list(leaf.shape)}"
         )
 
@@ -245,7 +245,7 @@ def _must_act(report: Report) -> bool:
 
 
 def _splitter(space: Space) -> Callable[[Any], Observation]:
-    """Observation → its named arrays; the common forms without the cost of the general one."""
+    """Return a function from observation to named arrays, optimised for common spaces."""
     if not isinstance(space, DictSpace):
         return lambda value: {OBSERVATION: value}
     if set(space.spaces) == {OBSERVATION, ACTION_MASK}:
@@ -256,5 +256,5 @@ def _splitter(space: Space) -> Callable[[Any], Observation]:
 
 
 def _plain(actions: NDArray) -> list[Any]:
-    """Discrete actions as Python integers, which environments index lists with; arrays as they are."""
+    """Discrete actions as Python integers, which environments use as list indices; other actions as arrays."""
     return actions.tolist() if actions.ndim == 1 else list(actions)

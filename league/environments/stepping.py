@@ -1,53 +1,60 @@
-"""The batched stepping protocol: n copies of an environment are reset and stepped by one call.
+"""Interface of batched environments, which step many environments per call, and validation of actions.
 
-A call yields, per group, one batch of the observations of all agents that must act, in all copies. What a group is,
-is the caller's: a policy id in training, a contestant's policy in a match. In a turn-based game an agent's rows are its
-own turns: the reward of a row is summed over all moves since the agent's previous row.
+A step returns one batch per group with the observations of all agents that must act, across all environments. Callers
+define the groups: policy ids in training, policies of contestants in matches. In a turn-based game the rows of an agent
+are its own turns, and rewards are summed since the agent's previous row.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
+from league.errors import IllegalAction
+from league.spaces import ACTION_MASK, Box, Discrete, MultiBinary, MultiDiscrete, Space
+
 Group = Any
-"""Anything hashable."""
+"""Any hashable value."""
 
 
 @dataclass(frozen=True, slots=True)
-class Episode:
-    """What a copy plays next: the seed of its reset, and the group of each agent in the order of `agents`."""
+class EpisodeStart:
+    """An episode to play: the seed of the reset, and the group of each agent in the order of `agents`."""
 
     seed: int
     groups: Sequence[Group]
 
 
-NextEpisode = Callable[[int], Episode | None]
-"""copy → its next episode, or None: the copy stays idle."""
+NextEpisode = Callable[[int], EpisodeStart | None]
+"""Index of an environment → its next episode; None leaves the environment idle."""
 
 
 @dataclass(slots=True)
 class Batch:
-    """The k agents of one group that must act now. Row i is agent agents[i] (an index) of copy copies[i].
+    """The k agents of a group that must act.
 
-    observations: ONNX input name → (k, …) in the environment's dtype.
-    rewards: summed since the agent's previous row; 0.0 at its first.
+    Attributes:
+        envs: Index of the environment of each row.
+        agents: Index of the agent of each row.
+        observations: ONNX input name → array (k, …) in the environment's dtype.
+        rewards: Sum of the rewards since the agent's previous row; 0.0 in its first.
     """
 
-    copies: list[int]
+    envs: list[int]
     agents: list[int]
     observations: dict[str, NDArray]
     rewards: list[float]
 
-    def without(self, copies: Collection[int]) -> list[int]:
-        """The rows that are not of these copies."""
-        return [row for row, copy in enumerate(self.copies) if copy not in copies]
+    def without(self, envs: Collection[int]) -> list[int]:
+        """Return the rows of all other environments."""
+        return [row for row, env in enumerate(self.envs) if env not in envs]
 
     def rows(self, rows: Sequence[int]) -> "Batch":
-        """A batch of these rows."""
+        """Return a batch of some rows."""
         return Batch(
-            [self.copies[row] for row in rows],
+            [self.envs[row] for row in rows],
             [self.agents[row] for row in rows],
             {name: array[rows] for name, array in self.observations.items()},
             [self.rewards[row] for row in rows],
@@ -56,13 +63,12 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """The last report of an agent that has left its episode. Exactly one of the two flags may be the reason;
-    an environment that sets both at once is reported as it is.
+    """The last report of an agent in an episode. Environments may set one or both flags.
 
-    observation: ONNX input name → array without a batch axis: the state after the last move.
+    observation: ONNX input name → array without a batch axis, after the last action.
     """
 
-    copy: int
+    env: int
     agent: int
     observation: dict[str, NDArray]
     reward: float
@@ -72,69 +78,127 @@ class Ending:
 
 @dataclass(slots=True)
 class Turn:
-    """What a call brought: agents that left, copies whose episode is over, and who must act next.
+    """Result of a step: agents that left, environments whose episodes ended, and the agents that must act next.
 
-    Endings belong to the episodes before; batches may already hold the first rows of a copy's next episode.
+    Endings belong to the previous episodes; batches may contain the first rows of the next ones.
     """
 
     batches: dict[Group, Batch] = field(default_factory=dict)
     endings: list[Ending] = field(default_factory=list)
     finished: list[int] = field(default_factory=list)
     crashed: list[int] = field(default_factory=list)
-    """Copies whose environment raised and was built anew. Their episode has no endings and is not in `finished`: what
-    was reported of it is to be dropped. Their next one has begun in this call."""
+    """Environments that raised an exception and were recreated. Their episodes have no endings and are not in
+    `finished`; earlier reports of them must be discarded. The next episodes have already started."""
     states: dict[int, NDArray] = field(default_factory=dict)
-    """Copy → the global state as it stands, float32 and flat, where it is asked for and the environment has one."""
+    """Environment → its current global state, flat float32, if requested and available."""
     last_states: dict[int, NDArray] = field(default_factory=dict)
-    """Of the finished copies, the state that their episode ended in."""
+    """Finished environment → the global state at the end of its episode."""
 
 
 class BatchedEnvironment(Protocol):
-    """n copies in lockstep. A copy whose episode is over restarts with its next one in the same call."""
+    """n environments in lockstep. After the end of an episode, the next one starts in the same call."""
 
     @property
     def agents(self) -> tuple[str, ...]:
-        """Agent names; rows and groups refer to them by index."""
-        ...
+        """Names of the agents, which rows and groups refer to by index."""
 
     @property
-    def copies(self) -> int:
-        """n"""
-        ...
+    def num_envs(self) -> int:
+        """Number of environments."""
 
     def start(self, next_episode: NextEpisode) -> Turn:
-        """Reset every copy. `next_episode` is called here and at each restart."""
-        ...
+        """Reset all environments. `next_episode` is called for each of them, and after each episode."""
 
     def step(self, actions: Mapping[Group, NDArray]) -> Turn:
-        """Act: actions[group][i] is row i of the last Turn's batch of that group. A Turn without batches means that
-        all copies are idle. Raises IllegalAction, naming agent and action, before any copy has moved."""
-        ...
+        """Step all environments. actions[group][i] belongs to row i of the group's batch in the last Turn.
 
-    def abandon(self, copies: Collection[int]) -> None:
-        """Break the episodes of these copies off. Their rows leave the last Turn: the next `step` takes actions of the
-        others only, and restarts these in the same call. As of a crash, no endings of theirs are reported, nor are they
-        in `finished`."""
-        ...
+        A Turn without batches means that all environments are idle. Raises IllegalAction before any environment is
+        stepped.
+        """
 
-    def assign(self, copy: int, groups: Sequence[Group]) -> None:
-        """Change the groups of a copy's agents from the next Turn on."""
-        ...
+    def abandon(self, envs: Collection[int]) -> None:
+        """Abort the episodes of some environments.
+
+        The next `step` expects actions for the other rows only, and starts their next episodes. As after a crash, the
+        aborted episodes have no endings and are not in `finished`.
+        """
+
+    def assign(self, env: int, groups: Sequence[Group]) -> None:
+        """Change the groups of an environment's agents, starting with the next Turn."""
 
     @property
     def busy(self) -> int | None:
-        """The copy whose environment is at work at this moment, for who looks from a signal handler; or whose
-        environment raised what came out of the last call."""
-        ...
+        """The environment that is executing, for use in signal handlers, or that raised in the last call."""
 
-    def seconds(self, copy: int) -> float:
-        """How long a copy's environment has worked on its episode, reset included and also if it is at it just now."""
-        ...
+    def seconds(self, env: int) -> float:
+        """Return the execution time of an environment in its current episode, including the reset, in seconds."""
 
-    def render(self, copy: int) -> NDArray:
-        """A picture of the copy as it stands, (height, width, 3) uint8. Raises EnvironmentMismatch if it has none."""
-        ...
+    def render(self, env: int) -> NDArray:
+        """Render an environment, (height, width, 3) uint8. Raises EnvironmentMismatch if it cannot be rendered."""
 
     def close(self) -> None:
-        """Release the copies."""
-        ...
+        """Close the environments."""
+
+
+ROUNDING = 1e-5
+"""Relative tolerance for actions at the bounds of a Box."""
+
+
+def check_actions(batch: Batch, actions: NDArray, space: Space, agents: Sequence[str]) -> None:
+    """Raise IllegalAction unless all actions (k, …) are in `space` and allowed by the masks."""
+    rows = len(batch.envs)
+    if len(actions) != rows:
+        raise IllegalAction(f"{len(actions)} actions for {rows} agents")
+    if isinstance(space, Discrete | Box | MultiDiscrete | MultiBinary) and actions.shape[1:] != space.shape:
+        expected = list(space.shape)
+        raise IllegalAction(
+            f"actions of {agents[batch.agents[0]]} have shape {list(actions.shape[1:])}, not {expected}"
+        )
+    mask = batch.observations.get(ACTION_MASK)
+    legal = legal_rows(actions, space, mask)
+    if not legal.all():
+        row = int(np.argmin(legal))
+        raise IllegalAction(
+            f"action {actions[row].tolist()} of {agents[batch.agents[row]]} is illegal"
+            + ("" if mask is None else f": action_mask is {mask[row].tolist()}")
+        )
+
+
+def legal_rows(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
+    """Return which of the actions (k, …) are in `space` and allowed by the mask, (k,) bool."""
+    match space:
+        case Discrete():
+            chosen = actions - space.start
+            legal = (chosen >= 0) & (chosen < space.n)
+            if mask is not None:
+                legal &= mask[np.arange(len(mask)), np.where(legal, chosen, 0)] != 0
+            return legal
+        case MultiDiscrete():
+            choices = np.asarray(space.nvec).ravel()
+            chosen = (actions - np.asarray(space.start)).reshape(len(actions), -1)
+            inside = (chosen >= 0) & (chosen < choices)
+            if mask is not None:
+                # The mask concatenates the choices of all elements.
+                first = np.cumsum(choices) - choices
+                inside &= mask[np.arange(len(mask))[:, np.newaxis], first + np.where(inside, chosen, 0)] != 0
+            return inside.all(axis=1)
+        case Box():
+            low, high = _bound(space.low, -np.inf), _bound(space.high, np.inf)
+            inside = (actions >= low - ROUNDING * (1 + np.abs(low))) & (actions <= high + ROUNDING * (1 + np.abs(high)))
+            return (inside & np.isfinite(actions)).reshape(len(actions), -1).all(axis=1)
+        case MultiBinary():
+            return ((actions == 0) | (actions == 1)).reshape(len(actions), -1).all(axis=1)
+    return np.ones(len(actions), dtype=bool)
+
+
+def allows_nothing(mask: NDArray, space: Space) -> NDArray:
+    """Return which rows of a mask (k, n) allow no action in at least one element, (k,) bool."""
+    if not isinstance(space, MultiDiscrete):
+        return ~(mask != 0).any(axis=1)
+    choices = np.asarray(space.nvec).ravel()
+    return (np.add.reduceat(mask != 0, np.cumsum(choices) - choices, axis=1, dtype=int) == 0).any(axis=1)
+
+
+def _bound(bound: Any, infinite: float) -> NDArray:
+    values = np.array(bound, dtype=np.float64)
+    return np.where(np.isnan(values), infinite, values)

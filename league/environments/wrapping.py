@@ -1,27 +1,92 @@
-"""SuperSuit's wrappers by name and arguments, in the order of the league's config. The only SuperSuit stack."""
+"""Applies SuperSuit wrappers by name, vectorised over agents where possible."""
 
 import importlib
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import supersuit
+from gymnasium import spaces
+from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
 from supersuit.lambda_wrappers.reward_lambda import aec_reward_lambda
 
-from league.config import WrapperConfig
-from league.environments.batched_wrappers import batched
-from league.errors import ConfigError
+from league.environment_config import WrapperConfig
+from league.environments.transforms import Transform, channel, transform
+from league.errors import ConfigError, one_line
+
+
+class BatchedWrappers(BaseParallelWrapper):
+    """Replaces a sequence of wrappers by transforms of all agents' observations, with identical results."""
+
+    def __init__(
+        self,
+        env: ParallelEnv,
+        view: Callable[[NDArray], NDArray] | None,
+        transforms: Sequence[Transform],
+        observed: Sequence[spaces.Space[Any]],
+    ) -> None:
+        """view: applied to each observation before stacking, None for the identity. observed: resulting spaces."""
+        super().__init__(env)
+        self._index = {agent: index for index, agent in enumerate(env.possible_agents)}
+        self._view, self._transforms, self._observed = view, transforms, observed
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return self._observed[self._index[agent]]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
+        observations, infos = self.env.reset(seed=seed, options=options)
+        for each in self._transforms:
+            each.reset()
+        return self._transformed(observations), infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], Any, Any, Any, Any]:
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        return self._transformed(observations), rewards, terminated, truncated, infos
+
+    def _transformed(self, observations: Mapping[str, NDArray]) -> dict[str, NDArray]:
+        if not observations:
+            return {}
+        agents = np.array([self._index[agent] for agent in observations])
+        values = observations.values() if self._view is None else map(self._view, observations.values())
+        rows = np.array(list(values))
+        for each in self._transforms:
+            rows = each(rows, agents)
+        return dict(zip(observations, rows, strict=True))
+
+
+def batched(
+    env: ParallelEnv, wrappers: Sequence[WrapperConfig], spaces_before: Sequence[Sequence[spaces.Space[Any]]]
+) -> ParallelEnv | None:
+    """Return `env` with vectorised wrappers; None if a wrapper or a space is not supported.
+
+    spaces_before[i]: the agents' observation spaces before wrapper i, as reported by SuperSuit; the last entry is the
+    result of all wrappers.
+    """
+    transforms = []
+    for wrapper, before in zip(wrappers, spaces_before, strict=False):
+        space = before[0]
+        if not isinstance(space, spaces.Box) or any(other != space for other in before):
+            return None
+        made = transform(wrapper.name, wrapper.kwargs, space, env.possible_agents)
+        if made is None:
+            return None
+        transforms.append(made)
+    view = channel(**wrappers[0].kwargs) if wrappers[0].name == "color_reduction_v0" else None
+    return BatchedWrappers(env, view, transforms[view is not None :], spaces_before[-1])
+
 
 VECTORS = re.compile(r"vec_env|vectorize|concat_vec")
 
 
 def wrapped(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> AECEnv | ParallelEnv:
-    """`env` with `wrappers`, the first of them innermost.
+    """Apply wrappers to `env`, the first one innermost.
 
-    Raises ConfigError, naming the wrapper and its place, for one that SuperSuit has not, that does not take its
-    arguments, or that cannot stand on what is before it.
+    Raises ConfigError, with name and position of the wrapper, if it does not exist, or does not support its arguments
+    or the spaces before it.
     """
     if not wrappers:
         return env
@@ -47,18 +112,20 @@ def _stock(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, position: int) -> 
             warnings.simplefilter("ignore")
             made = make(env, **_with_arguments(wrapper).kwargs)
             for agent in made.possible_agents:
-                # Some check what they stand on only when they are asked.
+                # Some wrappers check the space only on access.
                 made.observation_space(agent)
                 made.action_space(agent)
     except (TypeError, AssertionError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as error:
         agent = env.possible_agents[0]
-        given = f"before it, {agent} observes {env.observation_space(agent)} and acts {env.action_space(agent)}"
-        raise ConfigError(f"{where}: {' '.join(str(error).split()) or type(error).__name__}; {given}") from error
+        given = (
+            f"before it, {agent} has observations {env.observation_space(agent)} and actions {env.action_space(agent)}"
+        )
+        raise ConfigError(f"{where}: {one_line(error)}; {given}") from error
     return _with_whole_reset(made) if isinstance(made, aec_reward_lambda) else made
 
 
 def _with_whole_reset(env: AECEnv) -> AECEnv:
-    """SuperSuit's wrapper of rewards without what is left of the episode before: its reset keeps the sums."""
+    """Clear cumulative rewards at resets, which SuperSuit's reward wrapper keeps from the previous episode."""
     stock = env.reset
 
     def reset(seed: int | None = None, options: dict[str, Any] | None = None) -> None:
@@ -72,7 +139,7 @@ def _with_whole_reset(env: AECEnv) -> AECEnv:
 def _maker(name: str) -> Any:
     if VECTORS.search(name):
         raise ConfigError(
-            f"environment.wrappers: {name} makes a vector of environments, which a league does itself: leave it out"
+            f"environment.wrappers: {name} creates a vector environment, which is not needed here: remove it"
         )
     try:
         make = getattr(supersuit, name)
@@ -80,13 +147,13 @@ def _maker(name: str) -> Any:
         raise ConfigError(f"environment.wrappers: SuperSuit has no wrapper {name!r}: {error}") from error
     if not (callable(make) and re.search(r"_v\d+$", name)):
         raise ConfigError(
-            f"environment.wrappers: SuperSuit's {name!r} is no wrapper: expected one such as frame_stack_v1"
+            f"environment.wrappers: {name!r} of SuperSuit is not a wrapper: expected for example frame_stack_v1"
         )
     return make
 
 
 def _with_arguments(wrapper: WrapperConfig) -> WrapperConfig:
-    """The same wrapper with its arguments as SuperSuit takes them: YAML has neither tuples nor functions."""
+    """Convert arguments from YAML: lists to tuples, and names of functions to functions."""
     return WrapperConfig(name=wrapper.name, kwargs={key: _argument(wrapper, key) for key in wrapper.kwargs})
 
 
@@ -101,5 +168,5 @@ def _argument(wrapper: WrapperConfig, key: str) -> Any:
         return getattr(importlib.import_module(module_name), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
-            f"environment.wrappers: {wrapper.name}.{key}: {value!r} is no function package.module:function: {error}"
+            f"environment.wrappers: {wrapper.name}.{key}: {value!r} is not a function package.module:function: {error}"
         ) from error

@@ -1,4 +1,4 @@
-"""What acts: ONNX graphs, scripts, and clients of a policy server."""
+"""Policies: ONNX graphs, scripted baselines and remote policies."""
 
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 
 def load(ref: str, policy: str | None = None, registry: "Registry | None" = None) -> "Policy":
-    """The policy that a reference names, see `league.policies.loading.load`."""
+    """Load a policy by reference; see `league.policies.loading.load`."""
     from league.policies import loading
 
     return loading.load(ref, policy, registry)

@@ -1,13 +1,13 @@
-"""Raw actions, as a learner draws them, ↔ actions of the environment's own space.
+"""Conversion between raw actions (samples of a distribution) and actions of an environment's space.
 
 | action space                     | inputs of the distribution, (k, d) float32       | raw action                  |
 |----------------------------------|--------------------------------------------------|-----------------------------|
 | Discrete(n, start)               | n logits                                         | (k,) int64, from 0          |
-| MultiDiscrete of m elements      | the logits of its elements one behind another    | (k, m) int64, each from 0   |
-| Box of floats with m elements    | m means, then m logarithms of the deviations     | (k, m) float32, a Gaussian  |
+| MultiDiscrete of m elements      | concatenated logits of the elements              | (k, m) int64, each from 0   |
+| Box of floats with m elements    | m means, then m log standard deviations          | (k, m) float32, Gaussian    |
 
-The environment's action is the raw one plus `start`, and for a Box element by element: where both bounds are finite,
-raw values in [-1, 1] span them and others are clipped; elsewhere raw values are clipped to what bounds there are.
+Discrete actions are the raw ones plus `start`. For a Box element with two finite bounds, raw values are clipped to
+[-1, 1] and scaled to the bounds; for other elements they are clipped to the bounds that exist.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from league.spaces import Box, Discrete, MultiDiscrete, Space
 
 
 def dist_inputs_size(space: Space) -> int:
-    """d. Raises ConfigError for an action space that no policy can have."""
+    """Return d, the number of distribution inputs. Raises ConfigError for an unsupported action space."""
     match space:
         case Discrete(n=n):
             return n
@@ -26,13 +26,21 @@ def dist_inputs_size(space: Space) -> int:
             return int(np.sum(nvec))
         case Box(dtype=dtype, shape=shape) if np.dtype(dtype).kind == "f":
             return 2 * int(np.prod(shape))
-    raise ConfigError(f"no policy has actions of {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
+    raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
 
 
 def to_environment(raw: NDArray, space: Space) -> NDArray:
-    """(k,) or (k, m) raw actions → (k, *shape) actions in the dtype of `space`, and inside it.
+    """Convert raw actions to actions of the environment.
 
-    Raises ConfigError for an action space that no policy can have.
+    Args:
+        raw: Raw actions, (k,) or (k, m).
+        space: The action space.
+
+    Returns:
+        Actions inside the space, (k, *shape), in its dtype.
+
+    Raises:
+        ConfigError: The action space is not supported.
     """
     match space:
         case Discrete(start=start):
@@ -42,27 +50,27 @@ def to_environment(raw: NDArray, space: Space) -> NDArray:
         case Box(shape=shape, dtype=dtype) if np.dtype(dtype).kind == "f":
             wide, largest = raw.reshape(-1, *shape).astype(np.float64), float(np.finfo(dtype).max)
             return _spanned(wide, *bounds(space), largest).astype(dtype)
-    raise ConfigError(f"no policy has actions of {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
+    raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
 
 
 def bounds(space: Box) -> tuple[NDArray, NDArray]:
-    """Lowest and highest values, (*shape) float64; infinite where there is no bound."""
+    """Return lower and upper bounds, (*shape) float64; infinite if missing."""
     return _bound(space.low, -np.inf, space.shape), _bound(space.high, np.inf, space.shape)
 
 
 def _spanned(raw: NDArray, low: NDArray, high: NDArray, largest: float) -> NDArray:
-    """largest: what the dtype holds, so that an absent bound does not let a finite number become infinite."""
+    """largest: maximum of the dtype, which keeps unbounded values finite."""
     clipped = np.clip(raw, np.maximum(low, -largest), np.minimum(high, largest))
     finite = np.isfinite(low) & np.isfinite(high)
     if not finite.any():
         return clipped
     share = (np.clip(raw, -1, 1) + 1) / 2
-    # Weighted bounds, not the lower one plus a share of the span, which may overflow.
+    # A weighted mean of the bounds: `high - low` may overflow.
     spanned = np.where(finite, low, 0) * (1 - share) + np.where(finite, high, 0) * share
     return np.where(finite, np.clip(spanned, low, high), clipped)
 
 
 def _bound(bound: object, infinity: float, shape: tuple[int, ...]) -> NDArray:
-    # None becomes NaN in an array of floats; there is no other NaN among bounds.
+    # None becomes NaN in a float array; bounds contain no other NaN.
     values = np.array(bound, dtype=np.float64)
     return np.broadcast_to(np.where(np.isnan(values), infinity, values), shape)

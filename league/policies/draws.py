@@ -1,19 +1,21 @@
-"""Random choices of a batch: row i from generator i alone, so that it does not depend on the other rows."""
+"""Samples actions from the outputs of a policy graph, and computes action probabilities."""
 
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import ConfigError, InvalidInput
+from league.policies.actions import bounds
 from league.spaces import Box, Discrete, MultiDiscrete, Space
 
 Generators = Sequence[np.random.Generator]
 
 
 def draw(rng: Generators | None, rows: int, shape: tuple[int, ...] = ()) -> NDArray:
-    """Uniform numbers in [0, 1), (rows, *shape) float64. Raises InvalidInput without a generator per row."""
+    """Return uniform numbers in [0, 1), (rows, *shape) float64. Raises InvalidInput unless each row has a generator."""
     generators = _each(rng, rows)
     if not shape:
         return np.array([generator.random() for generator in generators])
@@ -21,9 +23,14 @@ def draw(rng: Generators | None, rows: int, shape: tuple[int, ...] = ()) -> NDAr
 
 
 def choose(allowed: NDArray, uniform: NDArray) -> NDArray:
-    """The index of a nonzero element of each row of `allowed` (k, n), each as likely; (k,) int64.
+    """Choose a random nonzero element of each row.
 
-    uniform: (k,) numbers in [0, 1).
+    Args:
+        allowed: Mask, (k, n).
+        uniform: Uniform numbers in [0, 1), (k,).
+
+    Returns:
+        Indices of the chosen elements, (k,) int64.
     """
     ranks = (allowed != 0).cumsum(axis=1)
     wanted = (uniform * ranks[:, -1]).astype(np.int64)
@@ -31,9 +38,14 @@ def choose(allowed: NDArray, uniform: NDArray) -> NDArray:
 
 
 def invert(logits: NDArray, uniform: NDArray) -> NDArray:
-    """One action of each row's categorical distribution with these logits (k, n); (k,) int64.
+    """Sample categorical distributions by inversion: the first action whose cumulative probability exceeds `uniform`.
 
-    The first action at which the cumulated probability exceeds the row's number of `uniform`, (k,) in [0, 1).
+    Args:
+        logits: Logits, (k, n).
+        uniform: Uniform numbers in [0, 1), (k,).
+
+    Returns:
+        Actions, (k,) int64.
     """
     weights = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
     cumulated = weights.cumsum(axis=1)
@@ -41,9 +53,19 @@ def invert(logits: NDArray, uniform: NDArray) -> NDArray:
 
 
 def sample(dist_inputs: NDArray, space: Space, rng: Generators | None) -> NDArray:
-    """A raw action of each row's distribution: see league/policies/actions.py.
+    """Sample a raw action for each row; see `league.policies.actions`.
 
-    dist_inputs: (k, d) float32. Raises ConfigError for a space that has no distribution.
+    Args:
+        dist_inputs: Inputs of the distributions, (k, d) float32.
+        space: The action space.
+        rng: One generator per row.
+
+    Returns:
+        Raw actions, (k,) or (k, m).
+
+    Raises:
+        ConfigError: The action space is not supported.
+        InvalidInput: There is not one generator per row.
     """
     rows = len(dist_inputs)
     match space:
@@ -57,11 +79,11 @@ def sample(dist_inputs: NDArray, space: Space, rng: Generators | None) -> NDArra
             means, log_deviations = np.split(dist_inputs, 2, axis=1)
             noise = np.array([generator.standard_normal(means.shape[1]) for generator in _each(rng, rows)])
             return (means + np.exp(log_deviations) * noise.reshape(means.shape)).astype(np.float32)
-    raise ConfigError(f"no policy has actions of {space!r}")
+    raise ConfigError(f"unsupported action space {space!r}")
 
 
 def elements(columns: NDArray, space: MultiDiscrete) -> list[NDArray]:
-    """Columns (k, sum of nvec), one for each value of each element, divided by element: (k, n) each."""
+    """Split (k, sum of nvec) columns into one array (k, n) per element of the space."""
     stops = list(accumulate(np.ravel(space.nvec).tolist()))
     return np.split(columns, stops[:-1], axis=1)
 
@@ -71,3 +93,51 @@ def _each(rng: Generators | None, rows: int) -> Generators:
         given = "none" if rng is None else str(len(rng))
         raise InvalidInput(f"a random choice for {rows} rows needs rng, one generator per row: got {given}")
     return rng
+
+
+def probabilities(dist_inputs: NDArray, space: Space, mask: NDArray | None = None) -> list[Any]:
+    """Compute the action distribution of each row as JSON values.
+
+    Args:
+        dist_inputs: Inputs of the distributions, (k, d).
+        space: The action space.
+        mask: Action mask, (k, n); masked actions have probability 0.
+
+    Returns:
+        One entry per row. Discrete: the probabilities of all actions, starting at `start`. MultiDiscrete: such a list
+        per element. Box: `mean` and `std` in the shape and units of the space, before clipping to its bounds.
+
+    Raises:
+        ConfigError: The action space is not supported.
+    """
+    match space:
+        case Discrete():
+            return _shares(dist_inputs, mask).tolist()
+        case MultiDiscrete():
+            masks = [None] * int(np.size(space.nvec)) if mask is None else elements(mask, space)
+            parts = [_shares(part, own) for part, own in zip(elements(dist_inputs, space), masks, strict=True)]
+            return [[part[row].tolist() for part in parts] for row in range(len(dist_inputs))]
+        case Box(shape=shape):
+            means, deviations = _gaussian(dist_inputs.astype(np.float64), space)
+            pairs = zip(means.reshape(-1, *shape), deviations.reshape(-1, *shape), strict=True)
+            return [{"mean": mean.tolist(), "std": deviation.tolist()} for mean, deviation in pairs]
+    raise ConfigError(f"unsupported action space {space!r}")
+
+
+def _shares(logits: NDArray, mask: NDArray | None) -> NDArray:
+    """Softmax, (k, n) float64."""
+    if mask is not None:
+        logits = np.where(mask != 0, logits, -np.inf)
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _gaussian(dist_inputs: NDArray, space: Box) -> tuple[NDArray, NDArray]:
+    """Means and standard deviations (k, m) in the units of the space; see `to_environment`."""
+    means, log_deviations = np.split(dist_inputs, 2, axis=1)
+    deviations = np.exp(log_deviations)
+    low, high = (np.ravel(bound) for bound in bounds(space))
+    finite = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(finite, low, -1.0), np.where(finite, high, 1.0)
+    half, centre = high / 2 - low / 2, high / 2 + low / 2
+    return centre + means * half, deviations * half

@@ -1,5 +1,12 @@
-"""From a reference to something that acts."""
+"""Loads policies by reference, and checks which versions and scripts may play in a league.
 
+Only versions trained in the league's current environment take part in its matches. Versions of another environment
+would be compared on a task that they were not trained for, even if the spaces are equal.
+"""
+
+from contextlib import closing
+
+from league.config import LeagueConfig
 from league.errors import EnvironmentMismatch, InvalidInput, UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
@@ -7,31 +14,46 @@ from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.refs import CheckpointRef, ScriptRef, parse_ref
 from league.registry.registry import Registry
-from league.registry.rows import VersionRow
+from league.registry.storage.rows import VersionRow
 
 
 def load(ref: str, policy: str | None = None, registry: Registry | None = None) -> Policy:
-    """Load one policy of a version, verified: `load("connect_four@champion").act({"observation": …})`.
+    """Load and verify a policy of a version: `load("connect_four@champion").act({"observation": …})`.
 
-    policy: which one, needed only where the version has several.
-    registry: where to look; by default the one that LEAGUE_HOME and its siblings name.
-    Raises InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy or ArtifactCorrupt.
+    Args:
+        ref: The version, by number or alias.
+        policy: The policy id; optional if the version has one policy.
+        registry: The registry; by default the one configured by environment variables.
+
+    Raises:
+        InvalidReference: The reference is malformed.
+        UnknownLeague: The league does not exist.
+        UnknownVersion: The version does not exist.
+        UnknownAlias: The alias does not exist.
+        UnknownPolicy: The policy does not exist, or is ambiguous.
+        ArtifactCorrupt: A file differs from the manifest.
     """
     checkpoint = CheckpointRef.parse(ref)
     if registry is not None:
-        return _policy(registry, registry.resolve(checkpoint), policy)
-    registry = Registry.open()
-    try:
-        return _policy(registry, registry.resolve(checkpoint), policy)
-    finally:
-        registry.close()
+        return _policy(registry, registry.versions.resolve(checkpoint), policy)
+    with closing(Registry.open()) as opened:
+        return load(ref, policy, opened)
 
 
 def contestant(ref: str, registry: Registry | None, interface: Interface) -> dict[str, tuple[str, Policy]]:
-    """Who acts for each agent: agent → (policy id, policy). Agents of one policy id share one object.
+    """Load the policies of a contestant for all agents.
 
-    registry: where versions are; not needed for a script.
-    Raises what `load` does, and EnvironmentMismatch if the version or script does not fit `interface`.
+    Args:
+        ref: A version or a script.
+        registry: The registry; optional for scripts.
+        interface: Interface of the league.
+
+    Returns:
+        Policy id and policy of each agent. Agents with the same policy id share one object.
+
+    Raises:
+        EnvironmentMismatch: The version or script does not fit `interface`.
+        LeagueError: See `load`.
     """
     parsed = parse_ref(ref)
     policies = _script(parsed, interface) if isinstance(parsed, ScriptRef) else _version(parsed, registry, interface)
@@ -46,9 +68,9 @@ def _script(ref: ScriptRef, interface: Interface) -> dict[str, Policy]:
 def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface) -> dict[str, Policy]:
     if registry is None:
         raise InvalidInput(f"{ref} is a version: without a registry, only scripts can be loaded")
-    version = registry.resolve(ref)
+    version = registry.versions.resolve(ref)
     if version.manifest.interface.digest() != interface.digest():
-        raise EnvironmentMismatch(f"{version.ref} has other spaces or policies than the environment that it is to play")
+        raise EnvironmentMismatch(f"the spaces or policies of {version.ref} differ from those of the environment")
     return {policy: _policy(registry, version, policy) for policy in interface.policy_ids}
 
 
@@ -57,7 +79,65 @@ def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Poli
     if policy is None and len(known) == 1:
         policy = next(iter(known))
     if policy not in known:
-        asked = f"{version.ref} has no policy {policy!r}" if policy else f"{version.ref} has several policies: name one"
-        raise UnknownPolicy(f"{asked}; known: {', '.join(known)}")
+        problem = (
+            f"{version.ref} has no policy {policy!r}" if policy else f"{version.ref} has several policies: specify one"
+        )
+        raise UnknownPolicy(f"{problem}; known: {', '.join(known)}")
     manifest = known[policy]
     return OnnxPolicy(registry.artifacts.read(version.manifest, manifest.file), manifest)
+
+
+def pinned(ref: str, league: str, registry: Registry) -> str:
+    """Return an immutable reference: an alias is replaced by its current version.
+
+    Raises:
+        InvalidReference: The reference is malformed.
+        UnknownVersion: The version does not exist.
+        UnknownAlias: The alias does not exist.
+        UnknownPolicy: The script does not exist.
+        EnvironmentMismatch: The version belongs to another league, or the script does not support the spaces.
+    """
+    parsed = parse_ref(ref)
+    if isinstance(parsed, CheckpointRef):
+        _check_league(parsed, league)
+        return registry.versions.resolve(parsed).ref
+    check_plays(parsed, registry.leagues.get(league).interface)
+    return ref
+
+
+def check_plays(ref: ScriptRef, interface: Interface) -> None:
+    """Raise UnknownPolicy if the script does not exist, EnvironmentMismatch if it does not support the spaces."""
+    for policy in interface.policy_ids:
+        spaces = interface.of_policy(policy)
+        script(ref.name, spaces.observation, spaces.action)
+
+
+def eligible(registry: Registry, league: str) -> list[VersionRow]:
+    """Return the versions trained in the league's current environment. Raises UnknownLeague."""
+    now = registry.leagues.get(league).config.environment.digest()
+    return [version for version in registry.versions.all(league) if version.manifest.environment_digest == now]
+
+
+def check_eligible(ref: str, registry: Registry, config: LeagueConfig) -> None:
+    """Raise EnvironmentMismatch if `ref` is a version of another league or was trained in another environment.
+
+    Also raises UnknownVersion, UnknownAlias and UnknownLeague.
+    """
+    parsed = parse_ref(ref)
+    if not isinstance(parsed, CheckpointRef):
+        return
+    _check_league(parsed, config.league)
+    manifest, now = registry.versions.resolve(parsed).manifest, config.environment
+    if manifest.environment_digest == now.digest():
+        return
+    own, other = (each.model_dump(mode="json", by_alias=True) for each in (manifest.environment, now))
+    differences = [f"{name} {own[name]!r} instead of {other[name]!r}" for name in own if own[name] != other[name]]
+    raise EnvironmentMismatch(
+        f"{ref} was trained in another environment ({manifest.environment_digest[:12]}) than {config.league} has now"
+        f" ({now.digest()[:12]}), with {', '.join(differences)}: it cannot play in matches of this league"
+    )
+
+
+def _check_league(ref: CheckpointRef, league: str) -> None:
+    if ref.league != league:
+        raise EnvironmentMismatch(f"{ref} is not a version of league {league}")

@@ -1,4 +1,4 @@
-"""A policy that is an ONNX graph, run by ONNX Runtime on one thread."""
+"""Runs the ONNX graph of a policy with ONNX Runtime on one thread."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,11 +8,11 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError
+from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError, one_line
 from league.policies.actions import dist_inputs_size, to_environment
 from league.policies.draws import sample
 from league.policies.policy import Actions, Arrays
-from league.registry.manifest import PolicyManifest
+from league.registry.storage.manifest import PolicyManifest
 from league.spaces import Discrete, Space
 
 ACTION = "action"
@@ -20,19 +20,22 @@ DIST_INPUTS = "action_dist_inputs"
 STATE_IN = "state_in_"
 STATE_OUT = "state_out_"
 LAST_ACTION = "state_in_action"
-"""State of a graph that remembers its last action: the raw one plus one, (k, 1) float32, 0 at first. The graph answers
-with its greedy action; when another one is drawn, that takes its place."""
+"""State of a graph with the previous action as input: raw action + 1, (k, 1) float32, initially 0. The graph returns
+its greedy action here, which is replaced if another action is sampled."""
 
 DTYPES = {"float": "float32", "double": "float64"}
-"""ONNX Runtime's names of element types where they are not NumPy's."""
+"""Element types of ONNX Runtime whose names differ from NumPy's."""
 
 
 class OnnxPolicy:
-    """The graph of one policy. Keeps no state between calls, and may be called by several threads.
+    """An ONNX graph as a policy. Stateless and thread-safe.
 
-    graph: the file or its bytes. The graph must hold its weights itself.
-    manifest: what the graph must look like; without one, it is taken as it is.
-    Raises ArtifactCorrupt if it is no graph, or not the one of the manifest.
+    Args:
+        graph: Path or content of the ONNX file, which must contain its weights.
+        manifest: Expected inputs, outputs and action space. Without it, the graph is not checked against them.
+
+    Raises:
+        ArtifactCorrupt: The file is not an ONNX graph, or it does not match the manifest.
     """
 
     def __init__(self, graph: Path | str | bytes, manifest: PolicyManifest | None = None) -> None:
@@ -55,14 +58,20 @@ class OnnxPolicy:
         explore: bool = False,
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
-        """Act on a batch; see `Policy.act`. The distribution's inputs are answered when exploring.
+        """Choose actions for a batch; see `Policy.act`. `dist_inputs` are returned only with `explore`.
 
-        state: arrays (k, …) under the names `state_in_<i>`; None at the start of episodes.
-        Raises ObservationError if an array is missing or has another shape or dtype than the graph takes, and
-        EnvironmentMismatch if it cannot explore: without a manifest, only one action of several is told from the graph.
+        Args:
+            observations: See `Policy.act`.
+            state: Arrays (k, …) named `state_in_<i>`; None at the start of episodes.
+            explore: See `Policy.act`.
+            rng: See `Policy.act`.
+
+        Raises:
+            ObservationError: An array is missing or its shape or dtype does not fit the graph.
+            EnvironmentMismatch: `explore` without a manifest, for an action space that the graph does not determine.
         """
         if explore and self._action is None:
-            raise EnvironmentMismatch("this policy cannot explore without a manifest, which says its action space")
+            raise EnvironmentMismatch("this policy cannot explore without a manifest, which defines its action space")
         outputs = self._run(observations, state, self._exploring if explore else self._greedy)
         if not explore or self._action is None:
             return Actions(outputs[0], self._state(outputs[1:]))
@@ -72,11 +81,11 @@ class OnnxPolicy:
         return Actions(to_environment(raw, self._action), after, outputs[1])
 
     def distribution(self, observations: Arrays, *, state: Arrays | None = None) -> Actions:
-        """As a greedy `act`, with the distribution's inputs."""
+        """Choose greedy actions and return `dist_inputs`, too; see `act`."""
         outputs = self._run(observations, state, self._exploring)
         return Actions(outputs[0], self._state(outputs[2:]), outputs[1])
 
-    def _run(self, observations: Arrays, state: Arrays | None, answers: list[str]) -> list[NDArray]:
+    def _run(self, observations: Arrays, state: Arrays | None, outputs: list[str]) -> list[NDArray]:
         try:
             feed = {name: observations[name] for name in self._observed}
             if self._recurrent:
@@ -84,13 +93,13 @@ class OnnxPolicy:
             rows = {name: len(array) for name, array in feed.items()}
             if len(set(rows.values())) != 1:
                 raise ValueError(f"rows differ: {rows}")
-            return self._session.run(answers, feed)
+            return self._session.run(outputs, feed)
         except Exception as error:
             self._explain(observations, state)
-            raise ObservationError(f"the graph refuses its input: {_one_line(error)}") from error
+            raise ObservationError(f"the graph does not accept its input: {one_line(error)}") from error
 
     def initial_state(self, batch: int) -> dict[str, NDArray]:
-        """The recurrent state of `batch` episodes that start; empty for a graph without."""
+        """Return the recurrent state at the start of `batch` episodes; empty for graphs without state."""
         return {
             name: np.zeros((batch, *self._inputs[name].shape[1:]), _dtype(self._inputs[name]))
             for name in self._recurrent
@@ -100,7 +109,7 @@ class OnnxPolicy:
         return dict(zip(self._recurrent, outputs, strict=True)) if outputs else None
 
     def _explain(self, observations: Arrays, state: Arrays | None) -> None:
-        """Raise ObservationError for the first array that does not fit, if any."""
+        """Raise ObservationError for the first array that does not fit the graph, if any."""
         given = dict(observations) | dict(state or {})
         for name in (*self._observed, *(self._recurrent if state is not None else ())):
             node = self._inputs[name]
@@ -109,21 +118,21 @@ class OnnxPolicy:
                 raise ObservationError(f"{name} is missing: {expected}")
             array = given[name]
             if not isinstance(array, np.ndarray):
-                raise ObservationError(f"{name} is no NumPy array: {expected}")
+                raise ObservationError(f"{name} is not a NumPy array: {expected}")
             if array.dtype != _dtype(node) or list(array.shape[1:]) != list(node.shape[1:]):
                 raise ObservationError(f"{name} is {array.dtype} {list(array.shape[1:])}: {expected}")
 
 
 def _session(graph: bytes) -> Any:
     options = onnxruntime.SessionOptions()
-    # Replicas and workers are processes: threads of one would fight the others for cores.
+    # Replicas and workers are processes; more threads would compete with them for cores.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
     try:
         return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise ArtifactCorrupt(f"ONNX Runtime cannot load the graph: {_one_line(error)}") from error
+        raise ArtifactCorrupt(f"ONNX Runtime cannot load the graph: {one_line(error)}") from error
 
 
 def _check_graph(inputs: dict[str, Any], outputs: dict[str, Any], manifest: PolicyManifest | None) -> None:
@@ -147,7 +156,9 @@ def _check_graph(inputs: dict[str, Any], outputs: dict[str, Any], manifest: Poli
                 )
     found_size, size = outputs[DIST_INPUTS].shape[-1], dist_inputs_size(manifest.action)
     if isinstance(found_size, int) and found_size != size:
-        raise ArtifactCorrupt(f"{DIST_INPUTS} of the graph has {found_size} values a row, but its actions need {size}")
+        raise ArtifactCorrupt(
+            f"{DIST_INPUTS} of the graph has {found_size} values per row, but its action space requires {size}"
+        )
 
 
 def _dtype(node: Any) -> str:
@@ -155,12 +166,8 @@ def _dtype(node: Any) -> str:
     return DTYPES.get(name, name)
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
-
-
 def _discrete(outputs: dict[str, Any]) -> Space | None:
-    """The action space of a graph whose action is one integer."""
+    """The action space of a graph with a single integer action."""
     action = outputs[ACTION]
     is_discrete = len(action.shape) == 1 and _dtype(action) in ("int32", "int64")
     return Discrete(n=outputs[DIST_INPUTS].shape[1]) if is_discrete else None

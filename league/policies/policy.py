@@ -1,4 +1,4 @@
-"""The contract of a policy: observation (+ mask, + state) → action, batched, without hidden state."""
+"""Interface of a policy: a batched, stateless function from observations to actions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Arrays = Mapping[str, NDArray]
-"""ONNX input or output name → array whose first axis is the batch."""
+"""Name of an ONNX input or output → array whose first axis is the batch."""
 
 
 @dataclass(frozen=True, slots=True)
 class Actions:
-    """What a policy answers to a batch of k observations.
+    """Result of a policy for a batch of k observations.
 
-    actions: (k, *action shape) in the agent's own action space.
-    state: recurrent state to hand in at the next call, `state_out_<i>` under the name `state_in_<i>`; None without one.
-    dist_inputs: (k, d) float32 inputs of the action distribution, masked; None for scripts or when not asked for.
+    Attributes:
+        actions: Actions in the agent's action space, (k, *action shape).
+        state: Recurrent state for the next call, under the names `state_in_<i>`; None for policies without state.
+        dist_inputs: Masked inputs of the action distribution, (k, d) float32; None for scripts or if not requested.
     """
 
     actions: NDArray
@@ -26,7 +27,7 @@ class Actions:
 
 
 class Policy(Protocol):
-    """Anything that acts: an ONNX graph, a script, a client of a policy server."""
+    """An ONNX graph, a script, or a remote policy."""
 
     def act(
         self,
@@ -36,11 +37,16 @@ class Policy(Protocol):
         explore: bool = False,
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
-        """Act on a batch.
+        """Choose actions for a batch of k observations.
 
-        observations: `observation` or `observation.<key>`, and `action_mask` where the space has one; (k, …) each.
-        explore: sample from the action distribution instead of taking its mode.
-        rng: one generator per row. Row i draws from rng[i] alone, so that an answer does not depend on the batch
-            it was computed in. Required by scripts and by `explore`.
+        Args:
+            observations: Arrays (k, …) named `observation` or `observation.<key>`, and `action_mask` if the space has
+                one.
+            state: Recurrent state of the previous call; None at the start of episodes.
+            explore: Sample from the action distribution instead of taking its mode.
+            rng: One generator per row, required by scripts and by `explore`. Row i uses only rng[i], so the result does
+                not depend on the composition of the batch.
+
+        Returns:
+            The actions, and the state for the next call.
         """
-        ...

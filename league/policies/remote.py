@@ -1,16 +1,14 @@
-"""A policy that a server answers for, as matches and programs use any other: `Policy` on the client."""
+"""A policy served by a policy server, with the interface `Policy`."""
 
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from league.client.calls import Call, Document
-from league.client.client import Client
-from league.client.encoding import to_json
-from league.client.models import Model
-from league.client.questions import BatchQuestion
+from league.client import Client
+from league.client.calls import ApiCall
+from league.client.requests import BatchActionRequest, JsonObject, to_json
+from league.client.responses import Model
 from league.errors import InvalidInput
 from league.policies.policy import Actions, Arrays
 from league.refs import PolicyRef, check_slug
@@ -18,13 +16,14 @@ from league.spaces import ACTION_MASK
 
 
 class RemotePolicy:
-    """Acts as a served policy does. Connections are kept; may be called by several threads.
+    """A served policy. Keeps its connections open and is thread-safe.
 
-    base_url: of the server, `http://127.0.0.1:8000`.
-    model: `{league}`, or `{league}.{policy}` where a version has several policies.
-    version: a number or an alias; None is the champion of each moment.
-    timeout: seconds of one attempt.
-    options: what else a `Client` takes.
+    Args:
+        base_url: Base URL of the server, `http://127.0.0.1:8000`.
+        model: `LEAGUE`, or `LEAGUE.POLICY` if a version has several policies.
+        version: A number or an alias; None for the current champion.
+        timeout: Seconds allowed for one attempt.
+        options: Further arguments of `league.client.Client`.
     """
 
     def __init__(
@@ -43,22 +42,23 @@ class RemotePolicy:
         explore: bool = False,
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
-        """Act on a batch; see `Policy.act`. The inputs of the action distribution stay on the server.
+        """Choose actions for a batch; see `Policy.act`. `dist_inputs` are not transferred.
 
-        Raises the LeagueError that the server answers, InvalidInput for another refusal, or RemoteError if it cannot
-        be reached or fails.
+        Raises:
+            LeagueError: The error in the server's response.
+            RemoteError: The server is unreachable or failed.
         """
         rows = len(next(iter(observations.values())))
-        question = BatchQuestion.about(
+        request = BatchActionRequest.build(
             [_observation(observations, row) for row in range(rows)],
             self._client.encoding,
             explore=explore,
             seed=_seeds(rng, rows) if explore else None,
         )
-        # As arrays: rows of matches come and go, and numbers must stay what they are to the last bit.
+        # As arrays, which preserve every bit; state tokens do not allow changing the rows of a batch.
         given = {name: np.ascontiguousarray(array) for name, array in (state or {}).items()}
         path = f"{self._model.path}/action{self._model.query}"
-        return self._client.send(Call(path, _read, to_json(question.document | {"state": given})))
+        return self._client.send(ApiCall(path, _read, to_json(request.body | {"state": given})))
 
     def close(self) -> None:
         """Close the connections."""
@@ -67,13 +67,11 @@ class RemotePolicy:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-def _read(reply: Document, _: str) -> Actions:
+def _read(reply: JsonObject, _: str) -> Actions:
     state = {name: np.asarray(rows, np.float32) for name, rows in reply.get("state", {}).items()}
     actions = np.array(reply["actions"])
     return Actions(actions.astype(np.float32) if actions.dtype.kind == "f" else actions, state or None)
@@ -86,7 +84,7 @@ def _seeds(rng: Sequence[np.random.Generator] | None, rows: int) -> list[int]:
 
 
 def _observation(observations: Arrays, row: int) -> Any:
-    """One row as the environment gives it: a Dict's leaves go back to where their names say."""
+    """One row in the environment's format: leaves of a Dict are nested again by their names."""
     if observations.keys() == {"observation"}:
         return observations["observation"][row]
     nested: dict[str, Any] = {}

@@ -1,8 +1,8 @@
-"""Scripted baselines: contestants whose strength is known and that need no training.
+"""Scripted baselines, which need no training.
 
-`random` picks uniformly among the legal actions, `first` always takes the first one. `mirror` plays what it observes,
-and so repeats its opponent's last move in rock, paper, scissors. `one_ply` wins at once if it can, else keeps the
-opponent from doing so, else is `random`; it plays connect four and tic-tac-toe.
+`random` samples uniformly from the legal actions; `first` takes the first one. `mirror` repeats its observation, which
+is the opponent's last move in rock, paper, scissors. `one_ply` plays connect four and tic-tac-toe: it wins immediately
+if possible, else prevents the opponent's immediate win, else plays like `random`.
 """
 
 from collections.abc import Callable
@@ -32,23 +32,30 @@ from league.spaces import (
 
 
 def script(name: str, observation: Space, action: Space) -> Policy:
-    """The script `name` for an agent with these spaces.
+    """Create a scripted policy.
 
-    Raises UnknownPolicy if there is none of that name, EnvironmentMismatch if it cannot play with them.
+    Args:
+        name: Name of the script.
+        observation: Observation space of the agent.
+        action: Action space of the agent.
+
+    Raises:
+        UnknownPolicy: The script does not exist.
+        EnvironmentMismatch: The script does not support the spaces.
     """
     if name not in SCRIPTS:
-        raise UnknownPolicy(f"there is no script {name!r}; known: {', '.join(SCRIPTS)}")
+        raise UnknownPolicy(f"unknown script {name!r}; known: {', '.join(SCRIPTS)}")
     return SCRIPTS[name](observation, action)
 
 
 class Random:
-    """Uniform over the legal actions; over the whole action space where there is no mask."""
+    """Samples uniformly from the legal actions, or from the action space if there is no mask."""
 
     def __init__(self, observation: Space, action: Space) -> None:
         self._action = _playable("random", observation, action)
         self._masked = ACTION_MASK in inputs(observation)
         if isinstance(action, Box) and not all(np.isfinite(bound).all() for bound in bounds(action)):
-            raise EnvironmentMismatch(f"script:random cannot play with actions that have no bounds: {action!r}")
+            raise EnvironmentMismatch(f"script:random does not support unbounded actions: {action!r}")
 
     def act(
         self,
@@ -58,7 +65,7 @@ class Random:
         explore: bool = False,  # noqa: ARG002
         rng: Generators | None = None,
     ) -> Actions:
-        """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
+        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
         if self._masked:
             masks = _masks(observations[ACTION_MASK], self._action)
             uniform = draw(rng, len(masks[0]), (len(masks),) if self._action.shape else ()).reshape(-1, len(masks))
@@ -69,8 +76,7 @@ class Random:
 
 
 class First:
-    """Always the first legal action: the least integer, the lowest number, or what is nearest to 0 where a number has
-    no lower bound."""
+    """Takes the first legal action: the smallest integer, the lower bound, or without one the value closest to 0."""
 
     def __init__(self, observation: Space, action: Space) -> None:
         self._action = _playable("first", observation, action)
@@ -84,7 +90,7 @@ class First:
         explore: bool = False,  # noqa: ARG002
         rng: Generators | None = None,  # noqa: ARG002
     ) -> Actions:
-        """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
+        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
         if self._masked:
             masks = _masks(observations[ACTION_MASK], self._action)
             return Actions(_raw_to_environment([(mask != 0).argmax(axis=1) for mask in masks], self._action))
@@ -93,16 +99,14 @@ class First:
 
 
 class Mirror:
-    """Plays what it observes: where an observation is one of n actions, or the value behind them for none as yet.
+    """Repeats its observation: one of n actions, or n if there is none yet, for which it takes the first action.
 
-    In PettingZoo's rock, paper, scissors that is the opponent's last move. Where there is none, the first action.
+    In PettingZoo's rock, paper, scissors the observation is the opponent's last move.
     """
 
     def __init__(self, observation: Space, action: Space) -> None:
         if not (isinstance(observation, Discrete) and isinstance(action, Discrete) and observation.n == action.n + 1):
-            raise EnvironmentMismatch(
-                "script:mirror plays where an observation is an action or none: Discrete(n + 1) for actions Discrete(n)"
-            )
+            raise EnvironmentMismatch("script:mirror requires observations Discrete(n + 1) for actions Discrete(n)")
         self._observation, self._action = observation, action
 
     def act(
@@ -113,16 +117,16 @@ class Mirror:
         explore: bool = False,  # noqa: ARG002
         rng: Generators | None = None,  # noqa: ARG002
     ) -> Actions:
-        """Act on a batch; see `Policy.act`."""
+        """Choose actions for a batch; see `Policy.act`."""
         seen = observations[OBSERVATION] - self._observation.start
         return Actions(to_environment(np.where(seen < self._action.n, seen, 0), self._action))
 
 
 @dataclass(frozen=True, slots=True)
 class LineGame:
-    """A game that is won by `length` squares in a line. Observed are two planes: own squares, the opponent's.
+    """A game won by `length` squares in a line. Observations have two planes: own and opponent's squares.
 
-    With `gravity` an action is a column, whose lowest empty square it takes (row 0 is the top); else it is a
+    With `gravity` an action is a column, whose lowest empty square is taken (row 0 is the top); otherwise it is a
     square, numbered row by row.
     """
 
@@ -136,7 +140,7 @@ class LineGame:
         return self.columns if self.gravity else self.rows * self.columns
 
     def lines(self) -> NDArray:
-        """Which squares each line covers: (lines, rows · columns) of 0 and 1, float32."""
+        """Return the squares of each line as 0 and 1, (lines, rows · columns) float32."""
         covered = []
         for row, column in product(range(self.rows), range(self.columns)):
             for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -149,7 +153,7 @@ class LineGame:
         return np.array(covered)
 
     def actions_on(self, squares: NDArray, empty: NDArray) -> NDArray:
-        """Which actions take one of `squares`; both (k, rows · columns) bool → (k, actions) bool."""
+        """Return which actions take one of `squares`: two (k, rows · columns) bool → (k, actions) bool."""
         if not self.gravity:
             return squares & empty
         empty = empty.reshape(-1, self.rows, self.columns)
@@ -177,7 +181,7 @@ class OnePly:
         explore: bool = False,  # noqa: ARG002
         rng: Generators | None = None,
     ) -> Actions:
-        """Act on a batch; see `Policy.act`. Raises IllegalMask if a row allows nothing."""
+        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
         boards = observations[OBSERVATION]
         legal = observations[ACTION_MASK] != 0
         planes = boards.reshape(len(boards), -1, 2).astype(np.float32)
@@ -187,11 +191,11 @@ class OnePly:
             completing = legal & self._game.actions_on(self._completing(planes[:, :, player]), empty)
             best = np.where(completing.any(axis=1, keepdims=True), completing, best)
         if not legal.any(axis=1).all():
-            raise IllegalMask(NOTHING_ALLOWED)
+            raise IllegalMask(NO_LEGAL_ACTION)
         return Actions(choose(best, draw(rng, len(best))))
 
     def _completing(self, own: NDArray) -> NDArray:
-        """The squares of lines of which `own` (k, squares) lacks one: an empty one completes its line."""
+        """Return the squares of all lines in which one square is missing in `own`, (k, squares)."""
         almost = own @ self._lines.T == self._game.length - 1
         return almost.astype(np.float32) @ self._lines > 0
 
@@ -202,23 +206,23 @@ SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {
     "first": First,
     "mirror": Mirror,
 }
-NOTHING_ALLOWED = "action_mask allows no action: expected at least one 1"
+NO_LEGAL_ACTION = "action_mask allows no action: expected at least one 1"
 
 
 def _playable(name: str, observation: Space, action: Space) -> Leaf:
-    """The action space, if it is one, and its mask fits where there is one."""
+    """Return the action space if the script supports it and its mask, if there is one."""
     if isinstance(action, DictSpace):
-        raise EnvironmentMismatch(f"script:{name} cannot play with {action.type} actions")
+        raise EnvironmentMismatch(f"script:{name} does not support {action.type} actions")
     mask = inputs(observation).get(ACTION_MASK)
     if mask is not None and mask.shape != (_values(action),):
         raise EnvironmentMismatch(
-            f"script:{name} cannot play with a mask of shape {list(mask.shape)} for actions {action!r}"
+            f"script:{name} does not support a mask of shape {list(mask.shape)} for actions {action!r}"
         )
     return action
 
 
 def _values(action: Leaf) -> int | None:
-    """How many values a mask has for an action space; None where it can have none."""
+    """Size of the mask of an action space; None if it cannot be masked."""
     match action:
         case Discrete(n=n):
             return n
@@ -228,10 +232,10 @@ def _values(action: Leaf) -> int | None:
 
 
 def _masks(mask: NDArray, action: Leaf) -> list[NDArray]:
-    """The mask (k, n) of each element of the action. Raises IllegalMask if one allows nothing."""
+    """The mask (k, n) of each element of the action. Raises IllegalMask if one allows no action."""
     masks = elements(mask, action) if isinstance(action, MultiDiscrete) else [mask]
     if not all(part.any(axis=1).all() for part in masks):
-        raise IllegalMask(NOTHING_ALLOWED)
+        raise IllegalMask(NO_LEGAL_ACTION)
     return masks
 
 
@@ -260,11 +264,11 @@ def _line_game(observation: Space, action: Space) -> LineGame:
         fits = OBSERVATION in leaves and leaves[OBSERVATION].shape == (game.rows, game.columns, 2)
         if fits and ACTION_MASK in leaves and action == Discrete(n=game.actions):
             return game
-    raise EnvironmentMismatch("script:one_ply plays connect four and tic-tac-toe only, and has other spaces here")
+    raise EnvironmentMismatch("script:one_ply supports only the spaces of connect four and tic-tac-toe")
 
 
 def _spread(uniform: NDArray, space: Leaf) -> NDArray:
-    """Uniform numbers in [0, 1) over a space: (k, *shape) in its dtype."""
+    """Map uniform numbers in [0, 1) to a space, (k, *shape) in its dtype."""
     match space:
         case Discrete():
             values = space.start + np.floor(uniform * space.n)

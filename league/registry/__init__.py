@@ -1,1 +1,1 @@
-"""What is kept: leagues, checkpoint versions, aliases, promotions and what replicas serve."""
+"""The registry: leagues, checkpoint versions, aliases, verdicts, evaluations and training runs."""

@@ -1,28 +1,30 @@
-"""Aliases move by compare-and-set, and each movement leaves an event. Events form a stack for rollback:
+"""Aliases are set by compare-and-set, and each change is an event. Events form a stack for rollback:
 
     set 1            set 2            set 3           rollback          rollback        set 4
     version 1   ←    version 2   ←    version 3       version 2         version 1       version 4
                                                       (beneath: 1)      (beneath: –)    (beneath: 1)
 
-`beneath` is the event that a rollback returns to. A set lies on the event before it; a rollback lies where
-the event that it returned to did, so that rolling back twice goes two versions back.
+`beneath` is the event that a rollback returns to. A set lies on the previous event. A rollback takes over the
+`beneath` of the event that it returns to, so two rollbacks go two versions back.
 """
 
 from datetime import UTC, datetime
 from enum import Enum
-from typing import Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from league.errors import AliasMoved, NothingToRollBack
-from league.refs import check_alias
-from league.registry import leagues, rows, verdicts, versions
-from league.registry.tables import Alias, AliasEvent
+from league.refs import CHAMPION, check_alias
+from league.registry import leagues, verdicts, versions
+from league.registry.storage.database import Repository
+from league.registry.storage.idempotency import IdempotentCall, apply_once
+from league.registry.storage.rows import AliasEvent, detached
+from league.registry.storage.tables import AliasEventTable, AliasTable
 
 
 class AnyVersion(Enum):
-    """`ANY` as the expected version: set the alias wherever it points."""
+    """`ANY` as the expected version: set the alias unconditionally."""
 
     ANY = "any"
 
@@ -30,38 +32,103 @@ class AnyVersion(Enum):
 ANY = AnyVersion.ANY
 
 
+class AliasRepository(Repository):
+    """Sets, rolls back and reads aliases."""
+
+    def current(self, league: str) -> dict[str, int]:
+        """Return alias → version. Raises UnknownLeague."""
+        with self._database.read() as session:
+            return current(session, league)
+
+    def all(self) -> dict[tuple[str, str], int]:
+        """Return (league, alias) → version of all leagues, by one cheap query."""
+        with self._database.read() as session:
+            found = session.execute(select(AliasTable.league, AliasTable.name, AliasTable.version))
+            return {(league, name): version for league, name, version in found}
+
+    def set(
+        self,
+        league: str,
+        alias: str,
+        version: int,
+        *,
+        expected: int | AnyVersion | None,
+        actor: str,
+        reason: str,
+        verdict: str | None = None,
+        call: IdempotentCall | None = None,
+    ) -> AliasEvent:
+        """Point `alias` at `version` if it points at `expected` (None: if it is not set; ANY: always).
+
+        Returns the event in force. A repeated `call` changes nothing and returns its event. An alias already
+        at `version` keeps its event, because a rollback must lead to another version.
+        Raises UnknownLeague, UnknownVersion, KeyReused, Conflict if `verdict` is closed, or AliasMoved if the alias
+        points elsewhere.
+        """
+        check_alias(alias)
+        with self._database.write() as session:
+            leagues.lock(session, league)
+
+            def change() -> AliasEvent:
+                return _set(session, league, alias, version, expected, actor=actor, reason=reason, verdict=verdict)
+
+            return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
+
+    def rollback(self, league: str, *, actor: str, reason: str, call: IdempotentCall | None = None) -> AliasEvent:
+        """Return the champion to the version before it. A repeated `call` changes nothing and returns its event.
+
+        Raises UnknownLeague, NothingToRollBack or KeyReused.
+        """
+        with self._database.write() as session:
+            leagues.lock(session, league)
+
+            def change() -> AliasEvent:
+                return _roll_back(session, league, CHAMPION, actor=actor, reason=reason)
+
+            return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
+
+    def history(
+        self,
+        league: str,
+        alias: str = CHAMPION,
+        at: datetime | None = None,
+        *,
+        before: int | None = None,
+        limit: int | None = None,
+    ) -> list[AliasEvent]:
+        """Return the events of an alias, newest first. Raises UnknownLeague.
+
+        at: return only the event in force at this time. before: return only events older than the event with this id.
+        """
+        table = AliasEventTable
+        query = select(table).filter_by(league=league, alias=alias).order_by(table.id.desc()).limit(limit)
+        if before is not None:
+            query = query.where(table.id < before)
+        if at is not None:
+            query = query.where(table.at <= at).limit(1)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return [_row(event) for event in session.scalars(query)]
+
+
 def current(session: Session, league: str) -> dict[str, int]:
-    """alias → version. Raises UnknownLeague."""
+    """Return alias → version. Raises UnknownLeague."""
     leagues.require(session, league)
-    found = session.scalars(select(Alias).filter_by(league=league).order_by(Alias.name))
+    found = session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name))
     return {alias.name: alias.version for alias in found}
 
 
-def every(session: Session) -> dict[tuple[str, str], int]:
-    """(league, alias) → version, of all leagues, by one query."""
-    found = session.execute(select(Alias.league, Alias.name, Alias.version))
-    return {(league, name): version for league, name, version in found}
-
-
-def move(
+def _set(
     session: Session,
     league: str,
     alias: str,
     version: int,
-    *,
     expected: int | AnyVersion | None,
+    *,
     actor: str,
     reason: str,
     verdict: str | None,
-) -> rows.AliasEvent:
-    """Point `alias` at `version` if it points at `expected` (None: if there is no such alias).
-
-    Returns the event in force: an alias that is there already is left alone, for a rollback
-    must lead elsewhere.
-    Raises UnknownLeague, UnknownVersion, AliasMoved if it points elsewhere, and Conflict if `verdict` is closed.
-    """
-    check_alias(alias)
-    leagues.lock(session, league)
+) -> AliasEvent:
     if verdict is not None:
         verdicts.require_open(session, verdict)
     versions.require(session, league, version)
@@ -72,8 +139,8 @@ def move(
         wanted = f"{league}@{expected}" if expected else "not set"
         raise AliasMoved(f"alias {alias} of league {league} {now}, expected {wanted}: nothing was changed")
     if last and last.version == version:
-        return row(last)
-    event = AliasEvent(
+        return _row(last)
+    event = AliasEventTable(
         kind="set",
         version=version,
         beneath=last.id if last else None,
@@ -84,15 +151,13 @@ def move(
     return _record(session, league, alias, last, event)
 
 
-def roll_back(session: Session, league: str, alias: str, *, actor: str, reason: str) -> rows.AliasEvent:
-    """Return `alias` to where it was before its version came. Raises UnknownLeague or NothingToRollBack."""
-    leagues.lock(session, league)
+def _roll_back(session: Session, league: str, alias: str, *, actor: str, reason: str) -> AliasEvent:
     last = _in_force(session, league, alias)
-    beneath = session.get(AliasEvent, last.beneath) if last and last.beneath else None
+    beneath = session.get(AliasEventTable, last.beneath) if last and last.beneath else None
     if beneath is None:
         was = f"has had no version before {league}@{last.version}" if last else "was never set"
         raise NothingToRollBack(f"alias {alias} of league {league} {was}")
-    event = AliasEvent(
+    event = AliasEventTable(
         kind="rollback",
         version=beneath.version,
         beneath=beneath.beneath,
@@ -103,50 +168,27 @@ def roll_back(session: Session, league: str, alias: str, *, actor: str, reason: 
     return _record(session, league, alias, last, event)
 
 
-def history(
-    session: Session, league: str, alias: str, at: datetime | None, before: int | None, limit: int | None
-) -> list[rows.AliasEvent]:
-    """The events of an alias, newest first; with `at`, only the one in force then. Raises UnknownLeague.
-
-    before: those older than the event of this id. limit: so many at most.
-    """
-    leagues.require(session, league)
-    query = select(AliasEvent).filter_by(league=league, alias=alias).order_by(AliasEvent.id.desc()).limit(limit)
-    if before is not None:
-        query = query.where(AliasEvent.id < before)
-    if at is not None:
-        query = query.where(AliasEvent.at <= at).limit(1)
-    return [row(event) for event in session.scalars(query)]
+def _in_force(session: Session, league: str, alias: str) -> AliasEventTable | None:
+    query = select(AliasEventTable).join(AliasTable, AliasTable.event == AliasEventTable.id)
+    return session.scalar(query.where(AliasTable.league == league, AliasTable.name == alias))
 
 
-def _in_force(session: Session, league: str, alias: str) -> AliasEvent | None:
-    query = select(AliasEvent).join(Alias, Alias.event == AliasEvent.id)
-    return session.scalar(query.where(Alias.league == league, Alias.name == alias))
-
-
-def _record(session: Session, league: str, alias: str, last: AliasEvent | None, event: AliasEvent) -> rows.AliasEvent:
+def _record(
+    session: Session, league: str, alias: str, last: AliasEventTable | None, event: AliasEventTable
+) -> AliasEvent:
     event.league, event.alias = league, alias
     event.previous = last.version if last else None
-    # Clocks of machines differ; events are ordered by their ids, which their times must not contradict.
+    # Clocks of machines differ. Events are ordered by id, and their times must not contradict that order.
     event.at = max(datetime.now(UTC), last.at) if last else datetime.now(UTC)
     session.add(event)
     session.flush()
-    session.merge(Alias(league=league, name=alias, version=event.version, event=event.id))
-    return row(event)
+    session.merge(AliasTable(league=league, name=alias, version=event.version, event=event.id))
+    return _row(event)
 
 
-def row(event: AliasEvent) -> rows.AliasEvent:
-    """An event as the registry answers it."""
-    kind: Literal["set", "rollback"] = "rollback" if event.kind == "rollback" else "set"
-    return rows.AliasEvent(
-        id=event.id,
-        league=event.league,
-        alias=event.alias,
-        kind=kind,
-        version=event.version,
-        previous=event.previous,
-        actor=event.actor,
-        reason=event.reason,
-        verdict=event.verdict,
-        at=event.at,
-    )
+def _load(session: Session, event: int) -> AliasEvent:
+    return _row(session.get_one(AliasEventTable, event))
+
+
+def _row(event: AliasEventTable) -> AliasEvent:
+    return detached(AliasEvent, event)

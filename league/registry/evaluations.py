@@ -1,10 +1,10 @@
-"""Evaluations that are asked of the service: who may play one, how far it is, and how it ended.
+"""The queue of evaluations that clients request.
 
     queued → running → done | failed | stopped
 
-A runner, a process that plays, claims one and says again and again that it lives. One that falls silent, or that its
-studio has seen die, loses its claim, and another goes on where the ledger is. Stopping is a request: it ends what is
-queued at once, and what runs as soon as its runner has seen it.
+A runner (a process that plays evaluations) claims an evaluation and sends heartbeats. If they stop, or the service sees
+the runner die, the claim is released and another runner resumes from the ledger. Stopping is a request: a queued
+evaluation ends immediately, a running one as soon as its runner notices.
 """
 
 from datetime import UTC, datetime, timedelta
@@ -14,44 +14,163 @@ from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session
 
 from league.errors import TooManyEvaluations, UnknownEvaluation
-from league.registry import leagues, rows
-from league.registry.rows import EvaluationRow
-from league.registry.tables import Evaluation
+from league.registry import leagues
+from league.registry.storage.database import Repository
+from league.registry.storage.idempotency import IdempotentCall, apply_once
+from league.registry.storage.rows import EvaluationRow, EvaluationState, detached
+from league.registry.storage.tables import EvaluationTable
 
 QUEUED, RUNNING, DONE, FAILED, STOPPED = "queued", "running", "done", "failed", "stopped"
-SILENT = timedelta(seconds=15)
-"""A runner that has said nothing for longer has died."""
-ATTEMPTS = 5
-"""Runners that may die one after another without getting on: then it is the evaluation that kills them."""
+HEARTBEAT_TIMEOUT = timedelta(seconds=15)
+"""A runner without a heartbeat for longer is considered dead."""
+MAX_ATTEMPTS = 5
+"""Consecutive runners that may die without progress before the evaluation fails."""
 GIVEN_UP = {
     "code": "worker_lost",
-    "message": f"{ATTEMPTS} processes that played this died, one after another, without getting on",
+    "message": f"{MAX_ATTEMPTS} worker processes died one after another without making progress",
 }
 
 
-def ask(
+class EvaluationRepository(Repository):
+    """Queues, claims, updates and reads evaluations."""
+
+    def submit(
+        self,
+        league: str,
+        request: dict[str, Any],
+        *,
+        actor: str,
+        key: str | None = None,
+        reason: str | None = None,
+        max_active: int,
+        call: IdempotentCall | None = None,
+    ) -> EvaluationRow:
+        """Queue an evaluation. A repeated `call` queues nothing and returns its evaluation in its current state.
+
+        key: the id of the client's API key. max_active: the limit of queued and running evaluations in all leagues;
+        two concurrent submissions for different leagues may exceed it by one.
+        Raises UnknownLeague, TooManyEvaluations or KeyReused.
+        """
+        with self._database.write() as session:
+            leagues.lock(session, league)
+            return apply_once(
+                session,
+                call,
+                "evaluation",
+                change=lambda: _submit(
+                    session, league, request, actor=actor, key=key, reason=reason, max_active=max_active
+                ),
+                load=lambda number: _row(session.get_one(EvaluationTable, number)),
+            )
+
+    def get(self, league: str, number: int) -> EvaluationRow:
+        """Return one evaluation. Raises UnknownLeague or UnknownEvaluation."""
+        with self._database.read() as session:
+            return _row(_of_league(session, league, number))
+
+    def newest(self, league: str, *, before: int | None = None, limit: int = 20) -> list[EvaluationRow]:
+        """Return at most `limit` evaluations of a league, newest first. Raises UnknownLeague.
+
+        before: return only evaluations with a lower number.
+        """
+        query = select(EvaluationTable).filter_by(league=league).order_by(EvaluationTable.id.desc()).limit(limit)
+        if before is not None:
+            query = query.where(EvaluationTable.id < before)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return [_row(evaluation) for evaluation in session.scalars(query)]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return league → state → number of queued and running evaluations, of the leagues that have any."""
+        table = EvaluationTable
+        query = select(table.league, table.state, func.count()).where(table.state.in_((QUEUED, RUNNING)))
+        found: dict[str, dict[str, int]] = {}
+        with self._database.read() as session:
+            for league, state, count in session.execute(query.group_by(table.league, table.state)):
+                found.setdefault(league, {})[state] = count
+        return found
+
+    def stop(self, league: str, number: int, *, actor: str) -> EvaluationRow:
+        """Request the end of an evaluation; an ended one is unchanged. Raises UnknownLeague or UnknownEvaluation."""
+        with self._database.write() as session:
+            evaluation = _of_league(session, league, number, lock=True)
+            if evaluation.state in (QUEUED, RUNNING) and evaluation.stop_at is None:
+                evaluation.stop_at, evaluation.stopped_by = datetime.now(UTC), actor
+                if evaluation.state == QUEUED:
+                    _end(evaluation, STOPPED)
+            return _row(evaluation)
+
+    def claim(self, runner: str, workers: int) -> EvaluationRow | None:
+        """Assign the oldest evaluation that is queued, or whose runner is dead, to `runner`; None if there is none."""
+        with self._database.read() as session:
+            if session.scalar(select(EvaluationTable.id).where(_is_free()).limit(1)) is None:
+                return None
+        with self._database.write() as session:
+            return _claim(session, runner, workers)
+
+    def heartbeat(self, number: int, runner: str, progress: dict[str, Any] | None = None) -> EvaluationRow:
+        """Record a heartbeat of a runner and its progress.
+
+        Returns the evaluation, which shows whether it is still assigned to `runner`.
+        """
+        with self._database.write() as session:
+            evaluation = session.get_one(EvaluationTable, number, with_for_update=True)
+            if _is_held(evaluation, runner):
+                evaluation.heartbeat_at = datetime.now(UTC)
+                if progress is not None and progress != evaluation.progress:
+                    evaluation.progress, evaluation.attempts = progress, 0
+            return _row(evaluation)
+
+    def finish(
+        self,
+        number: int,
+        runner: str,
+        state: EvaluationState,
+        *,
+        progress: dict[str, Any] | None = None,
+        result: dict[str, Any] | None = None,
+        error: dict[str, str] | None = None,
+    ) -> None:
+        """Record how an evaluation ended, unless another runner has claimed it."""
+        with self._database.write() as session:
+            evaluation = session.get_one(EvaluationTable, number, with_for_update=True)
+            if _is_held(evaluation, runner):
+                evaluation.progress, evaluation.result = progress or evaluation.progress, result
+                _end(evaluation, state, error)
+
+    def release(self, number: int, runner: str) -> None:
+        """Queue an unfinished evaluation again because its runner is gone, unless it was to be stopped."""
+        with self._database.write() as session:
+            evaluation = session.get_one(EvaluationTable, number, with_for_update=True)
+            if _is_held(evaluation, runner) and not _ends_here(evaluation):
+                evaluation.state = QUEUED
+
+
+def active(session: Session, league: str) -> tuple[EvaluationRow, ...]:
+    """Return the queued and running evaluations of a league, oldest first."""
+    table = EvaluationTable
+    query = select(table).where(table.state.in_((QUEUED, RUNNING)), table.league == league).order_by(table.id)
+    return tuple(_row(evaluation) for evaluation in session.scalars(query))
+
+
+def _submit(
     session: Session,
     league: str,
-    asked: dict[str, Any],
+    request: dict[str, Any],
     *,
     actor: str,
     key: str | None,
     reason: str | None,
-    most: int,
+    max_active: int,
 ) -> EvaluationRow:
-    """Queue an evaluation. Raises UnknownLeague, or TooManyEvaluations where `most` are queued or running.
-
-    Two that come at the same moment for different leagues may both be the last one.
-    """
-    leagues.lock(session, league)
-    waiting = session.scalar(select(func.count()).where(Evaluation.state.in_((QUEUED, RUNNING)))) or 0
-    if waiting >= most:
+    waiting = session.scalar(select(func.count()).where(EvaluationTable.state.in_((QUEUED, RUNNING)))) or 0
+    if waiting >= max_active:
         raise TooManyEvaluations(
-            f"{waiting} evaluations are queued or running, and {most} are the most: come back later"
+            f"{waiting} evaluations are queued or running, the limit is {max_active}: try again later"
         )
-    evaluation = Evaluation(
+    evaluation = EvaluationTable(
         league=league,
-        asked=asked,
+        request=request,
         state=QUEUED,
         actor=actor,
         key=key,
@@ -61,134 +180,55 @@ def ask(
     )
     session.add(evaluation)
     session.flush()
-    return row(evaluation)
+    return _row(evaluation)
 
 
-def one(session: Session, league: str, number: int) -> EvaluationRow:
-    """One of a league. Raises UnknownLeague or UnknownEvaluation."""
-    return row(_of_league(session, league, number))
-
-
-def newest(session: Session, league: str, before: int | None, limit: int) -> list[EvaluationRow]:
-    """Those of a league, newest first, at most `limit`, of those older than number `before`. Raises UnknownLeague."""
-    leagues.require(session, league)
-    query = select(Evaluation).filter_by(league=league).order_by(Evaluation.id.desc()).limit(limit)
-    if before is not None:
-        query = query.where(Evaluation.id < before)
-    return [row(evaluation) for evaluation in session.scalars(query)]
-
-
-def active(session: Session, league: str) -> tuple[EvaluationRow, ...]:
-    """Those of a league that are queued or running, oldest first."""
-    query = select(Evaluation).where(Evaluation.state.in_((QUEUED, RUNNING)), Evaluation.league == league)
-    return tuple(row(evaluation) for evaluation in session.scalars(query.order_by(Evaluation.id)))
-
-
-def counts(session: Session) -> dict[str, dict[str, int]]:
-    """league → how many are queued and running, of the leagues that have any."""
-    query = select(Evaluation.league, Evaluation.state, func.count()).where(Evaluation.state.in_((QUEUED, RUNNING)))
-    found: dict[str, dict[str, int]] = {}
-    for league, state, count in session.execute(query.group_by(Evaluation.league, Evaluation.state)):
-        found.setdefault(league, {})[state] = count
-    return found
-
-
-def stop(session: Session, league: str, number: int, actor: str) -> EvaluationRow:
-    """Ask for the end of one; what has ended stays as it is. Raises UnknownLeague or UnknownEvaluation."""
-    evaluation = _of_league(session, league, number, lock=True)
-    if evaluation.state in (QUEUED, RUNNING) and evaluation.stop_at is None:
-        evaluation.stop_at, evaluation.stopped_by = datetime.now(UTC), actor
-        if evaluation.state == QUEUED:
-            _end(evaluation, STOPPED)
-    return row(evaluation)
-
-
-def wait(session: Session) -> bool:
-    """Whether there is one to claim."""
-    return session.scalar(select(Evaluation.id).where(_is_free()).limit(1)) is not None
-
-
-def claim(session: Session, runner: str, workers: int) -> EvaluationRow | None:
-    """Give the oldest that waits, or whose runner has died, to `runner`; None if there is none."""
+def _claim(session: Session, runner: str, workers: int) -> EvaluationRow | None:
     now = datetime.now(UTC)
-    # One at a time: who locked all that are free would leave none to those who claim beside it.
-    query = select(Evaluation).where(_is_free()).order_by(Evaluation.id).limit(1)
+    # One row at a time: locking all free rows would leave none for concurrent claims.
+    query = select(EvaluationTable).where(_is_free()).order_by(EvaluationTable.id).limit(1)
     while (evaluation := session.scalar(query.with_for_update(skip_locked=True))) is not None:
         if not _ends_here(evaluation):
             evaluation.state, evaluation.runner, evaluation.workers = RUNNING, runner, workers
             evaluation.attempts += 1
             evaluation.started_at = evaluation.started_at or now
             evaluation.heartbeat_at = now
-            return row(evaluation)
+            return _row(evaluation)
     return None
 
 
-def beat(session: Session, number: int, runner: str, progress: dict[str, Any] | None) -> EvaluationRow:
-    """Say that `runner` lives and how far it is. What is returned tells whether it is still its runner's."""
-    evaluation = session.get_one(Evaluation, number, with_for_update=True)
-    if _is_held(evaluation, runner):
-        evaluation.heartbeat_at = datetime.now(UTC)
-        if progress is not None and progress != evaluation.progress:
-            evaluation.progress, evaluation.attempts = progress, 0
-    return row(evaluation)
-
-
-def finish(
-    session: Session,
-    number: int,
-    runner: str,
-    state: rows.EvaluationState,
-    *,
-    progress: dict[str, Any] | None,
-    result: dict[str, Any] | None,
-    error: dict[str, str] | None,
-) -> None:
-    """Record how it ended, unless another runner has it by now."""
-    evaluation = session.get_one(Evaluation, number, with_for_update=True)
-    if _is_held(evaluation, runner):
-        evaluation.progress, evaluation.result = progress or evaluation.progress, result
-        _end(evaluation, state, error)
-
-
-def release(session: Session, number: int, runner: str) -> None:
-    """`runner` is gone: what it has not brought to an end waits for another, unless it was to be stopped."""
-    evaluation = session.get_one(Evaluation, number, with_for_update=True)
-    if _is_held(evaluation, runner) and not _ends_here(evaluation):
-        evaluation.state = QUEUED
-
-
-def row(evaluation: Evaluation) -> EvaluationRow:
-    """An evaluation as the registry answers it."""
-    return EvaluationRow(**{name: getattr(evaluation, name) for name in EvaluationRow.__slots__})
-
-
-def _of_league(session: Session, league: str, number: int, lock: bool = False) -> Evaluation:
+def _of_league(session: Session, league: str, number: int, lock: bool = False) -> EvaluationTable:
     leagues.require(session, league)
-    evaluation = session.get(Evaluation, number, with_for_update=lock or None)
+    evaluation = session.get(EvaluationTable, number, with_for_update=lock or None)
     if evaluation is None or evaluation.league != league:
         raise UnknownEvaluation(f"league {league} has no evaluation {number}")
     return evaluation
 
 
 def _is_free() -> ColumnElement[bool]:
-    is_left = (Evaluation.state == RUNNING) & (Evaluation.heartbeat_at < datetime.now(UTC) - SILENT)
-    return or_(Evaluation.state == QUEUED, is_left)
+    oldest = datetime.now(UTC) - HEARTBEAT_TIMEOUT
+    is_orphaned = (EvaluationTable.state == RUNNING) & (EvaluationTable.heartbeat_at < oldest)
+    return or_(EvaluationTable.state == QUEUED, is_orphaned)
 
 
-def _is_held(evaluation: Evaluation, runner: str) -> bool:
+def _is_held(evaluation: EvaluationTable, runner: str) -> bool:
     return evaluation.state == RUNNING and evaluation.runner == runner
 
 
-def _ends_here(evaluation: Evaluation) -> bool:
-    """End one that no runner holds, if it is to go no further."""
+def _ends_here(evaluation: EvaluationTable) -> bool:
+    """End an evaluation without a runner that was stopped or has used all attempts; returns whether it ended."""
     if evaluation.stop_at is not None:
         _end(evaluation, STOPPED)
-    elif evaluation.attempts >= ATTEMPTS:
+    elif evaluation.attempts >= MAX_ATTEMPTS:
         _end(evaluation, FAILED, GIVEN_UP)
     else:
         return False
     return True
 
 
-def _end(evaluation: Evaluation, state: str, error: dict[str, str] | None = None) -> None:
+def _end(evaluation: EvaluationTable, state: str, error: dict[str, str] | None = None) -> None:
     evaluation.state, evaluation.error, evaluation.ended_at = state, error, datetime.now(UTC)
+
+
+def _row(evaluation: EvaluationTable) -> EvaluationRow:
+    return detached(EvaluationRow, evaluation)

@@ -1,10 +1,10 @@
-"""API keys: who may call a server, for what, until when and how often.
+"""API keys: scopes, leagues, expiry and rate limit of each client.
 
     plk_1f3a9c2e_5d0c…    plk_, the key's id, and 256 random bits in hexadecimal
 
-Only the SHA-256 of a key is kept, so that whoever reads the database learns no key. A slow, salted hash is for
-passwords, which can be guessed; 256 random bits cannot, so a fast hash is as safe and lets each request be checked.
-The row of a key is never removed, nor its name used again: history names keys as actors.
+Only the SHA-256 of a key is stored, so that reading the database reveals no key. A slow, salted hash is for passwords,
+which can be guessed; 256 random bits cannot, so a fast hash is as safe and lets each request be checked. Rows of keys
+are never deleted and names are never reused, because audit records name keys as actors.
 """
 
 import hashlib
@@ -13,77 +13,82 @@ from collections.abc import Collection
 from datetime import UTC, datetime
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput, NameTaken, UnknownKey
 from league.refs import check_slug
-from league.registry import leagues, rows
-from league.registry.database import insert
-from league.registry.tables import ApiKey
+from league.registry import leagues
+from league.registry.storage.database import Repository, insert
+from league.registry.storage.rows import KeyRow, detached
+from league.registry.storage.tables import ApiKeyTable
 
 PREFIX = "plk"
 SCOPES = ("act", "read", "evaluate", "promote")
-"""What a key may be for: asking for actions, reading what is served, having games played, changing what is served."""
+"""What a key permits: inference, reading, starting evaluations and games, changing what is served."""
 TOKEN_LENGTH = len(PREFIX) + 1 + 8 + 1 + 64
 
 
+class KeyRepository(Repository):
+    """Creates, lists and revokes API keys."""
+
+    def create(
+        self,
+        name: str,
+        scopes: Collection[str],
+        *,
+        only_leagues: Collection[str] = (),
+        expires_at: datetime | None = None,
+        rate: float | None = None,
+    ) -> tuple[KeyRow, str]:
+        """Create an API key; returns it with its text, which is not stored.
+
+        scopes: a subset of `SCOPES`. only_leagues: leagues that the key is valid for, all if empty. rate: requests per
+        second, unlimited if None. Raises InvalidReference, InvalidInput, UnknownLeague or NameTaken.
+        """
+        check_slug("key", name)
+        _check(scopes, rate)
+        id_ = secrets.token_hex(4)
+        token = f"{PREFIX}_{id_}_{secrets.token_hex(32)}"
+        values = {
+            "id": id_,
+            "name": name,
+            "sha256": digest(token.encode()),
+            "scopes": [scope for scope in SCOPES if scope in scopes],
+            "leagues": sorted(set(only_leagues)) or None,
+            "rate": rate,
+            "created_at": datetime.now(UTC),
+            "expires_at": expires_at,
+            "revoked_at": None,
+        }
+        with self._database.write() as session:
+            for league in only_leagues:
+                leagues.require(session, league)
+            if not insert(session, ApiKeyTable, [values]):
+                raise NameTaken(f"a key {name!r} exists or existed: names of keys are not reused")
+            return _row(session.get_one(ApiKeyTable, id_)), token
+
+    def all(self) -> list[KeyRow]:
+        """Return all API keys, revoked ones included, oldest first."""
+        query = select(ApiKeyTable).order_by(ApiKeyTable.created_at, ApiKeyTable.id)
+        with self._database.read() as session:
+            return [_row(key) for key in session.scalars(query)]
+
+    def revoke(self, name: str) -> KeyRow:
+        """Revoke an API key by its name or id. Idempotent. Raises UnknownKey, which lists the names."""
+        query = select(ApiKeyTable).where((ApiKeyTable.name == name) | (ApiKeyTable.id == name)).with_for_update()
+        with self._database.write() as session:
+            # A name takes precedence over an equal id of another key.
+            found = sorted(session.scalars(query), key=lambda key: key.name != name)
+            if not found:
+                known = ", ".join(session.scalars(select(ApiKeyTable.name).order_by(ApiKeyTable.name))) or "none yet"
+                raise UnknownKey(f"there is no key {name!r}; known: {known}")
+            key = found[0]
+            key.revoked_at = key.revoked_at or datetime.now(UTC)
+            return _row(key)
+
+
 def digest(token: bytes) -> str:
-    """What is kept of a key's text."""
+    """Return the digest of a key's text, as it is stored."""
     return hashlib.sha256(token).hexdigest()
-
-
-def create(
-    session: Session,
-    name: str,
-    scopes: Collection[str],
-    *,
-    only_leagues: Collection[str] = (),
-    expires_at: datetime | None = None,
-    rate: float | None = None,
-) -> tuple[rows.KeyRow, str]:
-    """Make a key; returns it with its text, which cannot be had again.
-
-    only_leagues: those that it is for, all if empty. rate: requests per second, unbounded if None.
-    Raises InvalidReference, InvalidInput, UnknownLeague or NameTaken.
-    """
-    check_slug("key", name)
-    _check(scopes, rate)
-    for league in only_leagues:
-        leagues.require(session, league)
-    id_ = secrets.token_hex(4)
-    token = f"{PREFIX}_{id_}_{secrets.token_hex(32)}"
-    values = {
-        "id": id_,
-        "name": name,
-        "sha256": digest(token.encode()),
-        "scopes": [scope for scope in SCOPES if scope in scopes],
-        "leagues": sorted(set(only_leagues)) or None,
-        "rate": rate,
-        "created_at": datetime.now(UTC),
-        "expires_at": expires_at,
-        "revoked_at": None,
-    }
-    if not insert(session, ApiKey, [values]):
-        raise NameTaken(f"there is or was a key {name!r} already: names are not used again, for history tells by them")
-    return _row(session.get_one(ApiKey, id_)), token
-
-
-def every(session: Session) -> list[rows.KeyRow]:
-    """All keys that ever were, in the order in which they were made."""
-    return [_row(key) for key in session.scalars(select(ApiKey).order_by(ApiKey.created_at, ApiKey.id))]
-
-
-def revoke(session: Session, name: str) -> rows.KeyRow:
-    """Make a key void; twice is once. `name` may be its id. Raises UnknownKey, which lists the names."""
-    query = select(ApiKey).where((ApiKey.name == name) | (ApiKey.id == name)).with_for_update()
-    # A name that looks like another's id is still that name.
-    found = sorted(session.scalars(query), key=lambda key: key.name != name)
-    if not found:
-        known = ", ".join(session.scalars(select(ApiKey.name).order_by(ApiKey.name))) or "none yet"
-        raise UnknownKey(f"there is no key {name!r}; known: {known}")
-    key = found[0]
-    key.revoked_at = key.revoked_at or datetime.now(UTC)
-    return _row(key)
 
 
 def _check(scopes: Collection[str], rate: float | None) -> None:
@@ -95,15 +100,6 @@ def _check(scopes: Collection[str], rate: float | None) -> None:
         raise InvalidInput(f"rate {rate} must be a positive number of requests per second")
 
 
-def _row(key: ApiKey) -> rows.KeyRow:
-    return rows.KeyRow(
-        id=key.id,
-        name=key.name,
-        sha256=key.sha256,
-        scopes=frozenset(key.scopes),
-        leagues=None if key.leagues is None else frozenset(key.leagues),
-        rate=key.rate,
-        created_at=key.created_at,
-        expires_at=key.expires_at,
-        revoked_at=key.revoked_at,
-    )
+def _row(key: ApiKeyTable) -> KeyRow:
+    only = None if key.leagues is None else frozenset(key.leagues)
+    return detached(KeyRow, key, scopes=frozenset(key.scopes), leagues=only)

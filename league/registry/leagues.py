@@ -1,79 +1,85 @@
-"""Registered leagues. The row of a league is the lock that orders all changes below it."""
+"""Registered leagues. The row of a league is the lock that serialises all changes to the league."""
 
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from league.config import LeagueConfig
 from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface
-from league.registry.database import insert
-from league.registry.rows import LeagueRow
-from league.registry.tables import READY, League, Version
+from league.registry.storage.database import Repository, insert
+from league.registry.storage.rows import LeagueRow, detached
+from league.registry.storage.tables import READY, LeagueTable, VersionTable
+
+if TYPE_CHECKING:
+    from league.config import LeagueConfig
 
 
-def register(session: Session, config: LeagueConfig, interface: Interface) -> None:
-    """Insert a league or renew its configuration. Raises InterfaceChanged if versions have another."""
-    values = {
-        "config": config.model_dump(mode="json", by_alias=True),
-        "interface": interface.model_dump(mode="json"),
-        "interface_digest": interface.digest(),
-        "environment_digest": config.environment.digest(),
-    }
-    first = {"slug": config.league, "last_version": 0, "registered_at": datetime.now(UTC)}
-    if insert(session, League, [first | values]):
-        return
-    known = lock(session, config.league)
-    if known.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
-        raise InterfaceChanged(
-            f"league {config.league} has versions with other spaces or policies than this configuration: "
-            "keep them, or give the new league a name of its own"
-        )
-    for name, value in values.items():
-        setattr(known, name, value)
+class LeagueRepository(Repository):
+    """Registers and reads leagues."""
+
+    def register(self, config: "LeagueConfig", interface: Interface) -> None:
+        """Add a league or update its configuration.
+
+        Raises InterfaceChanged if published versions have another interface.
+        """
+        values = {
+            "config": config.model_dump(mode="json", by_alias=True),
+            "interface": interface.model_dump(mode="json"),
+            "interface_digest": interface.digest(),
+            "environment_digest": config.environment.digest(),
+        }
+        first = {"slug": config.league, "last_version": 0, "registered_at": datetime.now(UTC)}
+        with self._database.write() as session:
+            if insert(session, LeagueTable, [first | values]):
+                return
+            known = lock(session, config.league)
+            if known.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
+                raise InterfaceChanged(
+                    f"league {config.league} has versions with other spaces or policies than this configuration: "
+                    "keep them, or register the configuration under a new league name"
+                )
+            for name, value in values.items():
+                setattr(known, name, value)
+
+    def get(self, league: str) -> LeagueRow:
+        """Return one league. Raises UnknownLeague."""
+        with self._database.read() as session:
+            return _row(session.get(LeagueTable, league) or _unknown(session, league))
+
+    def all(self) -> list[LeagueRow]:
+        """Return all leagues, sorted by name."""
+        with self._database.read() as session:
+            return [_row(league) for league in session.scalars(select(LeagueTable).order_by(LeagueTable.slug))]
 
 
-def get(session: Session, slug: str) -> LeagueRow:
-    """One league. Raises UnknownLeague, which lists the known ones."""
-    return _row(session.get(League, slug) or _unknown(session, slug))
+def require(session: Session, league: str) -> None:
+    """Raise UnknownLeague, which lists the known leagues, unless the league is registered."""
+    if session.scalar(select(LeagueTable.slug).filter_by(slug=league)) is None:
+        _unknown(session, league)
 
 
-def every(session: Session) -> list[LeagueRow]:
-    """All leagues by name."""
-    return [_row(league) for league in session.scalars(select(League).order_by(League.slug))]
+def lock(session: Session, league: str) -> LeagueTable:
+    """Lock a league until the transaction ends. Raises UnknownLeague.
 
-
-def require(session: Session, slug: str) -> None:
-    """Raise UnknownLeague unless the league is registered."""
-    if session.scalar(select(League.slug).filter_by(slug=slug)) is None:
-        _unknown(session, slug)
-
-
-def lock(session: Session, slug: str) -> League:
-    """Hold a league until the transaction ends: nobody else changes what is below it. Raises UnknownLeague.
-
-    Rows that merely refer to it may be inserted meanwhile (key_share). On SQLite the transaction is the lock.
+    Rows that only refer to the league can still be inserted (key_share). On SQLite the transaction is the lock.
     """
-    return session.get(League, slug, with_for_update={"key_share": True}) or _unknown(session, slug)
+    return session.get(LeagueTable, league, with_for_update={"key_share": True}) or _unknown(session, league)
 
 
-def _has_versions(session: Session, slug: str) -> bool:
-    ready = select(Version.number).filter_by(league=slug, state=READY)
+def _has_versions(session: Session, league: str) -> bool:
+    ready = select(VersionTable.number).filter_by(league=league, state=READY)
     return session.scalar(ready.limit(1)) is not None
 
 
-def _unknown(session: Session, slug: str) -> League:
-    known = ", ".join(session.scalars(select(League.slug).order_by(League.slug)))
-    raise UnknownLeague(f"there is no league {slug!r}; known: {known or 'none yet'}")
+def _unknown(session: Session, league: str) -> LeagueTable:
+    known = ", ".join(session.scalars(select(LeagueTable.slug).order_by(LeagueTable.slug)))
+    raise UnknownLeague(f"there is no league {league!r}; known: {known or 'none yet'}")
 
 
-def _row(league: League) -> LeagueRow:
-    return LeagueRow(
-        slug=league.slug,
-        config=LeagueConfig.from_mapping(league.config, source=f"the registered league {league.slug}"),
-        interface=Interface.model_validate(league.interface),
-        interface_digest=league.interface_digest,
-        environment_digest=league.environment_digest,
-        registered_at=league.registered_at,
-    )
+def _row(league: LeagueTable) -> LeagueRow:
+    from league.config import LeagueConfig  # Takes 0.05 s to import, and most commands read versions only.
+
+    config = LeagueConfig.from_mapping(league.config, source=f"the registered league {league.slug}")
+    return detached(LeagueRow, league, config=config, interface=Interface.model_validate(league.interface))

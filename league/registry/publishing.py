@@ -1,34 +1,104 @@
-"""How a version comes to be: reserved, written, made ready; or cleared away, whenever its publisher stops.
+"""Publishes versions atomically and removes what interrupted publications leave.
 
     reserve → (files staged, manifest, rename) → finish          the version is ready
-            ↘ abandon → files removed → forget                   there never was one
+            ↘ abandon → files removed → forget                   the version never existed
 
-A row leaves `publishing` once, by `finish` or by `abandon`, so that files are removed only when it can no
+A row leaves the state `publishing` once, by `finish` or by `abandon`, so files are removed only when the version can no
 longer become ready. A crash at any point leaves a row that `stale` finds later.
 """
 
 import hashlib
-from datetime import UTC, datetime
+import os
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from league.errors import EnvironmentMismatch, InterfaceChanged, StorageError
+from league.files import DISK_FULL_OR_READ_ONLY, disk_errors
 from league.registry import leagues, versions
-from league.registry.database import affected
-from league.registry.manifest import Manifest
-from league.registry.publisher import is_gone, this_process
-from league.registry.tables import ABANDONED, PUBLISHING, READY, Version
+from league.registry.storage.artifacts import ArtifactStore
+from league.registry.storage.database import Database, Repository, row_count
+from league.registry.storage.manifest import Manifest
+from league.registry.storage.rows import VersionRow
+from league.registry.storage.tables import ABANDONED, PUBLISHING, READY, VersionTable
+from league.registry.versions import VersionRepository
+
+PUBLICATION_TIMEOUT = timedelta(days=1)
+"""After this, a process on another machine is considered dead. Publishing takes seconds to minutes."""
+Build = Callable[[Path, int], Manifest]
+"""Writes the files of version `number` into a directory and returns its manifest, without digests."""
+
+
+class VersionPublisher(Repository):
+    """Publishes versions: reserves a number, writes the files, makes the version ready."""
+
+    def __init__(self, database: Database, artifacts: ArtifactStore) -> None:
+        super().__init__(database)
+        self._artifacts = artifacts
+        self._versions = VersionRepository(database, artifacts)
+
+    def publish(self, league: str, build: Build, *, source: str, parent: int | None = None) -> VersionRow:
+        """Publish the files that `build` writes as the next version, completely or not at all.
+
+        source: identifies the checkpoint. If it was published before, the existing version is returned.
+        Raises UnknownLeague, UnknownVersion (of the parent), InterfaceChanged, and whatever `build` raises.
+        """
+        self.sweep(league)
+        with self._database.write() as session:
+            leagues.lock(session, league)
+            if (ready := versions.find_by_source(session, league, source)) is None:
+                number = reserve(session, league, source, parent, above=self._artifacts.last(league))
+        if ready is None:
+            ready = self._build(league, number, build, source, parent)
+        return self._versions.get(league, ready)
+
+    def sweep(self, league: str) -> None:
+        """Remove what publishers that died have left."""
+        with self._database.write() as session:
+            numbers = stale(session, league)
+        for number in numbers:
+            self._clear(league, number)
+
+    def _build(self, league: str, number: int, build: Build, source: str, parent: int | None) -> int:
+        """Write a reserved version; returns the number of the version that is ready."""
+        try:
+            staging = self._artifacts.stage(league, number)
+            with disk_errors(staging, only=DISK_FULL_OR_READ_ONLY):
+                manifest = build(staging, number)
+            check(manifest, league, number, parent)
+            text = self._artifacts.commit(manifest)
+            with self._database.write() as session:
+                return finish(session, manifest, text, source)
+        finally:
+            self._withdraw_unfinished(league, number)
+
+    def _withdraw_unfinished(self, league: str, number: int) -> None:
+        """Remove a version that is not ready. If that fails, a later sweep removes it."""
+        with suppress(StorageError):
+            with self._database.write() as session:
+                abandoned = abandon(session, league, number)
+            if abandoned:
+                self._clear(league, number)
+
+    def _clear(self, league: str, number: int) -> None:
+        self._artifacts.discard(league, number)
+        with self._database.write() as session:
+            forget(session, league, number)
 
 
 def reserve(session: Session, league: str, source: str, parent: int | None, above: int) -> int:
-    """Take the next number `above` that one. Raises UnknownLeague, or UnknownVersion of the parent."""
+    """Reserve the next version number, higher than `above`. Raises UnknownLeague, or UnknownVersion of the parent."""
     row = leagues.lock(session, league)
     if parent is not None:
         versions.require(session, league, parent)
     row.last_version = max(row.last_version, above) + 1
     session.add(
-        Version(
+        VersionTable(
             league=league,
             number=row.last_version,
             state=PUBLISHING,
@@ -42,7 +112,7 @@ def reserve(session: Session, league: str, source: str, parent: int | None, abov
 
 
 def check(manifest: Manifest, league: str, number: int, parent: int | None) -> None:
-    """Raise EnvironmentMismatch if a manifest is not of the version that was reserved."""
+    """Raise EnvironmentMismatch if a manifest does not describe the reserved version."""
     found = (manifest.league, manifest.version, manifest.parent)
     if found != (league, number, parent):
         raise EnvironmentMismatch(
@@ -52,43 +122,78 @@ def check(manifest: Manifest, league: str, number: int, parent: int | None) -> N
 
 
 def finish(session: Session, manifest: Manifest, text: str, source: str) -> int:
-    """Make a version ready, `text` being its manifest.json, unless another of the same source was faster.
+    """Make a version ready; `text` is its manifest.json.
 
-    Returns the number of the one that is ready. Raises InterfaceChanged if its league has another interface.
+    Returns the number of the ready version: another one if a concurrent publication of the same source was faster.
+    Raises InterfaceChanged if its league has another interface.
     """
     row = leagues.lock(session, manifest.league)
     if row.interface_digest != manifest.interface.digest():
         raise InterfaceChanged(f"version {manifest.version} has other spaces or policies than league {manifest.league}")
-    if (faster := versions.of_source(session, manifest.league, source)) is not None:
+    if (faster := versions.find_by_source(session, manifest.league, source)) is not None:
         return faster
     values = {"state": READY, "manifest": text, "sha256": hashlib.sha256(text.encode()).hexdigest()}
     if not _leave_publishing(session, manifest.league, manifest.version, values):
-        raise StorageError(f"{manifest.league}@{manifest.version} took so long that it was cleared away")
+        raise StorageError(f"publishing {manifest.league}@{manifest.version} took too long: its files were removed")
     return manifest.version
 
 
 def abandon(session: Session, league: str, number: int) -> bool:
-    """Give a reservation up. False if it is ready or already given up."""
+    """Give up a reservation. False if it is ready or already abandoned."""
     return _leave_publishing(session, league, number, {"state": ABANDONED})
 
 
 def forget(session: Session, league: str, number: int) -> None:
-    """Remove the row of an abandoned version whose files are gone."""
-    session.execute(delete(Version).filter_by(league=league, number=number, state=ABANDONED))
+    """Delete the row of an abandoned version whose files are removed."""
+    session.execute(delete(VersionTable).filter_by(league=league, number=number, state=ABANDONED))
 
 
 def stale(session: Session, league: str) -> list[int]:
-    """Abandon what no living process will finish; returns those and the abandoned ones still there."""
-    unfinished = session.scalars(select(Version).filter_by(league=league).where(Version.state != READY))
+    """Abandon reservations whose publisher is dead; returns the numbers of all abandoned versions."""
+    unfinished = session.scalars(select(VersionTable).filter_by(league=league).where(VersionTable.state != READY))
     numbers = []
     for version in unfinished:
-        if version.state == PUBLISHING and not is_gone(version.publisher, version.reserved_at):
+        if version.state == PUBLISHING and not is_dead(version.publisher, version.reserved_at):
             continue
         version.state = ABANDONED
         numbers.append(version.number)
     return numbers
 
 
+def this_process() -> str:
+    """Return `host:pid:start`, where `start` distinguishes processes that reuse a pid, if the system reports it."""
+    return f"{socket.gethostname()}:{os.getpid()}:{_start(os.getpid())}"
+
+
+def is_dead(publisher: str, reserved_at: datetime) -> bool:
+    """Return whether `publisher` will not finish the publication that it began at `reserved_at`.
+
+    If this is wrong, that process loses its publication and nothing else: the version can no longer become ready.
+    """
+    host, pid, start = publisher.rsplit(":", 2)
+    if datetime.now(UTC) - reserved_at > PUBLICATION_TIMEOUT:
+        return True
+    return host == socket.gethostname() and not (_exists(int(pid)) and _start(int(pid)) == start)
+
+
 def _leave_publishing(session: Session, league: str, number: int, values: dict[str, str]) -> bool:
-    statement = update(Version).filter_by(league=league, number=number, state=PUBLISHING).values(**values)
-    return affected(session, statement) == 1
+    statement = update(VersionTable).filter_by(league=league, number=number, state=PUBLISHING).values(**values)
+    return row_count(session, statement) == 1
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _start(pid: int) -> str:
+    """Clock ticks from boot to the start of a process (proc(5), stat field 22); empty if there is no /proc."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except OSError:
+        return ""

@@ -1,9 +1,9 @@
-"""Training runs, as their drivers tell of them: what is trained, how far it is, its curves, and how it ended.
+"""Training runs as their drivers report them: settings, progress, learning curves and outcome.
 
-    running → ended | failed | stopped → running, where it is gone on with
+    running → ended | failed | stopped → running, if it is resumed
 
-A driver says again and again that it lives; of one that fell silent nobody knows. A run keeps a bounded number of
-points, however long it takes: when there are too many, every second one goes, and from then on they come half as often.
+A driver sends heartbeats; a run without a recent heartbeat is `silent`. The number of points of a run is bounded: when
+there are too many, every second point is deleted, and the spacing of new points doubles.
 """
 
 from dataclasses import replace
@@ -14,129 +14,151 @@ from sqlalchemy import delete, func, select, tuple_
 from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput, UnknownRun
-from league.registry import leagues, rows
-from league.registry.tables import Run, RunPoint
+from league.registry import leagues
+from league.registry.storage.database import Repository
+from league.registry.storage.rows import RunPoint, RunRow, RunState, detached
+from league.registry.storage.tables import RunPointTable, RunTable
 
 RUNNING = "running"
-SILENT = timedelta(minutes=1)
-"""A run of which nothing was heard for longer is said to be silent."""
-FULL = 601
-"""So many points are too many. Odd, so that the first and the last stay when every second one goes."""
+HEARTBEAT_TIMEOUT = timedelta(minutes=1)
+"""A run without a heartbeat for longer is reported as silent."""
+MAX_POINTS = 601
+"""At this number, every second point is deleted. Odd, so that the first and the last point are kept."""
 
 
-def begin(
-    session: Session,
-    league: str,
-    run: str,
-    *,
-    algorithm: str,
-    settings: dict[str, Any],
-    seed: int,
-    target: int,
-    parent: int | None,
-    steps: int,
-) -> rows.RunRow:
-    """Record that a run begins, or goes on at `steps`: what it told beyond those is forgotten. Raises UnknownLeague."""
-    leagues.require(session, league)
-    now = datetime.now(UTC)
-    row = session.get(Run, (league, run), with_for_update=True)
-    if row is None:
-        row = Run(league=league, id=run, lives=0, seconds=0.0, curves={}, spacing=0, began_at=now)
-        session.add(row)
-    row.algorithm, row.settings, row.seed, row.target, row.parent = algorithm, settings, seed, target, parent
-    row.state, row.error, row.ended_at = RUNNING, None, None
-    row.lives += 1
-    row.steps, row.heartbeat_at = steps, now
-    session.flush()
-    session.execute(delete(RunPoint).filter_by(league=league, run=run).where(RunPoint.steps > steps))
-    return _row(row)
+class RunRepository(Repository):
+    """Records and reads training runs."""
+
+    def begin(
+        self,
+        league: str,
+        run: str,
+        *,
+        algorithm: str,
+        settings: dict[str, Any],
+        seed: int,
+        target: int,
+        parent: int | None = None,
+        steps: int = 0,
+    ) -> RunRow:
+        """Record that a training run starts, or resumes at `steps`; later points are deleted.
+
+        target: steps at which the run ends. parent: the version that training starts from. Raises UnknownLeague.
+        """
+        now = datetime.now(UTC)
+        with self._database.write() as session:
+            leagues.require(session, league)
+            row = session.get(RunTable, (league, run), with_for_update=True)
+            if row is None:
+                row = RunTable(league=league, id=run, attempts=0, seconds=0.0, curves={}, spacing=0, began_at=now)
+                session.add(row)
+            row.algorithm, row.settings, row.seed, row.target, row.parent = algorithm, settings, seed, target, parent
+            row.state, row.error, row.ended_at = RUNNING, None, None
+            row.attempts += 1
+            row.steps, row.heartbeat_at = steps, now
+            session.flush()
+            session.execute(delete(RunPointTable).filter_by(league=league, run=run).where(RunPointTable.steps > steps))
+            return _row(row)
+
+    def record(self, league: str, run: str, point: RunPoint | None, seconds: float | None = None) -> None:
+        """Record a heartbeat of a run's driver and the newest point of its curves, if any. Raises UnknownRun.
+
+        seconds: training time so far.
+        """
+        with self._database.write() as session:
+            row = _locked(session, league, run)
+            row.heartbeat_at = datetime.now(UTC)
+            if seconds is not None:
+                row.seconds = seconds
+            if point is not None:
+                row.steps, row.curves = point.steps, {**row.curves, **point.curves}
+                _keep(session, row, point)
+
+    def end(self, league: str, run: str, state: RunState, error: str | None = None) -> None:
+        """Record how a run ended. Raises UnknownRun."""
+        with self._database.write() as session:
+            row = _locked(session, league, run)
+            row.state, row.error = state, error
+            row.heartbeat_at = row.ended_at = datetime.now(UTC)
+
+    def get(self, league: str, run: str) -> RunRow:
+        """Return one training run. Raises UnknownLeague or UnknownRun."""
+        with self._database.read() as session:
+            return _get(session, league, run)
+
+    def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[RunRow]:
+        """Return at most `limit` training runs of a league, newest first.
+
+        before: return only runs that began before this one.
+        Raises UnknownLeague, or InvalidInput if `before` is not a run of the league.
+        """
+        table = RunTable
+        query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc()).limit(limit)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            if before is not None:
+                last = session.get(table, (league, before))
+                if last is None:
+                    raise InvalidInput(f"before: league {league} has no training run {before!r}")
+                query = query.where(tuple_(table.began_at, table.id) < (last.began_at, last.id))
+            return [_row(row) for row in session.scalars(query)]
+
+    def counts(self) -> dict[str, int]:
+        """Return league → number of active training runs, of the leagues that have any."""
+        alive = (RunTable.state == RUNNING) & (RunTable.heartbeat_at >= datetime.now(UTC) - HEARTBEAT_TIMEOUT)
+        with self._database.read() as session:
+            found = session.execute(select(RunTable.league, func.count()).where(alive).group_by(RunTable.league))
+            return dict(found.tuples().all())
+
+    def points(self, league: str, run: str) -> list[RunPoint]:
+        """Return the points of a run's curves, sorted by steps, fewer than MAX_POINTS.
+
+        Raises UnknownLeague or UnknownRun.
+        """
+        table = RunPointTable
+        query = select(table.steps, table.curves, table.at).filter_by(league=league, run=run).order_by(table.steps)
+        with self._database.read() as session:
+            _get(session, league, run)
+            return [RunPoint(*values) for values in session.execute(query).tuples()]
 
 
-def tell(
-    session: Session, league: str, run: str, point: rows.RunPoint | None = None, seconds: float | None = None
-) -> None:
-    """Say that a run's driver lives, and where its curves are by now."""
-    row = _held(session, league, run)
-    row.heartbeat_at = datetime.now(UTC)
-    if seconds is not None:
-        row.seconds = seconds
-    if point is not None:
-        row.steps, row.curves = point.steps, {**row.curves, **point.curves}
-        _keep(session, row, point)
-
-
-def end(session: Session, league: str, run: str, state: rows.RunState, error: str | None) -> None:
-    """Record how it ended."""
-    row = _held(session, league, run)
-    row.state, row.error = state, error
-    row.heartbeat_at = row.ended_at = datetime.now(UTC)
-
-
-def one(session: Session, league: str, run: str) -> rows.RunRow:
-    """One of a league. Raises UnknownLeague or UnknownRun."""
-    leagues.require(session, league)
-    row = session.get(Run, (league, run))
-    if row is None:
-        raise UnknownRun(f"league {league} has no training run {run!r}")
-    return _row(row)
-
-
-def newest(session: Session, league: str, before: str | None, limit: int) -> list[rows.RunRow]:
-    """Those of a league, newest first, that began before the run `before`. Raises UnknownLeague or InvalidInput."""
-    leagues.require(session, league)
-    query = select(Run).filter_by(league=league).order_by(Run.began_at.desc(), Run.id.desc()).limit(limit)
-    if before is not None:
-        last = session.get(Run, (league, before))
-        if last is None:
-            raise InvalidInput(f"before: league {league} has no training run {before!r}")
-        query = query.where(tuple_(Run.began_at, Run.id) < (last.began_at, last.id))
-    return [_row(row) for row in session.scalars(query)]
-
-
-def active(session: Session, league: str) -> tuple[rows.RunRow, ...]:
-    """Those of a league that nobody has ended, oldest first."""
-    query = select(Run).filter_by(league=league, state=RUNNING).order_by(Run.began_at, Run.id)
+def active(session: Session, league: str) -> tuple[RunRow, ...]:
+    """Return the runs of a league in state `running` or `silent`, oldest first."""
+    query = select(RunTable).filter_by(league=league, state=RUNNING).order_by(RunTable.began_at, RunTable.id)
     return tuple(_row(row) for row in session.scalars(query))
 
 
-def counts(session: Session) -> dict[str, int]:
-    """league → runs that are on, of the leagues that have any."""
-    alive = (Run.state == RUNNING) & (Run.heartbeat_at >= datetime.now(UTC) - SILENT)
-    found = session.execute(select(Run.league, func.count()).where(alive).group_by(Run.league))
-    return dict(found.tuples().all())
+def _get(session: Session, league: str, run: str) -> RunRow:
+    leagues.require(session, league)
+    return _row(session.get(RunTable, (league, run)) or _unknown(league, run))
 
 
-def points(session: Session, league: str, run: str) -> list[rows.RunPoint]:
-    """Those of a run, by their steps, the newest that is known among them. Raises UnknownLeague or UnknownRun."""
-    one(session, league, run)
-    query = select(RunPoint.steps, RunPoint.curves, RunPoint.at).filter_by(league=league, run=run)
-    return [rows.RunPoint(*each) for each in session.execute(query.order_by(RunPoint.steps)).tuples()]
+def _locked(session: Session, league: str, run: str) -> RunTable:
+    return session.get(RunTable, (league, run), with_for_update=True) or _unknown(league, run)
 
 
-def _keep(session: Session, row: Run, point: rows.RunPoint) -> None:
-    """The newest point is always kept; the one before it only if it is far enough from its own predecessor."""
-    of_run = (RunPoint.league == row.league) & (RunPoint.run == row.id)
-    session.execute(delete(RunPoint).where(of_run, RunPoint.steps >= point.steps))
-    newest = session.scalars(select(RunPoint.steps).where(of_run).order_by(RunPoint.steps.desc()).limit(2)).all()
+def _unknown(league: str, run: str) -> RunTable:
+    raise UnknownRun(f"league {league} has no training run {run!r}")
+
+
+def _keep(session: Session, row: RunTable, point: RunPoint) -> None:
+    """Store the newest point; delete the one before it unless that is far enough from its own predecessor."""
+    table = RunPointTable
+    of_run = (table.league == row.league) & (table.run == row.id)
+    session.execute(delete(table).where(of_run, table.steps >= point.steps))
+    newest = session.scalars(select(table.steps).where(of_run).order_by(table.steps.desc()).limit(2)).all()
     if len(newest) == 2 and newest[0] - newest[1] < row.spacing:
-        session.execute(delete(RunPoint).where(of_run, RunPoint.steps == newest[0]))
-    session.add(RunPoint(league=row.league, run=row.id, steps=point.steps, curves=point.curves, at=point.at))
+        session.execute(delete(table).where(of_run, table.steps == newest[0]))
+    session.add(table(league=row.league, run=row.id, steps=point.steps, curves=point.curves, at=point.at))
     session.flush()
-    kept = session.scalars(select(RunPoint.steps).where(of_run).order_by(RunPoint.steps)).all()
-    if len(kept) >= FULL:
-        session.execute(delete(RunPoint).where(of_run, RunPoint.steps.in_(kept[1::2])))
-        # Reports do not come at equal distances: with less than the mean one, still only every second one is kept.
+    kept = session.scalars(select(table.steps).where(of_run).order_by(table.steps)).all()
+    if len(kept) >= MAX_POINTS:
+        session.execute(delete(table).where(of_run, table.steps.in_(kept[1::2])))
+        # Points are not equidistant: a spacing below the mean distance still keeps only every second point.
         row.spacing = (kept[-1] - kept[0]) * 3 // (4 * len(kept[2::2]))
 
 
-def _held(session: Session, league: str, run: str) -> Run:
-    row = session.get(Run, (league, run), with_for_update=True)
-    if row is None:
-        raise UnknownRun(f"league {league} has no training run {run!r}")
-    return row
-
-
-def _row(run: Run) -> rows.RunRow:
-    row = rows.RunRow(**{name: getattr(run, name) for name in rows.RunRow.__slots__})
-    is_silent = row.state == RUNNING and row.heartbeat_at < datetime.now(UTC) - SILENT
+def _row(run: RunTable) -> RunRow:
+    row = detached(RunRow, run)
+    is_silent = row.state == RUNNING and row.heartbeat_at < datetime.now(UTC) - HEARTBEAT_TIMEOUT
     return replace(row, state="silent") if is_silent else row

@@ -1,6 +1,6 @@
-"""Snapshots: what pages show of a league, computed ahead of time, each with a mark of what it was computed from.
+"""Precomputed documents for web pages, each with the change token of the data that it was computed from.
 
-A league's mark is another as soon as anything is that its standings, ratings or verdicts follow from.
+The change token differs after each change of data that leaderboard, ratings or verdicts depend on.
 """
 
 from collections import defaultdict
@@ -13,87 +13,121 @@ from sqlalchemy.orm import Session
 
 from league.interface import digest
 from league.refs import CHAMPION
-from league.registry import leagues, rows
-from league.registry.database import upsert
-from league.registry.tables import READY, AliasEvent, League, Match, Schedule, Snapshot, Verdict, Version
+from league.registry import leagues
+from league.registry.storage.database import Repository, upsert
+from league.registry.storage.rows import SnapshotRow, detached
+from league.registry.storage.tables import (
+    READY,
+    AliasEventTable,
+    LeagueTable,
+    MatchTable,
+    ScheduleTable,
+    SnapshotTable,
+    VerdictTable,
+    VersionTable,
+)
 from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 1
-"""Of the documents: with another one all are computed anew."""
+FORMAT = 2
+"""Version of the document format. A new format invalidates all snapshots."""
 _COUNTS: dict[str, Executable] = {
-    "matches": select(Match.league, func.count()).group_by(Match.league),
-    "purged schedules": select(Schedule.league, func.count())
-    .where(Schedule.purged_at.is_not(None))
-    .group_by(Schedule.league),
-    "versions": select(Version.league, func.count()).filter_by(state=READY).group_by(Version.league),
-    "promotions": select(AliasEvent.league, func.count()).filter_by(alias=CHAMPION).group_by(AliasEvent.league),
+    "matches": select(MatchTable.league, func.count()).group_by(MatchTable.league),
+    "purged schedules": select(ScheduleTable.league, func.count())
+    .where(ScheduleTable.purged_at.is_not(None))
+    .group_by(ScheduleTable.league),
+    "versions": select(VersionTable.league, func.count()).filter_by(state=READY).group_by(VersionTable.league),
+    "promotions": select(AliasEventTable.league, func.count())
+    .filter_by(alias=CHAMPION)
+    .group_by(AliasEventTable.league),
     "verdicts, closed, void": select(
-        Verdict.league, func.count(), func.count(Verdict.outcome), func.count().filter(Verdict.outcome == VOID)
-    ).group_by(Verdict.league),
+        VerdictTable.league,
+        func.count(),
+        func.count(VerdictTable.outcome),
+        func.count().filter(VerdictTable.outcome == VOID),
+    ).group_by(VerdictTable.league),
 }
-"""Each grows whenever something is that a snapshot follows from: nothing of it is ever removed or changed."""
+"""Counts that grow with every change of the data behind a snapshot: none of these rows is deleted or changed."""
 
 
-def one(session: Session, league: str, part: str) -> rows.SnapshotRow | None:
-    """A part of a league's, None if it was not computed yet. Raises UnknownLeague."""
-    snapshot = session.get(Snapshot, (league, part))
-    if snapshot is None:
-        leagues.require(session, league)
-        return None
-    return _row(snapshot)
+class SnapshotRepository(Repository):
+    """Writes and reads snapshots, and finds outdated ones."""
+
+    def get(self, league: str, part: str) -> SnapshotRow | None:
+        """Return a part of a league's snapshots, None if it was not computed yet. Raises UnknownLeague."""
+        with self._database.read() as session:
+            snapshot = session.get(SnapshotTable, (league, part))
+            if snapshot is None:
+                leagues.require(session, league)
+                return None
+            return _row(snapshot)
+
+    def of_part(self, part: str) -> dict[str, SnapshotRow]:
+        """Return league → this part, of the leagues that have it."""
+        query = select(SnapshotTable).filter_by(part=part).order_by(SnapshotTable.league)
+        with self._database.read() as session:
+            return {snapshot.league: _row(snapshot) for snapshot in session.scalars(query)}
+
+    def verdict_reasons(self, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Return verdict → outcome and reason in its snapshot, of the verdicts that have one.
+
+        The rest of the documents, which is long, is not read.
+        """
+        parts = {f"verdict/{verdict}": verdict for verdict in verdicts}
+        fields = (SnapshotTable.document[name].as_string() for name in ("outcome", "reason"))
+        query = select(SnapshotTable.part, *fields)
+        query = query.where(SnapshotTable.league == league, SnapshotTable.part.in_(parts))
+        with self._database.read() as session:
+            return {parts[part]: (outcome, reason) for part, outcome, reason in session.execute(query)}
+
+    def marks(self, league: str) -> dict[str, str]:
+        """Return part → the mark that it was computed from, of all parts of a league."""
+        with self._database.read() as session:
+            found = session.execute(select(SnapshotTable.part, SnapshotTable.mark).filter_by(league=league))
+            return dict(found.tuples().all())
+
+    def put(self, league: str, documents: Mapping[str, Any], mark: str) -> None:
+        """Replace these parts of a league's snapshots, all or none. Raises UnknownLeague.
+
+        mark: of the data that they were computed from.
+        """
+        now = datetime.now(UTC)
+        with self._database.write() as session:
+            leagues.require(session, league)
+            for part, document in documents.items():
+                values = {"mark": mark, "document": document, "at": now}
+                upsert(session, SnapshotTable, {"league": league, "part": part}, values)
+
+    def current_marks(self) -> dict[str, str]:
+        """Return league → the mark of its current data, of all leagues."""
+        with self._database.read() as session:
+            return _current_marks(session)
+
+    def stale(self) -> list[str]:
+        """Return the leagues whose snapshots are outdated: leagues without snapshots first, then the oldest."""
+        query = select(SnapshotTable.league, SnapshotTable.mark, SnapshotTable.at).filter_by(part=SUMMARY)
+        with self._database.read() as session:
+            known = {league: (mark, at) for league, mark, at in session.execute(query)}
+            current = _current_marks(session)
+        behind = [league for league, mark in current.items() if league not in known or known[league][0] != mark]
+        never = datetime.min.replace(tzinfo=UTC)
+        return sorted(behind, key=lambda league: known[league][1] if league in known else never)
 
 
-def of_part(session: Session, part: str) -> dict[str, rows.SnapshotRow]:
-    """league → the same part, of all leagues that have it."""
-    found = session.scalars(select(Snapshot).filter_by(part=part).order_by(Snapshot.league))
-    return {snapshot.league: _row(snapshot) for snapshot in found}
-
-
-def reasons(session: Session, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
-    """verdict → outcome and reason in its judgement, of those that have one. The rest, which is long, is not read."""
-    parts = {f"verdict/{verdict}": verdict for verdict in verdicts}
-    told = (Snapshot.document[name].as_string() for name in ("outcome", "reason"))
-    found = session.execute(select(Snapshot.part, *told).where(Snapshot.league == league, Snapshot.part.in_(parts)))
-    return {parts[part]: (outcome, reason) for part, outcome, reason in found}
-
-
-def computed_from(session: Session, league: str) -> dict[str, str]:
-    """part → mark, of all that a league has."""
-    found = session.execute(select(Snapshot.part, Snapshot.mark).filter_by(league=league))
-    return dict(found.tuples().all())
-
-
-def put(session: Session, league: str, documents: Mapping[str, Any], mark: str) -> None:
-    """Replace these parts of a league's, all or none."""
-    leagues.require(session, league)
-    now = datetime.now(UTC)
-    for part, document in documents.items():
-        upsert(session, Snapshot, {"league": league, "part": part}, {"mark": mark, "document": document, "at": now})
-
-
-def marks(session: Session) -> dict[str, str]:
-    """league → its mark now. The ledger is counted on its index, nothing of it is read."""
+def _current_marks(session: Session) -> dict[str, str]:
+    """Counts the ledger by an index-only query."""
     counts: defaultdict[str, list[Any]] = defaultdict(list)
     for name, query in _COUNTS.items():
         for league, *values in session.execute(query):
             counts[league].append(f"{name}: {' '.join(map(str, values))}")
-    registered = session.execute(select(League.slug, League.config, League.interface).order_by(League.slug))
+    table = LeagueTable
+    registered = session.execute(select(table.slug, table.config, table.interface).order_by(table.slug))
     return {
         league: "; ".join([str(FORMAT), digest({"config": config, "interface": interface})[:12], *counts[league]])
         for league, config, interface in registered
     }
 
 
-def stale(session: Session) -> list[str]:
-    """The leagues whose snapshots are not up to date: those without any first, then the oldest ones."""
-    found = session.execute(select(Snapshot.league, Snapshot.mark, Snapshot.at).filter_by(part=SUMMARY))
-    known = {league: (mark, at) for league, mark, at in found}
-    behind = [league for league, mark in marks(session).items() if league not in known or known[league][0] != mark]
-    never = datetime.min.replace(tzinfo=UTC)
-    return sorted(behind, key=lambda league: known[league][1] if league in known else never)
-
-
-def _row(snapshot: Snapshot) -> rows.SnapshotRow:
-    return rows.SnapshotRow(document=snapshot.document, mark=snapshot.mark, at=snapshot.at)
+def _row(snapshot: SnapshotTable) -> SnapshotRow:
+    return detached(SnapshotRow, snapshot)

@@ -1,24 +1,34 @@
-"""Which part of a league's requests goes to a canary, and which is mirrored to a shadow: settings, each with its audit.
+"""Canary and shadow settings of leagues, and the results of shadows.
 
-A setting is a row that never changes; the newest of a league is in force. A canary or shadow is named by a number, or
-by an alias, whose movements it then follows.
+A canary answers a share of the requests for the champion; a shadow gets mirrored requests. Each setting is an immutable
+row with its actor and reason, and the newest row of a league is in force. A canary or shadow is a version number, or an
+alias that it follows. Each replica writes its shadow counters since it started, so that writing them again is
+idempotent; the counters are kept after the replica stops.
 """
 
-from datetime import UTC, datetime
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
 from enum import Enum
 
-from sqlalchemy import func, select
+from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput
+from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, parse_version
-from league.registry import leagues, rows, versions
-from league.registry.rows import Portion
-from league.registry.tables import TrafficEvent
+from league.registry import leagues, versions
+from league.registry.storage.database import Repository, upsert
+from league.registry.storage.idempotency import IdempotentCall, apply_once
+from league.registry.storage.rows import Portion, ShadowCounts, Traffic, detached
+from league.registry.storage.tables import ShadowCountTable, TrafficEventTable
+
+SHADOW_COUNTS_KEPT = timedelta(days=90)
+COUNTERS = ("requests", "observations", "agreed", "failed", "dropped", "skipped")
 
 
 class Unchanged(Enum):
-    """`KEEP` as a portion: leave it as it is."""
+    """`KEEP` as a portion: leave it unchanged."""
 
     KEEP = "keep"
 
@@ -26,22 +36,84 @@ class Unchanged(Enum):
 KEEP = Unchanged.KEEP
 
 
-def put(
+class TrafficRepository(Repository):
+    """Sets and reads canaries and shadows."""
+
+    def set(
+        self,
+        league: str,
+        *,
+        canary: Portion | Unchanged | None = KEEP,
+        shadow: Portion | Unchanged | None = KEEP,
+        actor: str,
+        reason: str,
+        call: IdempotentCall | None = None,
+    ) -> Traffic:
+        """Set the canary and the shadow of a league; None ends one, KEEP leaves it unchanged.
+
+        Returns the setting in force, which is the old one if nothing differs. A repeated `call` changes nothing and
+        returns its setting. Raises UnknownLeague, UnknownVersion, UnknownAlias, InvalidInput or KeyReused.
+        """
+        with self._database.write() as session:
+            leagues.lock(session, league)
+            return apply_once(
+                session,
+                call,
+                "traffic",
+                change=lambda: _set(session, league, canary, shadow, actor=actor, reason=reason),
+                load=lambda event: _row(session.get_one(TrafficEventTable, event)),
+            )
+
+    def current(self, league: str) -> Traffic:
+        """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
+        with self._database.read() as session:
+            return _current(session, league)
+
+    def all(self) -> dict[str, Traffic]:
+        """Return league → its setting in force, of the leagues that have one, by one cheap query."""
+        newest = select(func.max(TrafficEventTable.id)).group_by(TrafficEventTable.league)
+        with self._database.read() as session:
+            found = session.scalars(select(TrafficEventTable).where(TrafficEventTable.id.in_(newest)))
+            return {event.league: _row(event) for event in found}
+
+    def history(self, league: str) -> list[Traffic]:
+        """Return all settings of a league, newest first. Raises UnknownLeague."""
+        query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc())
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return [_row(event) for event in session.scalars(query)]
+
+    def shadow_counts(self, league: str) -> list[ShadowCounts]:
+        """Return the shadow counters of a league, summed over replicas, by candidate and champion."""
+        table = ShadowCountTable
+        query = select(table).filter_by(league=league).order_by(table.candidate, table.champion)
+        found: dict[tuple[int, int], list[ShadowCountTable]] = {}
+        with self._database.read() as session:
+            for count in session.scalars(query):
+                found.setdefault((count.candidate, count.champion), []).append(count)
+        return [_sum(league, *pair, counts) for pair, counts in found.items()]
+
+
+def write_shadow_counts(session: Session, replica: str, counts: Iterable[ShadowCounts]) -> None:
+    """Replace the shadow counters of `replica`; deletes old ones of all replicas."""
+    now = datetime.now(UTC)
+    for count in counts:
+        values = asdict(count)
+        key = {"replica": replica} | {name: values.pop(name) for name in ("league", "candidate", "champion")}
+        upsert(session, ShadowCountTable, key, values | {"latency": list(count.latency), "at": now})
+    session.execute(delete(ShadowCountTable).where(ShadowCountTable.at < now - SHADOW_COUNTS_KEPT))
+
+
+def _set(
     session: Session,
     league: str,
-    *,
     canary: Portion | Unchanged | None,
     shadow: Portion | Unchanged | None,
+    *,
     actor: str,
     reason: str,
-) -> rows.Traffic:
-    """Set the canary and the shadow of a league; None ends one, KEEP leaves it.
-
-    Returns the setting in force: what is set so already is left alone.
-    Raises UnknownLeague, UnknownVersion, UnknownAlias or InvalidInput.
-    """
-    leagues.lock(session, league)
-    now = current(session, league)
+) -> Traffic:
+    now = _current(session, league)
     wanted = tuple(
         before if portion is KEEP else portion for portion, before in ((canary, now.canary), (shadow, now.shadow))
     )
@@ -50,57 +122,42 @@ def put(
             _check(session, league, portion)
     if now.id is not None and wanted == (now.canary, now.shadow):
         return now
-    event = TrafficEvent(league=league, actor=actor, reason=reason, at=datetime.now(UTC))
+    event = TrafficEventTable(league=league, actor=actor, reason=reason, at=datetime.now(UTC))
     (event.canary, event.canary_share), (event.shadow, event.shadow_share) = (
         (str(portion.version), portion.share) if isinstance(portion, Portion) else (None, None) for portion in wanted
     )
     session.add(event)
     session.flush()
-    return row(event)
+    return _row(event)
 
 
-def current(session: Session, league: str) -> rows.Traffic:
-    """The setting in force; one without an id where nothing was ever set. Raises UnknownLeague."""
+def _current(session: Session, league: str) -> Traffic:
     leagues.require(session, league)
-    query = select(TrafficEvent).filter_by(league=league).order_by(TrafficEvent.id.desc()).limit(1)
+    query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc()).limit(1)
     event = session.scalar(query)
-    return rows.Traffic(league=league) if event is None else row(event)
+    return Traffic(league=league) if event is None else _row(event)
 
 
-def every(session: Session) -> dict[str, rows.Traffic]:
-    """league → its setting in force, of the leagues that have one."""
-    newest = select(func.max(TrafficEvent.id)).group_by(TrafficEvent.league)
-    found = session.scalars(select(TrafficEvent).where(TrafficEvent.id.in_(newest)))
-    return {event.league: row(event) for event in found}
+def _check(session: Session, league: str, portion: Portion) -> None:
+    if portion.version == CHAMPION:
+        raise InvalidInput(f"a canary or shadow is compared with the {CHAMPION}: it must be another version")
+    if not 0 <= portion.share <= 1:
+        raise InvalidInput(f"share {portion.share:g} must be from 0 to 1")
+    versions.resolve(session, CheckpointRef(league, portion.version))
 
 
-def history(session: Session, league: str) -> list[rows.Traffic]:
-    """All settings of a league, newest first. Raises UnknownLeague."""
-    leagues.require(session, league)
-    query = select(TrafficEvent).filter_by(league=league).order_by(TrafficEvent.id.desc())
-    return [row(event) for event in session.scalars(query)]
-
-
-def row(event: TrafficEvent) -> rows.Traffic:
-    """A setting as the registry answers it."""
-    return rows.Traffic(
-        league=event.league,
-        id=event.id,
-        canary=_portion(event.canary, event.canary_share),
-        shadow=_portion(event.shadow, event.shadow_share),
-        actor=event.actor,
-        reason=event.reason,
-        at=event.at,
-    )
+def _row(event: TrafficEventTable) -> Traffic:
+    canary, shadow = _portion(event.canary, event.canary_share), _portion(event.shadow, event.shadow_share)
+    return detached(Traffic, event, canary=canary, shadow=shadow)
 
 
 def _portion(version: str | None, share: float | None) -> Portion | None:
     return None if version is None or share is None else Portion(parse_version(version), share)
 
 
-def _check(session: Session, league: str, portion: Portion) -> None:
-    if portion.version == CHAMPION:
-        raise InvalidInput(f"a canary or shadow is held against the {CHAMPION}: it must be another version")
-    if not 0 <= portion.share <= 1:
-        raise InvalidInput(f"share {portion.share:g} must be from 0 to 1")
-    versions.resolve(session, CheckpointRef(league, portion.version))
+def _sum(league: str, candidate: int, champion: int, counts: list[ShadowCountTable]) -> ShadowCounts:
+    latency = Histogram()
+    for count in counts:
+        latency.merge(count.latency, count.ns)
+    sums = {name: sum(getattr(count, name) for count in counts) for name in COUNTERS}
+    return ShadowCounts(league, candidate, champion, **sums, latency=tuple(latency.counts), ns=latency.ns)

@@ -1,7 +1,10 @@
-"""Verdicts: opened before the first match that they count, closed once; after that, a person may void one, and nothing
-else is ever changed.
+"""Verdicts and the nightly runs that open them.
+
+A verdict is opened before the first match that it counts, and closed once. After that it can only be voided by a
+person. A nightly run stores its candidates before the first verdict, so that an interrupted run resumes with the same.
 """
 
+from collections.abc import Collection
 from datetime import UTC, datetime
 from typing import Any
 
@@ -9,112 +12,141 @@ from sqlalchemy import func, select, tuple_
 from sqlalchemy.orm import Session
 
 from league.errors import Conflict, InvalidInput, UnknownVerdict
-from league.registry import leagues, rows, versions
-from league.registry.database import insert
-from league.registry.tables import AliasEvent, Verdict
+from league.registry import leagues, versions
+from league.registry.storage.database import Repository, insert
+from league.registry.storage.rows import NightlyRunRow, VerdictRow, detached
+from league.registry.storage.tables import AliasEventTable, NightlyRunTable, VerdictTable
 
 VOID = "void"
 
 
-def start(
-    session: Session, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]
-) -> rows.VerdictRow:
-    """Open the verdict of a schedule, or find it. Raises UnknownVersion, or Conflict if it differs."""
-    versions.require(session, league, candidate)
-    asked = {"league": league, "candidate": candidate, "champion": champion, "settings": settings}
-    insert(session, Verdict, [asked | {"id": schedule, "opened_at": datetime.now(UTC)}])
-    verdict = session.get_one(Verdict, schedule)
-    for name, value in asked.items():
-        if getattr(verdict, name) != value:
-            raise Conflict(f"verdict {schedule} was opened with {name} {getattr(verdict, name)!r}, not {value!r}")
-    return _row(verdict)
+class VerdictRepository(Repository):
+    """Opens, closes, voids and reads verdicts."""
+
+    def open(self, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]) -> VerdictRow:
+        """Open the verdict that counts the matches of `schedule`, or return it if it exists. Its id is the schedule's.
+
+        Raises UnknownVersion, or Conflict if it exists with other arguments.
+        """
+        values = {"league": league, "candidate": candidate, "champion": champion, "settings": settings}
+        with self._database.write() as session:
+            versions.require(session, league, candidate)
+            insert(session, VerdictTable, [values | {"id": schedule, "opened_at": datetime.now(UTC)}])
+            verdict = session.get_one(VerdictTable, schedule)
+            for name, value in values.items():
+                if (found := getattr(verdict, name)) != value:
+                    raise Conflict(f"verdict {schedule} was opened with {name} {found!r}, not {value!r}")
+            return _row(verdict)
+
+    def close(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
+        """Record the outcome of a verdict. Idempotent. Raises UnknownVerdict, or Conflict if it has another outcome."""
+        with self._database.write() as session:
+            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            if row.outcome is None:
+                row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
+            elif row.outcome != outcome:
+                raise Conflict(f"verdict {verdict} is already {row.outcome!r}, it cannot become {outcome!r}")
+
+    def void(self, verdict: str, note: str) -> VerdictRow:
+        """Void a verdict, open or closed. Idempotent.
+
+        Its evidence is kept and its alpha stays spent. A promotion that it led to is not undone.
+        Raises UnknownVerdict, or Conflict while its promotion is being applied.
+        """
+        with self._database.write() as session:
+            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            if row.outcome is None:
+                leagues.lock(session, row.league)
+                if session.scalars(select(AliasEventTable).filter_by(verdict=verdict)).first() is not None:
+                    raise Conflict(f"the promotion of verdict {verdict} is being applied: void it once it is closed")
+            if row.outcome != VOID:
+                row.outcome, row.evidence = VOID, {**(row.evidence or {}), "note": note}
+                row.closed_at = row.closed_at or datetime.now(UTC)
+            return _row(row)
+
+    def get(self, verdict: str) -> VerdictRow:
+        """Return one verdict. Raises UnknownVerdict."""
+        with self._database.read() as session:
+            return _row(session.get(VerdictTable, verdict) or _unknown(verdict))
+
+    def all(self, league: str) -> list[VerdictRow]:
+        """Return all verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
+        query = select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at, VerdictTable.id)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return [_row(verdict) for verdict in session.scalars(query)]
+
+    def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[VerdictRow]:
+        """Return at most `limit` verdicts of a league, newest first.
+
+        before: return only verdicts opened before this one.
+        Raises UnknownLeague, or InvalidInput if `before` is not a verdict of the league.
+        """
+        table = VerdictTable
+        query = select(table).filter_by(league=league).order_by(table.opened_at.desc(), table.id.desc()).limit(limit)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            if before is not None:
+                last = session.get(table, before)
+                if last is None or last.league != league:
+                    raise InvalidInput(f"before: league {league} has no verdict {before!r}")
+                query = query.where(tuple_(table.opened_at, table.id) < (last.opened_at, last.id))
+            return [_row(verdict) for verdict in session.scalars(query)]
+
+    def last_closed(self) -> dict[str, VerdictRow]:
+        """Return league → the verdict that was closed last, of the leagues that have one."""
+        table = VerdictTable
+        closed = select(table).where(table.closed_at.is_not(None)).order_by(table.closed_at, table.id)
+        latest = select(table.league, func.max(table.closed_at).label("at")).group_by(table.league).subquery()
+        is_latest = (table.league == latest.c.league) & (table.closed_at == latest.c.at)
+        with self._database.read() as session:
+            return {verdict.league: _row(verdict) for verdict in session.scalars(closed.join(latest, is_latest))}
 
 
-def close(session: Session, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
-    """Record how it came out; twice is once. Raises UnknownVerdict, or Conflict if it came out otherwise before."""
-    row = session.get(Verdict, verdict, with_for_update=True)
-    if row is None:
-        raise UnknownVerdict(f"there is no verdict {verdict!r}")
-    if row.outcome is not None:
-        if row.outcome != outcome:
-            raise Conflict(f"verdict {verdict} is {row.outcome!r} already, it cannot become {outcome!r}")
-        return
-    row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
+class NightlyRunRepository(Repository):
+    """Opens, closes and reads nightly runs."""
 
+    def open(self, league: str, candidates: Collection[int], alpha: float) -> NightlyRunRow:
+        """Open a nightly run that judges `candidates`, or return the one that is open. Raises UnknownLeague."""
+        with self._database.write() as session:
+            leagues.lock(session, league)
+            run = session.scalars(select(NightlyRunTable).filter_by(league=league, ended_at=None)).first()
+            if run is None:
+                began_at = datetime.now(UTC)
+                run = NightlyRunTable(league=league, candidates=sorted(candidates), alpha=alpha, began_at=began_at)
+                session.add(run)
+                session.flush()
+            return _nightly_row(run)
 
-def void(session: Session, verdict: str, note: str) -> rows.VerdictRow:
-    """End a verdict for a reason beside its games, or take back one that has fallen; twice is once.
+    def close(self, run: int, report: dict[str, Any] | None) -> None:
+        """End a nightly run and store its report. Idempotent."""
+        with self._database.write() as session:
+            row = session.get_one(NightlyRunTable, run)
+            if row.ended_at is None:
+                row.report, row.ended_at = report, datetime.now(UTC)
 
-    What it has shown stays in its evidence, and its alpha is spent. A promotion that it led to is not undone.
-    Raises UnknownVerdict, or Conflict for one whose promotion is just being applied.
-    """
-    row = session.get(Verdict, verdict, with_for_update=True)
-    if row is None:
-        raise UnknownVerdict(f"there is no verdict {verdict!r}")
-    if row.outcome is None:
-        leagues.lock(session, row.league)
-        if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
-            raise Conflict(f"the promotion of verdict {verdict} is just being applied: void it when it is closed")
-    if row.outcome != VOID:
-        row.outcome, row.evidence = VOID, {**(row.evidence or {}), "note": note}
-        row.closed_at = row.closed_at or datetime.now(UTC)
-    return _row(row)
+    def all(self, league: str) -> list[NightlyRunRow]:
+        """Return all nightly runs of a league, oldest first. Raises UnknownLeague."""
+        query = select(NightlyRunTable).filter_by(league=league).order_by(NightlyRunTable.id)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return [_nightly_row(run) for run in session.scalars(query)]
 
 
 def require_open(session: Session, verdict: str) -> None:
-    """Raise Conflict if it has been closed, such as by a person."""
-    row = session.get(Verdict, verdict)
+    """Raise Conflict if a verdict has been closed."""
+    row = session.get(VerdictTable, verdict)
     if row is not None and row.outcome is not None:
-        raise Conflict(f"verdict {verdict} is {row.outcome!r}: it promotes nobody")
+        raise Conflict(f"verdict {verdict} is {row.outcome!r}: it cannot promote a version")
 
 
-def one(session: Session, verdict: str) -> rows.VerdictRow:
-    """A verdict by its id. Raises UnknownVerdict."""
-    row = session.get(Verdict, verdict)
-    if row is None:
-        raise UnknownVerdict(f"there is no verdict {verdict!r}")
-    return _row(row)
+def _unknown(verdict: str) -> VerdictTable:
+    raise UnknownVerdict(f"there is no verdict {verdict!r}")
 
 
-def every(session: Session, league: str) -> list[rows.VerdictRow]:
-    """All verdicts of a league, in the order in which they were opened. Raises UnknownLeague."""
-    leagues.require(session, league)
-    query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at, Verdict.id)
-    return [_row(verdict) for verdict in session.scalars(query)]
+def _row(verdict: VerdictTable) -> VerdictRow:
+    return detached(VerdictRow, verdict)
 
 
-def newest(session: Session, league: str, before: str | None, limit: int) -> list[rows.VerdictRow]:
-    """Those of a league, newest first, at most `limit`, of those opened before `before`.
-
-    Raises UnknownLeague, or InvalidInput if `before` is none of them.
-    """
-    leagues.require(session, league)
-    query = select(Verdict).filter_by(league=league).order_by(Verdict.opened_at.desc(), Verdict.id.desc()).limit(limit)
-    if before is not None:
-        last = session.get(Verdict, before)
-        if last is None or last.league != league:
-            raise InvalidInput(f"before: league {league} has no verdict {before!r}")
-        query = query.where(tuple_(Verdict.opened_at, Verdict.id) < (last.opened_at, last.id))
-    return [_row(verdict) for verdict in session.scalars(query)]
-
-
-def last_closed(session: Session) -> dict[str, rows.VerdictRow]:
-    """league → the verdict that was closed last, of the leagues that have one."""
-    closed = select(Verdict).where(Verdict.closed_at.is_not(None)).order_by(Verdict.closed_at, Verdict.id)
-    latest = select(Verdict.league, func.max(Verdict.closed_at).label("at")).group_by(Verdict.league).subquery()
-    of_latest = (Verdict.league == latest.c.league) & (Verdict.closed_at == latest.c.at)
-    return {verdict.league: _row(verdict) for verdict in session.scalars(closed.join(latest, of_latest))}
-
-
-def _row(verdict: Verdict) -> rows.VerdictRow:
-    return rows.VerdictRow(
-        id=verdict.id,
-        league=verdict.league,
-        candidate=verdict.candidate,
-        champion=verdict.champion,
-        settings=verdict.settings,
-        outcome=verdict.outcome,
-        evidence=verdict.evidence,
-        opened_at=verdict.opened_at,
-        closed_at=verdict.closed_at,
-    )
+def _nightly_row(run: NightlyRunTable) -> NightlyRunRow:
+    return detached(NightlyRunRow, run, candidates=tuple(run.candidates))

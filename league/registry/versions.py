@@ -1,104 +1,166 @@
-"""Versions that are ready: the only ones that exist for anybody but their publisher."""
+"""Published versions and their notes. A version is visible only once it is ready."""
 
-from sqlalchemy import Select, select
+from collections.abc import Collection
+from datetime import UTC, datetime
+from pathlib import Path
+
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
-from league.errors import UnknownAlias, UnknownVersion
+from league.errors import InvalidInput, UnknownAlias, UnknownVersion
 from league.refs import CheckpointRef
-from league.registry import leagues, notes
-from league.registry.manifest import Manifest
-from league.registry.rows import Note, VersionRow
-from league.registry.tables import READY, Alias, Version
+from league.registry import leagues
+from league.registry.storage.artifacts import ArtifactStore
+from league.registry.storage.database import Database, Repository
+from league.registry.storage.manifest import Manifest
+from league.registry.storage.rows import Note, VersionRow, detached
+from league.registry.storage.tables import READY, AliasTable, VersionNoteTable, VersionTable
+
+MAX_NOTE_LENGTH = 2000
+"""Characters."""
 
 
-def get(session: Session, league: str, number: int) -> VersionRow:
-    """One version. Raises UnknownLeague or UnknownVersion."""
-    version = session.scalar(_ready(league).where(Version.number == number))
-    return _rows(session, league, [version])[0] if version else _unknown(session, league, number)
+class VersionRepository(Repository):
+    """Reads published versions and their files, and writes notes."""
 
+    def __init__(self, database: Database, artifacts: ArtifactStore) -> None:
+        super().__init__(database)
+        self._artifacts = artifacts
 
-def every(session: Session, league: str) -> list[VersionRow]:
-    """All versions of a league, ascending. Raises UnknownLeague."""
-    leagues.require(session, league)
-    return _rows(session, league, list(session.scalars(_ready(league).order_by(Version.number))))
+    def get(self, league: str, number: int) -> VersionRow:
+        """Return one version. Raises UnknownLeague or UnknownVersion."""
+        with self._database.read() as session:
+            return _get(session, league, number)
 
+    def resolve(self, ref: CheckpointRef | str) -> VersionRow:
+        """Return the version that a reference names now.
 
-def newest(session: Session, league: str, before: int | None, limit: int) -> list[VersionRow]:
-    """Those of a league, newest first, at most `limit`, of those with a lower number than `before`.
+        Raises InvalidReference, UnknownLeague, UnknownVersion or UnknownAlias.
+        """
+        ref = CheckpointRef.parse(ref) if isinstance(ref, str) else ref
+        with self._database.read() as session:
+            return resolve(session, ref)
 
-    Raises UnknownLeague.
-    """
-    leagues.require(session, league)
-    query = _ready(league).order_by(Version.number.desc()).limit(limit)
-    if before is not None:
-        query = query.where(Version.number < before)
-    return _rows(session, league, list(session.scalars(query)))
+    def all(self, league: str) -> list[VersionRow]:
+        """Return all versions of a league, oldest first. Raises UnknownLeague."""
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return _rows(session, league, list(session.scalars(_ready(league).order_by(VersionTable.number))))
 
+    def newest(self, league: str, *, before: int | None = None, limit: int = 20) -> list[VersionRow]:
+        """Return at most `limit` versions of a league, newest first. Raises UnknownLeague.
 
-def numbers(session: Session, league: str | None) -> dict[str, list[int]]:
-    """league → numbers of its versions, ascending: of one league or of all. Their manifests are not read."""
-    query = select(Version.league, Version.number).filter_by(state=READY).order_by(Version.league, Version.number)
-    found: dict[str, list[int]] = {}
-    for name, number in session.execute(query if league is None else query.filter_by(league=league)):
-        found.setdefault(name, []).append(number)
-    return found
+        before: return only versions with a lower number.
+        """
+        query = _ready(league).order_by(VersionTable.number.desc()).limit(limit)
+        if before is not None:
+            query = query.where(VersionTable.number < before)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return _rows(session, league, list(session.scalars(query)))
 
+    def numbers(self, league: str | None = None) -> dict[str, list[int]]:
+        """Return league → version numbers, ascending, of one league or of all that have versions.
 
-def of_source(session: Session, league: str, source: str) -> int | None:
-    """The number of the version that was made from the checkpoint `source`."""
-    return session.scalar(select(Version.number).filter_by(league=league, state=READY).where(Version.source == source))
+        Does not read manifests.
+        """
+        table = VersionTable
+        query = select(table.league, table.number).filter_by(state=READY).order_by(table.league, table.number)
+        found: dict[str, list[int]] = {}
+        with self._database.read() as session:
+            for name, number in session.execute(query if league is None else query.filter_by(league=league)):
+                found.setdefault(name, []).append(number)
+        return found
+
+    def fetch(self, league: str, number: int) -> Path:
+        """Return a local directory with the verified files of a version. Raises ArtifactCorrupt."""
+        return self._artifacts.verify(league, number, self.get(league, number).sha256)
+
+    def set_note(self, ref: CheckpointRef, text: str, *, actor: str) -> VersionRow:
+        """Replace the note of a version; an empty text removes it.
+
+        Raises UnknownLeague, UnknownVersion, UnknownAlias or InvalidInput.
+        """
+        with self._database.write() as session:
+            version = resolve(session, ref)
+            _write_note(session, version.league, version.number, text, actor)
+            return _get(session, version.league, version.number)
 
 
 def resolve(session: Session, ref: CheckpointRef) -> VersionRow:
-    """The version that a reference names now. Raises UnknownLeague, UnknownVersion or UnknownAlias."""
+    """Return the version that a reference names now. Raises UnknownLeague, UnknownVersion or UnknownAlias."""
     if isinstance(ref.version, int):
-        return get(session, ref.league, ref.version)
-    number = session.scalar(select(Alias.version).filter_by(league=ref.league, name=ref.version))
+        return _get(session, ref.league, ref.version)
+    number = session.scalar(select(AliasTable.version).filter_by(league=ref.league, name=ref.version))
     if number is None:
         leagues.require(session, ref.league)
-        names = session.scalars(select(Alias.name).filter_by(league=ref.league).order_by(Alias.name))
+        names = session.scalars(select(AliasTable.name).filter_by(league=ref.league).order_by(AliasTable.name))
         known = ", ".join(names) or "none yet"
         raise UnknownAlias(f"league {ref.league} has no alias {ref.version!r}; known: {known}")
-    return get(session, ref.league, number)
+    return _get(session, ref.league, number)
+
+
+def find_by_source(session: Session, league: str, source: str) -> int | None:
+    """Return the number of the version that was published from the checkpoint `source`."""
+    ready = select(VersionTable.number).filter_by(league=league, state=READY)
+    return session.scalar(ready.where(VersionTable.source == source))
 
 
 def require(session: Session, league: str, number: int) -> None:
     """Raise UnknownLeague or UnknownVersion unless the version is ready."""
-    if session.scalar(select(Version.number).filter_by(league=league, number=number, state=READY)) is None:
+    if session.scalar(select(VersionTable.number).filter_by(league=league, number=number, state=READY)) is None:
         _unknown(session, league, number)
 
 
-def _ready(league: str) -> Select[Version]:
-    return select(Version).filter_by(league=league, state=READY)
+def _get(session: Session, league: str, number: int) -> VersionRow:
+    version = session.scalar(_ready(league).where(VersionTable.number == number))
+    return _rows(session, league, [version])[0] if version else _unknown(session, league, number)
+
+
+def _ready(league: str) -> Select[VersionTable]:
+    return select(VersionTable).filter_by(league=league, state=READY)
 
 
 def _unknown(session: Session, league: str, number: int) -> VersionRow:
     leagues.require(session, league)
-    last = session.scalar(
-        select(Version.number).filter_by(league=league, state=READY).order_by(Version.number.desc()).limit(1)
-    )
+    ready = select(VersionTable.number).filter_by(league=league, state=READY)
+    last = session.scalar(ready.order_by(VersionTable.number.desc()).limit(1))
     newest = f"the newest is {last}" if last else "none is published yet"
     raise UnknownVersion(f"league {league} has no version {number}; {newest}")
 
 
-def _rows(session: Session, league: str, versions: list[Version]) -> list[VersionRow]:
+def _write_note(session: Session, league: str, version: int, text: str, actor: str) -> None:
+    text = text.strip()
+    if len(text) > MAX_NOTE_LENGTH or "\0" in text:
+        raise InvalidInput(f"a note must be at most {MAX_NOTE_LENGTH} characters without a zero byte, got {len(text)}")
+    before = _notes(session, league, [version]).get(version)
+    if text == (before.text if before else ""):
+        return
+    session.add(VersionNoteTable(league=league, version=version, text=text, actor=actor, at=datetime.now(UTC)))
+    session.flush()
+
+
+def _notes(session: Session, league: str, versions: Collection[int]) -> dict[int, Note]:
+    """Return version → its newest note, without empty ones."""
+    if not versions:
+        return {}
+    table = VersionNoteTable
+    of_versions = (table.league == league) & table.version.between(min(versions), max(versions))
+    newest = select(func.max(table.id)).where(of_versions).group_by(table.version)
+    notes = session.scalars(select(table).where(table.id.in_(newest), table.text != ""))
+    return {note.version: Note(note.text, note.actor, note.at) for note in notes}
+
+
+def _rows(session: Session, league: str, versions: list[VersionTable]) -> list[VersionRow]:
     names: dict[int, list[str]] = {}
-    for alias in session.scalars(select(Alias).filter_by(league=league).order_by(Alias.name)):
+    for alias in session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name)):
         names.setdefault(alias.version, []).append(alias.name)
-    written = notes.current(session, league, [version.number for version in versions])
-    return [_row(version, tuple(names.get(version.number, ())), written.get(version.number)) for version in versions]
+    notes = _notes(session, league, [version.number for version in versions])
+    return [_row(version, tuple(names.get(version.number, ())), notes.get(version.number)) for version in versions]
 
 
-def _row(version: Version, aliases: tuple[str, ...], note: Note | None) -> VersionRow:
-    assert version.manifest is not None, "a version is ready with its manifest"
-    assert version.sha256 is not None, "and its digest"
+def _row(version: VersionTable, aliases: tuple[str, ...], note: Note | None) -> VersionRow:
+    assert version.manifest is not None, "a ready version has a manifest"
+    assert version.sha256 is not None, "a ready version has a digest"
     manifest = Manifest.from_json(version.manifest, source=f"the manifest of {version.league}@{version.number}")
-    return VersionRow(
-        league=version.league,
-        number=version.number,
-        source=version.source,
-        sha256=version.sha256,
-        manifest=manifest,
-        aliases=aliases,
-        note=note,
-    )
+    return detached(VersionRow, version, manifest=manifest, aliases=aliases, note=note)

@@ -1,1 +1,1 @@
-"""What was played: plain records and the append-only ledger."""
+"""Results: records of matches, their scores and the append-only ledger."""

@@ -1,4 +1,4 @@
-"""The append-only store of what was played. It takes what its schedules ask for, and each match once."""
+"""The append-only store of matches. It accepts each scheduled match once."""
 
 from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
@@ -8,11 +8,15 @@ from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput, NotFound, UnknownMatch
-from league.registry import leagues, tables
-from league.registry.database import insert
+from league.registry import leagues
 from league.registry.registry import Registry
-from league.results.admission import admit
-from league.results.documents import (
+from league.registry.storage import tables
+from league.registry.storage.database import insert
+from league.results.records import (
+    BlockResult,
+    LedgerEntry,
+    Match,
+    Schedule,
     dump_games,
     dump_numbers,
     dump_schedule,
@@ -20,47 +24,47 @@ from league.results.documents import (
     load_numbers,
     load_schedule,
 )
-from league.results.records import BlockResult, Entry, Match, Schedule
+from league.results.scoring import admit
 
 Columns = TypeVarTuple("Columns")
 STRIDE = 1000
-"""Matches that are read at a time by whoever goes through many."""
+"""Matches per query when iterating over a schedule."""
 
 
 class Ledger:
-    """Schedules and their matches, in the registry's database. Raises StorageError when that fails."""
+    """Schedules and their matches in the registry's database. Raises StorageError if the database fails."""
 
     def __init__(self, registry: Registry) -> None:
         self._database = registry.database
 
     def open(self, schedule: Schedule) -> Schedule:
-        """Store a schedule unless its id is there already; returns the stored one. Raises UnknownLeague."""
+        """Store a schedule unless its id exists; returns the stored one. Raises UnknownLeague."""
         row = {"id": schedule.id, "league": schedule.league, "kind": schedule.kind, "document": dump_schedule(schedule)}
         with self._database.write() as session:
             leagues.require(session, schedule.league)
-            insert(session, tables.Schedule, [row | {"opened_at": datetime.now(UTC)}])
+            insert(session, tables.ScheduleTable, [row | {"opened_at": datetime.now(UTC)}])
             return _schedule(session, schedule.id)
 
     def schedules(self, league: str) -> list[Schedule]:
-        """All schedules of a league, in the order in which they were opened. Raises UnknownLeague."""
+        """Return all schedules of a league in the order in which they were opened. Raises UnknownLeague."""
         with self._database.read() as session:
             return _schedules(session, league)
 
     def purged(self, league: str) -> set[str]:
-        """The schedules of a league whose matches count for nothing."""
-        table = tables.Schedule
+        """Return the ids of the purged schedules of a league, whose matches are not counted."""
+        table = tables.ScheduleTable
         with self._database.read() as session:
             return set(session.scalars(select(table.id).where(table.league == league, table.purged_at.is_not(None))))
 
     def schedule(self, schedule: str) -> Schedule:
-        """One schedule by its id. Raises NotFound."""
+        """Return one schedule. Raises NotFound."""
         with self._database.read() as session:
             return _schedule(session, schedule)
 
     def purge(self, schedules: Collection[str]) -> None:
-        """Let the matches of these schedules count for nothing from now on. They stay, and can be replayed."""
+        """Exclude the matches of these schedules from all results. They are kept and can be replayed."""
         with self._database.write() as session:
-            table = tables.Schedule
+            table = tables.ScheduleTable
             session.execute(
                 update(table)
                 .where(table.id.in_(schedules), table.purged_at.is_(None))
@@ -68,35 +72,40 @@ class Ledger:
             )
 
     def append(self, match: Match) -> bool:
-        """Store a match; False if it is there already. Raises LedgerRefusal if it breaks its schedule."""
+        """Store a match; False if it exists. Raises LedgerConflict if it contradicts its schedule."""
         return self.extend([match]) == 1
 
     def extend(self, matches: Sequence[Match]) -> int:
-        """Store matches, all or none; returns how many were new. Raises LedgerRefusal if one does not fit."""
+        """Store matches, all or none; returns the number of new ones.
+
+        Raises LedgerConflict if one contradicts its schedule.
+        """
         with self._database.write() as session:
             schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
             for match in matches:
                 admit(match, schedules[match.schedule])
-            return insert(session, tables.Match, [row(match) for match in matches])
+            return insert(session, tables.MatchTable, [row(match) for match in matches])
 
     def matches(self, *, league: str, schedule: str | None = None, after: int | None = None) -> list[Match]:
-        """The matches of a league, or of one of its schedules, in schedule order.
+        """Return the matches of a league, or of one of its schedules, in schedule order.
 
-        after: only those at later positions than this.
+        after: return only matches at later positions.
         """
         with self._database.read() as session:
             schedules = {known.id: known for known in _schedules(session, league, schedule)}
-            query = _in_order(select(tables.Match.schedule, tables.Match.position, tables.Match.moves), league)
+            query = _in_order(
+                select(tables.MatchTable.schedule, tables.MatchTable.position, tables.MatchTable.moves), league
+            )
             if schedule is not None:
-                query = query.where(tables.Match.schedule == schedule)
+                query = query.where(tables.MatchTable.schedule == schedule)
             if after is not None:
-                query = query.where(tables.Match.position > after)
+                query = query.where(tables.MatchTable.position > after)
             found = session.execute(query)
             return [schedules[of].match(position, load_games(moves)) for of, position, moves in found]
 
     def walk(self, schedule: Schedule) -> Iterator[Match]:
-        """The matches of a schedule in its order, a few of them in memory at a time."""
-        last, table = -1, tables.Match
+        """Iterate over the matches of a schedule in order, with at most STRIDE of them in memory."""
+        last, table = -1, tables.MatchTable
         query = select(table.position, table.moves).filter_by(schedule=schedule.id).order_by(table.position)
         while True:
             with self._database.read() as session:
@@ -107,14 +116,14 @@ class Ledger:
             last = found[-1].position
 
     def match(self, match: str) -> Match:
-        """One match by its id. Raises UnknownMatch."""
+        """Return one match. Raises UnknownMatch."""
         return self.scheduled_match(match)[1]
 
     def scheduled_match(self, match: str) -> tuple[Schedule, Match]:
-        """One match by its id, with its schedule. Raises UnknownMatch."""
+        """Return one match with its schedule. Raises UnknownMatch."""
         name, position = _place(match)
         with self._database.read() as session:
-            moves = session.scalar(select(tables.Match.moves).filter_by(schedule=name, position=position))
+            moves = session.scalar(select(tables.MatchTable.moves).filter_by(schedule=name, position=position))
             if moves is None:
                 raise _no_match(match)
             schedule = _schedule(session, name)
@@ -122,26 +131,26 @@ class Ledger:
 
     def page(
         self, league: str, *, contestants: tuple[str, str] | None = None, before: str | None = None, limit: int = 20
-    ) -> list[Entry]:
-        """The matches of a league as they were played, newest first, without their moves, purged ones included.
+    ) -> list[LedgerEntry]:
+        """Return at most `limit` matches of a league without moves, newest first, purged ones included.
 
-        contestants: only those between these two, in either order. before: those played before the match of this id.
-        Raises UnknownLeague, or InvalidInput if `before` is no match of the league.
+        contestants: return only matches between these two, in either order. before: return only matches played before
+        this one. Raises UnknownLeague, or InvalidInput if `before` is not a match of the league.
         """
-        table = tables.Match
-        ways = dict.fromkeys((contestants, contestants[::-1])) if contestants else ()
+        table = tables.MatchTable
+        orders = dict.fromkeys((contestants, contestants[::-1])) if contestants else ()
         with self._database.read() as session:
             leagues.require(session, league)
             query = select(*_LISTED).where(table.league == league)
             if before is not None:
                 query = query.where(tuple_(*_PLAYED) < _when_played(session, league, before))
             query = query.order_by(*(column.desc() for column in _PLAYED)).limit(limit)
-            # Each way round is read by itself, as it is then a range of an index.
-            parts = [query.where(table.first == first, table.second == second) for first, second in ways] or [query]
+            # Each order of the contestants is a query of its own, because it is then a range of an index.
+            parts = [query.where(table.first == first, table.second == second) for first, second in orders] or [query]
             return _entries(session, union_all(*(select(part.subquery()) for part in parts)).subquery(), limit)
 
-    def entry(self, match: str) -> Entry:
-        """A match by its id, without its moves. Raises UnknownMatch."""
+    def entry(self, match: str) -> LedgerEntry:
+        """Return one match without moves. Raises UnknownMatch."""
         schedule, position = _place(match)
         with self._database.read() as session:
             one = select(*_LISTED).filter_by(schedule=schedule, position=position)
@@ -151,24 +160,23 @@ class Ledger:
         return found[0]
 
     def positions(self, schedule: str) -> set[int]:
-        """Which positions of a schedule were played."""
+        """Return the positions of a schedule that were played."""
         with self._database.read() as session:
-            return set(session.scalars(select(tables.Match.position).filter_by(schedule=schedule)))
+            return set(session.scalars(select(tables.MatchTable.position).filter_by(schedule=schedule)))
 
     def counts(self, league: str) -> dict[str, int]:
-        """schedule → how many of its matches were played, of all schedules of a league of which any were."""
-        match = tables.Match
+        """Return schedule → number of played matches, of the schedules of a league that have any."""
+        match = tables.MatchTable
         query = select(match.schedule, func.count()).filter_by(league=league).group_by(match.schedule)
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
     def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
-        """The matches of a league without their moves, in schedule order; of one environment if given.
+        """Return the matches of a league without moves, in schedule order; of one environment if given.
 
-        Without those of purged schedules, and those in which the contestants were one team: they say nothing of who is
-        stronger.
+        Excludes purged schedules, and cross-play in one team, which does not show who is stronger.
         """
-        match = tables.Match
+        match = tables.MatchTable
         columns = match.schedule, match.position, match.games, match.scores, match.returns
         with self._database.read() as session:
             schedules = {
@@ -176,46 +184,39 @@ class Ledger:
                 for known in _schedules(session, league)
                 if environment_digest in (None, known.environment_digest) and known.scoring != "team"
             }
-            found = session.execute(_in_order(select(*columns), league).where(tables.Schedule.purged_at.is_(None)))
+            found = session.execute(_in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None)))
             return [
-                BlockResult(
-                    schedule=of,
-                    position=position,
-                    contestants=schedules[of].contestants_at(position),
-                    games=games,
-                    scores=load_numbers(scores),
-                    returns=load_numbers(returns) or None,
-                )
-                for of, position, games, scores, returns in found
-                if of in schedules
+                _result(each, schedules[each.schedule].contestants_at(each.position))
+                for each in found
+                if each.schedule in schedules
             ]
 
 
 _LISTED = tuple(
-    getattr(tables.Match, name)
+    getattr(tables.MatchTable, name)
     for name in ("schedule", "position", "first", "second", "games", "scores", "returns", "played_at")
 )
-_PLAYED = tables.Match.played_at, tables.Match.schedule, tables.Match.position
-"""The order in which matches were played."""
+_PLAYED = tables.MatchTable.played_at, tables.MatchTable.schedule, tables.MatchTable.position
+"""Sort key for the order in which matches were played."""
 
 
 def _schedules(session: Session, league: str, only: str | None = None) -> list[Schedule]:
     leagues.require(session, league)
-    query = select(tables.Schedule.document).filter_by(league=league).order_by(tables.Schedule.sequence)
+    query = select(tables.ScheduleTable.document).filter_by(league=league).order_by(tables.ScheduleTable.sequence)
     if only is not None:
         query = query.filter_by(id=only)
     return [load_schedule(document) for document in session.scalars(query)]
 
 
 def _schedule(session: Session, name: str) -> Schedule:
-    document = session.scalar(select(tables.Schedule.document).filter_by(id=name))
+    document = session.scalar(select(tables.ScheduleTable.document).filter_by(id=name))
     if document is None:
-        raise NotFound(f"no schedule {name!r} was opened")
+        raise NotFound(f"there is no schedule {name!r}")
     return load_schedule(document)
 
 
 def _place(match: str) -> tuple[str, int]:
-    """Schedule and position of a match's id; a position that no match has if it is no id."""
+    """Schedule and position of a match id; position -1, which no match has, if the id is invalid."""
     schedule, _, position = match.rpartition("/")
     return schedule, int(position) if position.isdecimal() and len(position) < 10 else -1
 
@@ -233,20 +234,13 @@ def _when_played(session: Session, league: str, match: str) -> tuple[Any, ...]:
     return tuple(found)
 
 
-def _entries(session: Session, found: Subquery, limit: int) -> list[Entry]:
-    """What was found in the ledger's table, newest first, each with what its schedule says."""
-    schedule, newest_first = tables.Schedule, (found.c[column.key].desc() for column in _PLAYED)
+def _entries(session: Session, found: Subquery, limit: int) -> list[LedgerEntry]:
+    """Join rows of the ledger with their schedules, newest first."""
+    schedule, newest_first = tables.ScheduleTable, (found.c[column.key].desc() for column in _PLAYED)
     query = select(*found.c, schedule.kind, schedule.purged_at).join(schedule, schedule.id == found.c.schedule)
     return [
-        Entry(
-            BlockResult(
-                schedule=each.schedule,
-                position=each.position,
-                contestants=(each.first, each.second),
-                games=each.games,
-                scores=load_numbers(each.scores),
-                returns=load_numbers(each.returns) or None,
-            ),
+        LedgerEntry(
+            _result(each, (each.first, each.second)),
             kind=each.kind,
             played_at=each.played_at,
             is_purged=each.purged_at is not None,
@@ -255,14 +249,19 @@ def _entries(session: Session, found: Subquery, limit: int) -> list[Entry]:
     ]
 
 
+def _result(row: Any, contestants: tuple[str, ...]) -> BlockResult:
+    returns = load_numbers(row.returns) or None
+    return BlockResult(row.schedule, row.position, contestants, row.games, load_numbers(row.scores), returns)
+
+
 def _in_order(query: Select[*Columns], league: str) -> Select[*Columns]:
-    query = query.join(tables.Schedule, tables.Schedule.id == tables.Match.schedule)
-    query = query.where(tables.Schedule.league == league)
-    return query.order_by(tables.Schedule.sequence, tables.Match.position)
+    query = query.join(tables.ScheduleTable, tables.ScheduleTable.id == tables.MatchTable.schedule)
+    query = query.where(tables.ScheduleTable.league == league)
+    return query.order_by(tables.ScheduleTable.sequence, tables.MatchTable.position)
 
 
 def row(match: Match) -> dict[str, Any]:
-    """A match as the ledger keeps it."""
+    """Return the row of a match."""
     result = match.result()
     first, second = match.contestants
     return {

@@ -1,36 +1,36 @@
-"""What was asked to be played and what was played, as plain data.
+"""Records of schedules, matches and games, and their JSON documents.
 
-A *schedule* lists pairings of two contestants in order. A *match* is one block: two games from one seed and one
-opening, in which the two change places. Position i of a schedule is match `"<schedule>/<i>"`, always.
+A *schedule* is an ordered list of pairings of two contestants. A *match* is one block: two games with the same seed and
+opening, in which the contestants swap sides. Position i of a schedule is match `"<schedule>/<i>"`.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 from typing import Any, Literal
 
-from league.seeds import derive
-
 Action = Any
-"""An action as JSON: an integer, or a list (of lists) of numbers, in which a float32 is the double of its value."""
+"""An action as JSON: an integer, or a nested list of numbers. A float32 is stored as the double of equal value."""
 
 Scoring = Literal["game", "side", "team"]
-"""Whom a contestant is compared with: its opponent in the same `game`, its opponent on the same `side` in the other
-game of the block, or nobody, where they are one `team`. See scoring.py."""
+"""What a contestant is compared with: its opponent in the same `game`, the other contestant on the same `side` in the
+other game of the block, or nothing if both are one `team`. See scoring.py."""
 
 GAMES_PER_BLOCK = 2
 
 Reason = Literal["illegal_action", "not_finite", "malformed", "crashed"]
-"""Why a game was forfeited: by an action outside the space or its mask; by one that holds NaN or an infinity; by an
-answer that is no array of the space's shape and kind; by a policy that raised."""
+"""Why a game was forfeited: an action outside the space or its mask; an action with NaN or infinity; an output that is
+not an array of the space's shape and kind; a policy that raised."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Matches to be played, in order.
+    """An ordered list of matches to play.
 
-    pairings[i] are indices into `contestants`: who plays match i. A sequential test that is not bounded by a list
-    repeats its pairings: match i is pairings[i % len(pairings)].
+    pairings[i] are the indices into `contestants` for match i. Pairings repeat, for sequential tests of unknown length:
+    match i is pairings[i % len(pairings)].
     """
 
     id: str
@@ -44,37 +44,39 @@ class Schedule:
     """Pinned references: `connect_four@3`, `script:random`; never an alias."""
     pairings: tuple[tuple[int, ...], ...]
     length: int
-    """Number of matches at most."""
+    """Maximum number of matches."""
     opening_plies: int
-    """Random steps of the environment at the start of each game."""
+    """Random environment steps at the start of each game."""
     scoring: Scoring = "game"
 
     def contestants_at(self, position: int) -> tuple[str, ...]:
-        """Who plays match `position`."""
+        """Return the contestants of match `position`."""
         return tuple(self.contestants[index] for index in self.pairings[position % len(self.pairings)])
 
     def seed_at(self, position: int) -> int:
-        """The seed of match `position`."""
+        """Return the seed of match `position`."""
+        from league.seeds import derive  # NumPy takes 0.1 s to import.
+
         return derive(self.seed, position)
 
     def seat_at(self, position: int) -> int:
-        """The side that one contestant has to itself in each game of match `position`, and the other all others.
+        """Return the side that one contestant controls in each game of match `position`; the other has all other sides.
 
-        It goes round with the rounds of the schedule. With two sides both games of a block have it, whichever it is.
+        It rotates with the rounds of the schedule. With two sides it is constant, because a block plays both seatings.
         """
         return position // len(self.pairings) % len(self.sides) if len(self.sides) > 2 else 0
 
     def seating_at(self, position: int, game: int) -> tuple[int, ...]:
-        """Who controls each side in a game of match `position`: contestant 0 has the seat in game 0, 1 in game 1."""
+        """Return the contestant of each side in a game of match `position`. Contestant g has the seat in game g."""
         seat = self.seat_at(position)
         return tuple(game if side == seat else 1 - game for side in range(len(self.sides)))
 
     def match_id(self, position: int) -> str:
-        """The id of match `position`."""
+        """Return the id of match `position`."""
         return f"{self.id}/{position}"
 
     def match(self, position: int, games: "Sequence[Game]") -> "Match":
-        """The record of match `position`, of which these are the games."""
+        """Return the record of match `position` with these games."""
         return Match(
             id=self.match_id(position),
             league=self.league,
@@ -89,7 +91,7 @@ class Schedule:
 
 @dataclass(frozen=True, slots=True)
 class Forfeit:
-    """A contestant (an index into the match's) had to act as `agent`, and gave no action that could be played."""
+    """A contestant (index) had to act as `agent` and returned no valid action."""
 
     contestant: int
     agent: str
@@ -100,16 +102,16 @@ class Forfeit:
 class Game:
     """One game of a block.
 
-    sides[s] is the contestant (an index into the match's) that controlled side s.
-    opening and actions hold every action, step by step and within a step by the agents' order in the environment, so
-    that stepping a fresh environment from `seed` with them plays the same game again.
-    returns[c] is contestant c's return, the mean over the agents of a side and then over its sides; scores[c] is 1, ½
-    or 0. Both are None for a contestant that took no part: where there is one side, each plays a game alone. Scores are
-    None where the contestants are one team.
+    sides[s] is the contestant (index) that controlled side s.
+    opening and actions contain every action, by step and within a step by the environment's order of agents, so that
+    stepping a new environment from `seed` with them reproduces the game.
+    returns[c] is the return of contestant c, the mean over the agents of a side and then over its sides; scores[c] is
+    1, ½ or 0. Both are None for a contestant that did not take part: with one side, each plays a game alone. Scores are
+    None if the contestants are one team.
 
-    A game that is forfeited ends there, and none of the actions of that step is among its own. Its returns are what had
-    been collected until then: they are checked when it is replayed, and compared with nothing. forfeits: by whom, at
-    most one of each contestant, both where they act at once and neither can.
+    A forfeited game ends at the forfeit, without the actions of that step. Its returns are those collected until then:
+    they are checked in a replay but not compared. forfeits: at most one per contestant, two if both had to act at the
+    same step and neither did.
     """
 
     sides: tuple[int, ...]
@@ -120,17 +122,13 @@ class Game:
     scores: tuple[float | None, ...]
     forfeits: tuple[Forfeit, ...] = ()
 
-    def forfeited_by(self, contestant: int) -> bool:
-        """Whether a contestant (by index) forfeited it."""
-        return any(forfeit.contestant == contestant for forfeit in self.forfeits)
-
 
 @dataclass(frozen=True, slots=True)
 class BlockResult:
-    """A match without its moves: what ratings and payoffs are made of.
+    """A match without its moves, the input of ratings and payoffs.
 
-    games: how many each contestant took part in. scores and returns are sums over those.
-    A block with a forfeit has no returns: those of a game that was broken off are no measure of anybody.
+    games: the number of games of each contestant. scores and returns are sums over them.
+    A block with a forfeit has no returns, because the returns of an aborted game are not comparable.
     """
 
     schedule: str
@@ -142,15 +140,15 @@ class BlockResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """A match as lists of the ledger show it."""
+class LedgerEntry:
+    """A match without its moves, for listings."""
 
     result: BlockResult
     kind: str
-    """Of its schedule."""
+    """Kind of its schedule."""
     played_at: datetime
     is_purged: bool
-    """Whether it counts for nothing."""
+    """Whether it is excluded from results."""
 
     @property
     def id(self) -> str:
@@ -159,7 +157,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """One block of games between the contestants of one position of a schedule."""
+    """The block of games at one position of a schedule."""
 
     id: str
     league: str
@@ -171,17 +169,17 @@ class Match:
     games: tuple[Game, ...]
 
     def score(self, contestant: int) -> float:
-        """Mean score of a contestant (by index) over its games, in [0, 1]."""
+        """Return the mean score of a contestant (index) over its games, in [0, 1]."""
         result = self.result()
         return result.scores[contestant] / result.games
 
     def mean_return(self, contestant: int) -> float | None:
-        """Mean return of a contestant (by index) over its games; None if one of the block was forfeited."""
+        """Return the mean return of a contestant (index) over its games; None if a game of the block was forfeited."""
         result = self.result()
         return None if result.returns is None else result.returns[contestant] / result.games
 
     def result(self) -> BlockResult:
-        """The match without its moves."""
+        """Return the match without its moves."""
         contestants = range(len(self.contestants))
         scores = [[game.scores[c] for game in self.games] for c in contestants]
         returns = [[game.returns[c] for game in self.games] for c in contestants]
@@ -194,3 +192,64 @@ class Match:
             scores=tuple(sum(score for score in own if score is not None) for own in scores),
             returns=tuple(sum(value for value in own if value is not None) for own in returns) if is_whole else None,
         )
+
+
+def dump_schedule(schedule: Schedule) -> str:
+    """Return a schedule as JSON, by field names."""
+    return _dump({name: getattr(schedule, name) for name in Schedule.__slots__})
+
+
+def load_schedule(text: str) -> Schedule:
+    """Return the schedule that `dump_schedule` wrote."""
+    fields = json.loads(text)
+    fields["pairings"] = tuple(tuple(pairing) for pairing in fields["pairings"])
+    return Schedule(**fields | {name: tuple(fields[name]) for name in ("sides", "contestants")})
+
+
+def dump_games(games: Sequence[Game]) -> str:
+    """Return a block as JSON: the common seed and opening, and [sides, actions, returns, scores] of each game, followed
+    by [contestant, agent, reason] of each forfeit."""
+    first = games[0]
+    return _dump([first.seed, first.opening, [_game(game) for game in games]])
+
+
+def load_games(text: str) -> tuple[Game, ...]:
+    """Return the games that `dump_games` wrote."""
+    seed, opening, games = json.loads(text)
+    return tuple(
+        Game(
+            tuple(sides),
+            seed,
+            tuple(opening),
+            tuple(actions),
+            tuple(returns),
+            tuple(scores),
+            tuple(Forfeit(*forfeit) for forfeit in forfeits),
+        )
+        for sides, actions, returns, scores, *forfeits in games
+    )
+
+
+def _game(game: Game) -> list[Any]:
+    return [
+        game.sides,
+        game.actions,
+        game.returns,
+        game.scores,
+        *([forfeit.contestant, forfeit.agent, forfeit.reason] for forfeit in game.forfeits),
+    ]
+
+
+def dump_numbers(numbers: Sequence[float]) -> str:
+    """Return a list of numbers as JSON."""
+    return _dump(numbers)
+
+
+@lru_cache(maxsize=4096)
+def load_numbers(text: str) -> tuple[float, ...]:
+    """Return the list that `dump_numbers` wrote. Cached, because few of these texts are different."""
+    return tuple(json.loads(text))
+
+
+def _dump(document: Any) -> str:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False)

@@ -1,31 +1,36 @@
-"""Who did better: from the returns of a block's two games to 1, ½ or 0 for each contestant in each.
+"""Scores games and validates matches against their schedule.
 
-Where the sides are alike, opponents are compared within each game: the usual win, draw and loss. Where they are not, an
-adversary's return says nothing beside that of the agents it works against, and where there is one side only, nobody is
-in the same game. There a contestant is compared with the other one on the same side in the other game, which has the
-same seed and opening: both have had the same task.
+If sides are symmetric, opponents are compared within each game: win, draw or loss. If they are not, or if there is one
+side, contestants are compared on the same side in the two games of the block, which have the same seed and opening, so
+both had the same task. If both play in one team (cross-play), there is no comparison and no score.
 
-A game that is forfeited is lost by who forfeited it, whatever it had collected, and drawn if both did. Compared by
-side, each comparison takes both games of the block: whoever forfeited one of them loses all comparisons, unless the
-other one forfeited one, too.
+A contestant that forfeits a game loses it, whatever its return; if both forfeit, it is a draw. Compared by side, each
+comparison uses both games of the block: a contestant that forfeits one of them loses all comparisons, unless the other
+contestant forfeits as well.
 
-Where both play in one team (cross-play) there is nothing to compare, and no score.
-
-Otherwise the scores of a block sum to half their number, and change places when the contestants do; so policies that
-play alike score ½ on average, whatever a seat is worth.
+The scores of a block sum to half their number and swap with the contestants, so equal policies score ½ on average.
 """
 
+import math
 from collections.abc import Collection, Sequence
+from typing import get_args
 
-from league.results.records import Scoring
+from league.errors import LedgerConflict
+from league.results.records import GAMES_PER_BLOCK, Game, Match, Reason, Schedule, Scoring
 
 Values = tuple[float | None, ...]
 
 
 def scores(returns: Sequence[Values], scoring: Scoring, forfeits: Sequence[Collection[int]] = ()) -> list[Values]:
-    """returns[g][c]: what contestant c got in game g of its block, None if it took no part; scores likewise.
+    """Score the games of a block.
 
-    forfeits[g]: who forfeited game g; nothing where nobody forfeited any.
+    Args:
+        returns: returns[g][c] is the return of contestant c in game g, None if it did not take part.
+        scoring: what returns are compared with.
+        forfeits: forfeits[g] are the contestants that forfeited game g; empty if there are none.
+
+    Returns:
+        Scores in {0, ½, 1}, indexed like `returns`; None where nothing is compared.
     """
     broken = [set(by) for by in forfeits] or [set[int]() for _ in returns]
     if scoring == "side":
@@ -46,3 +51,58 @@ def _score(
     if broken:
         mine, other = float(contestant not in broken), float(1 - contestant not in broken)
     return 1.0 if mine > other else 0.5 if mine == other else 0.0
+
+
+def admit(match: Match, schedule: Schedule) -> None:
+    """Raise LedgerConflict, which names the difference, unless `match` conforms to `schedule`."""
+    if not 0 <= match.position < schedule.length:
+        raise _refusal(match, f"its schedule ends before position {schedule.length}")
+    expected = {
+        "id": schedule.match_id(match.position),
+        "league": schedule.league,
+        "schedule": schedule.id,
+        "contestants": schedule.contestants_at(match.position),
+        "seed": schedule.seed_at(match.position),
+        "environment_digest": schedule.environment_digest,
+    }
+    for name, value in expected.items():
+        if getattr(match, name) != value:
+            raise _refusal(match, f"its {name} is {getattr(match, name)!r}, but {value!r} in its schedule")
+    if len(match.games) != GAMES_PER_BLOCK:
+        raise _refusal(match, f"it has {len(match.games)} games, expected {GAMES_PER_BLOCK}")
+    for index, game in enumerate(match.games):
+        _admit_game(match, schedule, index, game)
+    returns = [game.returns for game in match.games]
+    forfeits = [{forfeit.contestant for forfeit in game.forfeits} for game in match.games]
+    for index, expected_scores in enumerate(scores(returns, schedule.scoring, forfeits)):
+        if match.games[index].scores != expected_scores:
+            given, ground = match.games[index].scores, "forfeits" if any(forfeits) else "returns"
+            raise _refusal(match, f"game {index} has the scores {given}, but its {ground} say {expected_scores}")
+
+
+def _admit_game(match: Match, schedule: Schedule, index: int, game: Game) -> None:
+    seating = schedule.seating_at(match.position, index)
+    if game.sides != seating:
+        raise _refusal(match, f"game {index} has its sides played by {game.sides}, expected {seating}")
+    if game.seed != match.seed:
+        raise _refusal(match, f"game {index} has the seed {game.seed}, not the block's")
+    # A step has one action in turn-based games and several in simultaneous ones.
+    is_whole = len(game.opening) >= schedule.opening_plies and bool(game.opening) == bool(schedule.opening_plies)
+    if not is_whole or game.opening != match.games[0].opening:
+        raise _refusal(match, f"game {index} has another opening than the block's {schedule.opening_plies} steps")
+    finite = [value is not None and math.isfinite(value) for value in game.returns]
+    if finite != [contestant in seating for contestant in range(len(match.contestants))]:
+        raise _refusal(match, f"game {index} needs a finite return of each contestant that played, not {game.returns}")
+    for forfeit in game.forfeits:
+        if forfeit.contestant not in seating:
+            raise _refusal(
+                match, f"game {index} is forfeited by contestant {forfeit.contestant}, which did not play it"
+            )
+        if forfeit.reason not in get_args(Reason):
+            raise _refusal(match, f"game {index} has a forfeit with an unknown reason: {forfeit.reason!r}")
+    if len({forfeit.contestant for forfeit in game.forfeits}) < len(game.forfeits):
+        raise _refusal(match, f"game {index} has two forfeits of one contestant")
+
+
+def _refusal(match: Match, reason: str) -> LedgerConflict:
+    return LedgerConflict(f"match {match.id} is refused: {reason}")

@@ -1,6 +1,7 @@
-"""What there is to ask for: the server, its models with their inputs and outputs, and the repository's index.
+"""Describes the server and its models in the Open Inference Protocol: metadata, configuration, statistics and the
+index.
 
-Everything is a JSON document of the protocol, which gRPC's messages are made from, too.
+Descriptions are JSON documents, from which the gRPC messages are built, too.
 """
 
 from collections.abc import Iterable
@@ -9,44 +10,46 @@ from typing import Any
 
 from league.errors import StorageError
 from league.registry.registry import Registry
-from serve_app.inference_protocol.inference import Inference, Served
-from serve_app.inference_protocol.signature import Port
-from serve_app.inference_protocol.statistics import Entry
-from serve_app.models import Models
+from serve_app.inference_protocol.inference import Inference, ProtocolModel
+from serve_app.inference_protocol.statistics import ModelStatistics
+from serve_app.inference_protocol.tensors import TensorSpec
+from serve_app.models.resolver import ModelResolver
+from serve_app.models.version_cache import VersionCache
 from serve_app.settings import ServeSettings
-from serve_app.versions import Versions
 
 PACKAGE = "policy-league"
 PLATFORM = "onnxruntime_onnx"
 BACKEND = "onnxruntime"
 EXTENSIONS = ["binary_tensor_data", "model_configuration", "model_repository", "statistics"]
-LOADED_LATER = "it is loaded when it is asked for"
+NOT_LOADED = "loaded on demand"
 
 Document = dict[str, Any]
 
 
-class Catalogue:
-    """Describes what a replica serves."""
+class ModelCatalogue:
+    """Describes the models of a replica."""
 
-    def __init__(self, models: Models, versions: Versions, inference: Inference, settings: ServeSettings) -> None:
+    def __init__(
+        self, models: ModelResolver, versions: VersionCache, inference: Inference, settings: ServeSettings
+    ) -> None:
         self._models = models
         self._versions = versions
         self._inference = inference
         self._settings = settings
 
     def server(self) -> Document:
-        """Name, version and the protocol's extensions that are there."""
+        """Name, version and supported extensions of the server."""
         return {"name": PACKAGE, "version": installed(PACKAGE), "extensions": EXTENSIONS}
 
     async def metadata(self, model: str, version: str) -> Document:
-        """Inputs and outputs, -1 for the batch. Without a database, only the version asked for is told.
+        """Inputs and outputs, with -1 for the batch. Without a database, lists the requested version only.
 
-        Raises what `Models.find` raises.
+        Raises the errors of `ModelResolver.find`.
         """
         served = await self._inference.find(model, version)
         league = served.version.league
         try:
-            numbers = (await self._models.ask(lambda registry: registry.version_numbers(league)))[league]
+            numbers = (await self._models.query(lambda registry: registry.versions.numbers(league)))[league]
         except StorageError:
             numbers = [served.version.number]
         return {
@@ -58,7 +61,7 @@ class Catalogue:
         }
 
     async def config(self, model: str, version: str) -> Document:
-        """Triton's model configuration. Raises what `Models.find` raises."""
+        """Triton's model configuration. Raises the errors of `ModelResolver.find`."""
         served = await self._inference.find(model, version)
         signature = served.signature
         return {
@@ -71,21 +74,20 @@ class Catalogue:
         }
 
     async def statistics(self, model: str = "", version: str = "") -> Document:
-        """Of all models, of all versions of one, or of one version. Raises what `Models.find` raises."""
+        """Statistics of all models, all versions of a model, or one version. Raises the errors of
+        `ModelResolver.find`."""
         statistics = self._inference.statistics
         if not model:
             return {"model_stats": statistics.documents()}
         served = await self._inference.find(model, version)
         found = statistics.documents(served.name, served.version.number if version else None)
-        return {"model_stats": found or [_unused(served)]}
+        return {"model_stats": found or [_empty_statistics(served)]}
 
     async def index(self, only_ready: bool = False) -> list[Document]:
-        """Every version of every policy; those in memory are ready, the others are by the time they answer.
-
-        Raises StorageError.
-        """
-        policies, numbers = await self._models.ask(_published)
-        loaded = self._versions.loaded()
+        """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises
+        StorageError."""
+        policies, numbers = await self._models.query(_models_and_versions)
+        loaded = self._versions.cached_keys()
         return [
             {"name": name, "version": str(number)} | state
             for league, names in policies.items()
@@ -96,26 +98,26 @@ class Catalogue:
         ]
 
 
-def _published(registry: Registry) -> tuple[dict[str, list[str]], dict[str, list[int]]]:
-    """league → names of its models, and → numbers of its versions."""
+def _models_and_versions(registry: Registry) -> tuple[dict[str, list[str]], dict[str, list[int]]]:
+    """league → names of its models, and league → numbers of its versions."""
     models = {}
-    for row in registry.leagues():
+    for row in registry.leagues.all():
         policies = row.interface.policy_ids
         models[row.slug] = [row.slug] if len(policies) == 1 else [f"{row.slug}.{policy}" for policy in policies]
-    return models, registry.version_numbers()
+    return models, registry.versions.numbers()
 
 
 def _state(is_loaded: bool) -> Document:
-    return {"state": "READY"} if is_loaded else {"state": "UNAVAILABLE", "reason": LOADED_LATER}
+    return {"state": "READY"} if is_loaded else {"state": "UNAVAILABLE", "reason": NOT_LOADED}
 
 
-def _tensors(ports: Iterable[Port]) -> list[Document]:
+def _tensors(ports: Iterable[TensorSpec]) -> list[Document]:
     return [{"name": port.name, "datatype": port.datatype, "shape": [-1, *port.leaf.shape]} for port in ports]
 
 
-def _configured(port: Port) -> Document:
+def _configured(port: TensorSpec) -> Document:
     return {"name": port.name, "data_type": f"TYPE_{port.datatype}", "dims": list(port.leaf.shape)}
 
 
-def _unused(served: Served) -> Document:
-    return Entry().document(served.name, served.version.number)
+def _empty_statistics(served: ProtocolModel) -> Document:
+    return ModelStatistics().document(served.name, served.version.number)

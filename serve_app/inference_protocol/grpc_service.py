@@ -1,35 +1,119 @@
-"""The protocol over gRPC: what each call answers, from the same policies as REST."""
+"""The Open Inference Protocol over gRPC: messages to requests and back, and the service that answers them."""
 
 from collections.abc import Awaitable, Callable
+from functools import lru_cache
+from ipaddress import IPv6Address, ip_address
 from typing import Any
+from urllib.parse import unquote
 
 import grpc
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import Message
 
-from league.errors import ArtifactCorrupt, BodyTooLarge, LeagueError, NotFound, NotReady, StorageError
-from serve_app.alias_watcher import AliasWatcher
-from serve_app.doors import Doors, headers_of
+from league.errors import ArtifactCorrupt, BodyTooLarge, InvalidInput, LeagueError, NotFound, NotReady, StorageError
+from serve_app.access.access_control import AccessControl, headers_of
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from serve_app.inference_protocol.catalogue import Catalogue, Document
-from serve_app.inference_protocol.grpc_messages import read_request, write_response
-from serve_app.inference_protocol.inference import Inference
-from serve_app.inference_protocol.peers import is_of
+from serve_app.inference_protocol.catalogue import Document, ModelCatalogue
+from serve_app.inference_protocol.inference import Inference, InferRequest, InferResponse
+from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
+from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
+from serve_app.models.alias_watcher import AliasWatcher
+from serve_app.models.traffic_split import Headers
 from serve_app.settings import ServeSettings
-from serve_app.traffic import Headers
+
+CONTENTS = {
+    "BOOL": "bool_contents",
+    "INT8": "int_contents",
+    "INT16": "int_contents",
+    "INT32": "int_contents",
+    "INT64": "int64_contents",
+    "UINT8": "uint_contents",
+    "UINT16": "uint_contents",
+    "UINT32": "uint_contents",
+    "UINT64": "uint64_contents",
+    "FP32": "fp32_contents",
+    "FP64": "fp64_contents",
+}
+"""Field with the elements of a datatype if they are not sent as bytes. FP16 has none."""
+
+
+def read_request(request: messages.ModelInferRequest) -> InferRequest:
+    """Convert a message to a request. Raises InvalidInput."""
+    for tensor in (*request.inputs, *request.outputs):
+        for name in UNSUPPORTED:
+            if name in tensor.parameters:
+                raise InvalidInput(f"{tensor.name[:64]!r} requests {name}, which this server does not support")
+    raw_inputs = request.raw_input_contents
+    if raw_inputs and len(raw_inputs) != len(request.inputs):
+        raise InvalidInput(f"{len(raw_inputs)} raw_input_contents for {len(request.inputs)} inputs, expected one each")
+    sequence = request.parameters.get(SEQUENCE)
+    return InferRequest(
+        model=request.model_name,
+        version=request.model_version,
+        id=request.id,
+        inputs=[_tensor(tensor, raw_inputs[i] if raw_inputs else None) for i, tensor in enumerate(request.inputs)],
+        outputs=[output.name for output in request.outputs],
+        is_sequence=sequence is not None and bool(sequence.int64_param or sequence.string_param),
+    )
+
+
+def _tensor(tensor: messages.ModelInferRequest.InferInputTensor, contents: bytes | None) -> RequestTensor:
+    data: Data
+    if contents is not None:
+        if tensor.HasField("contents"):
+            raise InvalidInput(f"input {tensor.name[:64]!r} has both contents and raw_input_contents")
+        data = contents
+    elif (field := CONTENTS.get(tensor.datatype)) is not None:
+        data = list(getattr(tensor.contents, field))
+    else:
+        raise InvalidInput(f"input {tensor.name[:64]!r} has datatype {tensor.datatype[:64]!r}: send it as bytes")
+    return RequestTensor(tensor.name, tensor.datatype, tensor.shape, data)
+
+
+def write_response(response: InferResponse) -> messages.ModelInferResponse:
+    """Convert a response to a message, with all outputs as bytes."""
+    outputs = response.outputs
+    return messages.ModelInferResponse(
+        model_name=response.model,
+        model_version=response.version,
+        id=response.id,
+        outputs=[
+            messages.ModelInferResponse.InferOutputTensor(name=name, datatype=datatype_of(array), shape=array.shape)
+            for name, array in outputs.items()
+        ],
+        raw_output_contents=[to_bytes(array) for array in outputs.values()],
+    )
+
+
+@lru_cache(maxsize=1024)  # constant for a connection
+def is_local_peer(peer: str, machine: str) -> bool:
+    """Whether a peer address is on this machine: `ipv4:127.0.0.1:4711`, `ipv6:%5B::1%5D:4711`, `unix:` or the node's
+    address.
+    """
+    kind, _, rest = unquote(peer).partition(":")
+    if kind == "unix":
+        return True
+    try:
+        address = ip_address(rest.rpartition(":")[0].strip("[]"))
+    except ValueError:
+        return False
+    if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
+        address = address.ipv4_mapped
+    return address.is_loopback or str(address) == machine
+
 
 INFER = "ModelInfer"
 
 
 class InferenceService:
-    """The calls of a replica. `machine` is the address by which its node is known; `count` is told of each error."""
+    """The gRPC service of a replica. `machine`: the node's address; `count`: called for each error."""
 
     def __init__(
         self,
         inference: Inference,
-        catalogue: Catalogue,
+        catalogue: ModelCatalogue,
         watcher: AliasWatcher,
-        doors: Doors,
+        access: AccessControl,
         settings: ServeSettings,
         machine: str,
         count: Callable[[str, str], None],
@@ -37,7 +121,7 @@ class InferenceService:
         self._inference = inference
         self._catalogue = catalogue
         self._watcher = watcher
-        self._doors = doors
+        self._access = access
         self._settings = settings
         self._machine = machine
         self._count = count
@@ -54,12 +138,12 @@ class InferenceService:
 
     async def call(self, rpc: str, request: Message, context: grpc.aio.ServicerContext) -> Message:
         """Answer a call. Raises LeagueError."""
-        if self._settings.grpc_local_only and not is_of(context.peer(), self._machine):
-            raise NotReady("a replica answers gRPC from its own machine alone: call the server's port")
+        if self._settings.grpc_local_only and not is_local_peer(context.peer(), self._machine):
+            raise NotReady("replicas accept gRPC from their own machine only: call the server's port")
         model = getattr(request, "model_name", "") or getattr(request, "name", "")
         metadata = context.invocation_metadata()
         try:
-            self._doors.admit_rpc(metadata, rpc, model)
+            self._access.admit_rpc(metadata, rpc, model)
             if request.ByteSize() > self._settings.max_body:
                 raise BodyTooLarge(f"the message is larger than {self._settings.max_body} bytes")
             if rpc == INFER:

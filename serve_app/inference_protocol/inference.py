@@ -1,4 +1,5 @@
-"""One inference, however it was asked for: find the policy, check the tensors, run the graph, count what it took."""
+"""Executes inference requests of the protocol, over REST and gRPC: resolves the policy, checks inputs, runs the
+graph."""
 
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
@@ -13,59 +14,58 @@ from league.errors import InvalidInput, Overloaded
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.policies.policy import Actions
 from league.refs import CHAMPION
-from serve_app.inference_protocol.signature import Signature, signature_of
 from serve_app.inference_protocol.statistics import Statistics
-from serve_app.inference_protocol.tensors import Tensor, read_inputs
-from serve_app.loading import LoadedPolicy, LoadedVersion
-from serve_app.metrics import Metrics
-from serve_app.models import Models, policy_ref
+from serve_app.inference_protocol.tensors import RequestTensor, Signature, read_inputs, signature_of
+from serve_app.models.resolver import ModelResolver, policy_ref
+from serve_app.models.shadow import MirrorFunction, Shadow
+from serve_app.models.traffic_split import Headers
+from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.observability.metrics import Metrics
 from serve_app.settings import ServeSettings
-from serve_app.shadow import Shadow, Show
-from serve_app.traffic import Headers
 
 T = TypeVar("T")
 API = "infer"
-"""What inferences are called in metrics, over REST and gRPC."""
+"""Name of inference requests in metrics."""
 
 
 class InferRequest(NamedTuple):
-    """What is asked, of whom."""
+    """An inference request."""
 
     model: str
     version: str
     """A number or an alias; empty for the champion."""
     id: str
-    inputs: Sequence[Tensor]
+    inputs: Sequence[RequestTensor]
     outputs: Sequence[str]
-    """Names of the outputs that are wanted; none means all."""
+    """Names of the requested outputs; all if empty."""
     is_sequence: bool = False
-    """Whether the server is asked to keep state between requests."""
+    """Whether the client expects the server to keep state between requests."""
 
 
 class InferResponse(NamedTuple):
-    """What is answered."""
+    """An inference response."""
 
     model: str
     version: str
     id: str
     outputs: dict[str, NDArray]
-    """In the order in which they were asked for."""
+    """In the requested order."""
 
 
-class Served(NamedTuple):
-    """A policy with what the protocol says of it."""
+class ProtocolModel(NamedTuple):
+    """A policy with its signature in the protocol."""
 
     name: str
-    """`{league}`, or `{league}.{policy}` where a version has several policies."""
+    """`{league}`, or `{league}.{policy}` if a version has several policies."""
     version: LoadedVersion
     policy: LoadedPolicy
     signature: Signature
 
 
 class Inference:
-    """The policies of a replica under the protocol. Runs on the event loop."""
+    """Executes inference requests of a replica. Runs on the event loop."""
 
-    def __init__(self, models: Models, shadow: Shadow, metrics: Metrics, settings: ServeSettings) -> None:
+    def __init__(self, models: ModelResolver, shadow: Shadow, metrics: Metrics, settings: ServeSettings) -> None:
         self._models = models
         self._shadow = shadow
         self._metrics = metrics
@@ -73,45 +73,45 @@ class Inference:
         self._signatures: WeakKeyDictionary[LoadedPolicy, Signature] = WeakKeyDictionary()
         self.statistics = Statistics()
         self.in_flight = 0
-        """Requests that were begun and not answered yet."""
+        """Requests in flight."""
 
     @contextmanager
     def admitted(self) -> Iterator[None]:
         """Count a request while it is in progress. Raises Overloaded."""
         if self.in_flight >= self._settings.max_in_flight:
-            raise Overloaded(f"{self.in_flight} requests are in progress here already")
+            raise Overloaded(f"{self.in_flight} requests are in progress in this replica")
         self.in_flight += 1
         try:
             yield
         finally:
             self.in_flight -= 1
 
-    async def find(self, model: str, version: str, headers: Headers = ()) -> Served:
-        """What answers for a model. Raises what `Models.find` raises."""
+    async def find(self, model: str, version: str, headers: Headers = ()) -> ProtocolModel:
+        """The policy that answers for a model. Raises the errors of `ModelResolver.find`."""
         loaded, policy = await self._models.find(model, version or CHAMPION, headers)
         signature = self._signatures.get(policy)
         if signature is None:
             signature = self._signatures[policy] = signature_of(policy.manifest)
         name = loaded.league if len(loaded.policies) == 1 else str(policy_ref(model))
-        return Served(name, loaded, policy, signature)
+        return ProtocolModel(name, loaded, policy, signature)
 
     async def infer(self, request: InferRequest, encode: Callable[[InferResponse], T], headers: Headers = ()) -> T:
-        """Answer a request in the form that `encode` gives it. Raises LeagueError.
+        """Execute a request and encode the response. Raises LeagueError.
 
-        headers: the request's, whose key may send a request for a champion to its canary.
+        headers: those of the request; the caller's key may route a request for the champion to the canary.
         """
         begun = perf_counter_ns()
         served = await self.find(request.model, request.version, headers)
-        show = self._shadow.of(request.model, served.version)
+        mirror = self._shadow.mirror_for(request.model, served.version)
         found = perf_counter_ns()
         entry = self.statistics.entry(served.name, served.version.number)
         try:
             wanted = _wanted(request.outputs, served.signature)
             if request.is_sequence and served.signature.is_recurrent:
-                raise InvalidInput("no state is kept between requests: send state_out_<i> back as state_in_<i>")
+                raise InvalidInput("sequences are not supported: send state_out_<i> back as state_in_<i>")
             arrays = read_inputs(request.inputs, served.signature, self._settings.max_batch)
             read = perf_counter_ns()
-            outputs = await _run(arrays, wanted, served, show)
+            outputs = await _run(arrays, wanted, served, mirror)
             ran = perf_counter_ns()
             response = InferResponse(request.model, str(served.version.number), request.id, outputs)
             encoded = encode(response)
@@ -121,24 +121,24 @@ class Inference:
         rows = len(next(iter(arrays.values())))
         done = perf_counter_ns()
         entry.succeed(rows, begun, found, read, ran, done)
-        self._metrics.answered(API, request.model, served.version, rows, done - begun)
+        self._metrics.count_request(API, request.model, served.version, rows, done - begun)
         return encoded
 
 
 def _wanted(outputs: Sequence[str], signature: Signature) -> Sequence[str]:
-    """Raises InvalidInput."""
+    """Names of the requested outputs. Raises InvalidInput."""
     if not outputs:
         return list(signature.outputs)
     for name in outputs:
         if name not in signature.outputs:
-            raise InvalidInput(f"there is no output {name[:64]!r}, expected {', '.join(signature.outputs)}")
+            raise InvalidInput(f"unknown output {name[:64]!r}, expected {', '.join(signature.outputs)}")
     if len(set(outputs)) < len(outputs):
-        raise InvalidInput("an output is asked for twice")
+        raise InvalidInput("an output is requested twice")
     return outputs
 
 
 async def _run(
-    arrays: dict[str, NDArray], wanted: Sequence[str], served: Served, show: Show | None
+    arrays: dict[str, NDArray], wanted: Sequence[str], served: ProtocolModel, mirror: MirrorFunction | None
 ) -> dict[str, NDArray]:
     ports, policy = served.signature.inputs, served.policy.policy
     state = {name: array for name, array in arrays.items() if ports[name].is_state} or None
@@ -150,8 +150,8 @@ async def _run(
 
     rows = len(next(iter(arrays.values())))
     answer = act() if rows <= served.policy.inline_rows else await asyncio.to_thread(act)
-    if show is not None:
-        show({name: array for name, array in arrays.items() if not ports[name].is_state}, state, answer.actions)
+    if mirror is not None:
+        mirror({name: array for name, array in arrays.items() if not ports[name].is_state}, state, answer.actions)
     return {name: _output(name, answer) for name in wanted}
 
 

@@ -1,10 +1,10 @@
-"""The protocol over REST, below /v2.
+"""Routes of the Open Inference Protocol over REST, below /v2.
 
-GET   v2 · v2/health/live · v2/health/ready · v2/models/M[/versions/V] · …/ready · …/config · …/stats · v2/models/stats
-POST  v2/models/M[/versions/V]/infer · v2/repository/index
+    GET   v2, v2/health/live, v2/health/ready, v2/models/M[/versions/V], …/ready, …/config, …/stats, v2/models/stats
+    POST  v2/models/M[/versions/V]/infer, v2/repository/index
 
 M is `{league}` or `{league}.{policy}`; V is a number or an alias, by default the champion. Statistics are those of the
-replica that answers. An error is `{"error": "…"}`.
+replica that answers. Errors are `{"error": "…"}`.
 """
 
 from typing import Any
@@ -16,20 +16,19 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, NotReady
-from serve_app.access_log import LINE, answered_by
-from serve_app.alias_watcher import AliasWatcher
-from serve_app.bodies import parse_object, read_bytes
-from serve_app.inference_protocol.catalogue import Catalogue
-from serve_app.inference_protocol.compression import compressed, decompressed
-from serve_app.inference_protocol.framing import read_request, write_response
+from serve_app.access.access_log import LOG_ENTRY, log_version
+from serve_app.access.request_body import parse_json_object, read_bytes
+from serve_app.inference.action_request import REPLICA
+from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
-from serve_app.routes.action import REPLICA
+from serve_app.inference_protocol.rest_codec import compressed, decompressed, read_request, write_response
+from serve_app.models.alias_watcher import AliasWatcher
 from serve_app.settings import ServeSettings
 
 JSON, BINARY = b"application/json", b"application/octet-stream"
 HEADER_LENGTH = b"inference-header-content-length"
 LENGTH_DIGITS = 10
-"""A longer number of bytes is none."""
+"""Maximum digits of a length header."""
 
 
 class RestRoutes:
@@ -38,7 +37,7 @@ class RestRoutes:
     def __init__(
         self,
         inference: Inference,
-        catalogue: Catalogue,
+        catalogue: ModelCatalogue,
         watcher: AliasWatcher,
         settings: ServeSettings,
         replica: str,
@@ -50,7 +49,7 @@ class RestRoutes:
         self._watcher = watcher
 
     def routes(self) -> list[Route]:
-        """For Starlette, the most frequent first."""
+        """Routes for Starlette, the most frequent first."""
         infer = [
             Route(f"{model}/infer", self._infer, methods=["POST"])
             for model in ("/v2/models/{model}", "/v2/models/{model}/versions/{version}")
@@ -82,7 +81,7 @@ class RestRoutes:
 
     async def _ready(self, _: Request) -> Response:
         if not self._watcher.is_ready:
-            raise NotReady("this replica does not follow the registry's aliases yet")
+            raise NotReady("this replica has not loaded the registry's aliases yet")
         return _json({"ready": True})
 
     async def _model_ready(self, request: Request) -> Response:
@@ -101,15 +100,15 @@ class RestRoutes:
 
     async def _index(self, request: Request) -> Response:
         body = await read_bytes(request.scope, request.receive, self._settings.max_body)
-        asked = parse_object(body) if body else {}
-        only_ready = asked.pop("ready", False)
-        if asked or type(only_ready) is not bool:
+        options = parse_json_object(body) if body else {}
+        only_ready = options.pop("ready", False)
+        if options or type(only_ready) is not bool:
             raise InvalidInput('the body must be {"ready": true}, {"ready": false} or empty')
         return _json(await self._catalogue.index(only_ready))
 
 
 class InferRoute:
-    """POST …/infer, an ASGI application of its own: the hot path."""
+    """POST …/infer as a plain ASGI application: the hot path."""
 
     def __init__(self, inference: Inference, settings: ServeSettings, replica: str) -> None:
         self._inference = inference
@@ -119,9 +118,9 @@ class InferRoute:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a POST. Raises LeagueError."""
         with self._inference.admitted():
-            await self._answer(scope, receive, send)
+            await self._handle(scope, receive, send)
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         header_length, encoding, accepted = _headers(scope)
         limit = self._settings.max_body
         body = await read_bytes(scope, receive, limit)
@@ -131,8 +130,8 @@ class InferRoute:
         request = read_request(named["model"], named.get("version", ""), body, header_length)
 
         def write(response: InferResponse) -> tuple[bytes, int | None]:
-            if LINE in scope:
-                answered_by(scope, response.model, int(response.version))
+            if LOG_ENTRY in scope:
+                log_version(scope, response.model, int(response.version))
             return write_response(response, request)
 
         reply, length = await self._inference.infer(request.infer, write, scope["headers"])
@@ -165,7 +164,7 @@ def _headers(scope: Scope) -> tuple[int | None, bytes, bytes]:
 
 
 def _named(request: Request) -> tuple[str, str]:
-    """Model and version of a path, each empty where it has none."""
+    """Model and version of a path, empty if absent."""
     return request.path_params.get("model", ""), request.path_params.get("version", "")
 
 

@@ -1,7 +1,8 @@
-"""What a replica has inferred, by policy and version, in the protocol's terms: counts, and time in nanoseconds.
+"""Inference statistics of a replica by policy and version, in the protocol's format: counts and durations in
+nanoseconds.
 
-An inference counts once for each of its rows, an execution once for each run of a graph. Nothing waits in a queue, and
-nothing is cached; the protocol's places for both hold 0.
+Each row counts as an inference, and each run of a graph as an execution. There is neither a queue nor a cache; their
+fields are 0.
 """
 
 import time
@@ -9,13 +10,13 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-KEPT = 1024
-"""Policies and versions of which something is kept; those that were not asked for longest are forgotten."""
+MAX_ENTRIES = 1024
+"""Maximum policies and versions with statistics; the least recently used are dropped."""
 
 
 @dataclass(slots=True)
 class Duration:
-    """How often something was done, and how long that took altogether."""
+    """A count and the total duration."""
 
     count: int = 0
     ns: int = 0
@@ -29,27 +30,27 @@ class Duration:
 
 
 @dataclass(slots=True)
-class Entry:
-    """One version of one policy."""
+class ModelStatistics:
+    """Statistics of one version of one policy."""
 
     last_inference: int = 0
-    """Milliseconds since 1970; 0 before the first."""
+    """Milliseconds since the epoch; 0 before the first."""
     inference_count: int = 0
     success: Duration = field(default_factory=Duration)
     failure: Duration = field(default_factory=Duration)
     input: Duration = field(default_factory=Duration)
-    """Reading and checking tensors."""
+    """Decoding and checking tensors."""
     infer: Duration = field(default_factory=Duration)
-    """Running the graph, with the wait for a thread if the batch is large."""
+    """Running the graph, including the wait for a thread if the batch is large."""
     output: Duration = field(default_factory=Duration)
-    """Making the reply."""
+    """Encoding the response."""
 
     def fail(self, ns: int) -> None:
-        """A request was refused or failed after `ns` nanoseconds."""
+        """Count a request that failed after `ns` nanoseconds."""
         self.failure.add(ns)
 
     def succeed(self, rows: int, begun: int, found: int, read: int, ran: int, done: int) -> None:
-        """A request of `rows` observations was answered; the others are points in time, in nanoseconds."""
+        """Count a request of `rows` observations; the other arguments are times in nanoseconds."""
         self.last_inference = time.time_ns() // 1_000_000
         self.inference_count += rows
         self.success.add(done - begun)
@@ -58,7 +59,7 @@ class Entry:
         self.output.add(done - ran)
 
     def document(self, name: str, version: int) -> dict[str, Any]:
-        """As the statistics extension has it."""
+        """In the format of the statistics extension."""
         nothing = Duration().document()
         return {
             "name": name,
@@ -80,24 +81,24 @@ class Entry:
 
 
 class Statistics:
-    """The entries of a replica, since it started."""
+    """Statistics of a replica since it started."""
 
     def __init__(self) -> None:
-        self._entries: OrderedDict[tuple[str, int], Entry] = OrderedDict()
+        self._entries: OrderedDict[tuple[str, int], ModelStatistics] = OrderedDict()
 
-    def entry(self, name: str, version: int) -> Entry:
-        """The entry to count in; made if need be."""
+    def entry(self, name: str, version: int) -> ModelStatistics:
+        """The entry of a version, created if necessary."""
         key = (name, version)
         if (entry := self._entries.get(key)) is None:
-            entry = self._entries[key] = Entry()
-            if len(self._entries) > KEPT:
+            entry = self._entries[key] = ModelStatistics()
+            if len(self._entries) > MAX_ENTRIES:
                 self._entries.popitem(last=False)
         else:
             self._entries.move_to_end(key)
         return entry
 
     def documents(self, name: str | None = None, version: int | None = None) -> list[dict[str, Any]]:
-        """The entries of a model and a version, by default of all."""
+        """The entries of a model and a version, by default all."""
         return [
             entry.document(of, number)
             for (of, number), entry in sorted(self._entries.items())

@@ -1,9 +1,11 @@
-"""Tensors of a request → arrays that a graph takes, checked as the action route checks its observations.
+"""Tensors of the Open Inference Protocol: datatypes, the signature of a policy, and checked request inputs.
 
-Nothing is converted: a tensor has the datatype and the shape of the manifest, with the batch in front.
+BYTES and BF16 are not supported: no space or graph has elements of these types. Nothing is converted: a tensor must
+have the datatype and shape of the manifest, with the batch as the first dimension.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import chain
 from math import prod
 from typing import Any, NamedTuple
@@ -12,16 +14,101 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, ObservationError
-from league.spaces import ACTION_MASK, check, check_mask
-from serve_app.inference_protocol.datatypes import from_bytes
-from serve_app.inference_protocol.signature import Port, Signature
+from league.policies.onnx import ACTION, DIST_INPUTS, STATE_OUT
+from league.registry.storage.manifest import PolicyManifest
+from league.spaces import ACTION_MASK, Box, Leaf, inputs
+from league.spaces.arrays import check, check_mask
+
+DATATYPES = {
+    "bool": "BOOL",
+    "int8": "INT8",
+    "int16": "INT16",
+    "int32": "INT32",
+    "int64": "INT64",
+    "uint8": "UINT8",
+    "uint16": "UINT16",
+    "uint32": "UINT32",
+    "uint64": "UINT64",
+    "float16": "FP16",
+    "float32": "FP32",
+    "float64": "FP64",
+}
+"""NumPy dtype → the protocol's datatype."""
+
+_BY_DTYPE = {
+    np.dtype(name): datatype for name, datatype in DATATYPES.items()
+}  # computing a dtype's name takes microseconds
+
+
+def datatype_of(array: NDArray) -> str:
+    """The protocol's datatype of an array."""
+    return _BY_DTYPE[array.dtype]
+
+
+def to_bytes(array: NDArray) -> bytes:
+    """Elements in wire format: row-major, little-endian, one byte per BOOL."""
+    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+
+
+def from_bytes(data: bytes | memoryview, dtype: str) -> NDArray:
+    """Elements from wire format as a one-dimensional array, which may be read-only and unaligned."""
+    return np.frombuffer(data, np.dtype(dtype).newbyteorder("<"))
+
+
+@dataclass(frozen=True, slots=True)
+class TensorSpec:
+    """The specification of one input or output."""
+
+    name: str
+    datatype: str
+    leaf: Leaf
+    """Shape of a row, dtype, and permitted values."""
+    is_state: bool = False
+    """Whether it is recurrent state, which may be omitted at the start of an episode."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """Inputs and outputs of a policy by name, in the order of the manifest."""
+
+    inputs: dict[str, TensorSpec]
+    outputs: dict[str, TensorSpec]
+    is_masked: bool
+
+    @property
+    def is_recurrent(self) -> bool:
+        return any(port.is_state for port in self.inputs.values())
+
+
+def signature_of(manifest: PolicyManifest) -> Signature:
+    """Inputs are the leaves of the observation and the recurrent state; outputs are the fields of `Actions`."""
+    observed = {name: _tensor_spec(name, leaf) for name, leaf in inputs(manifest.observation).items()}
+    state = {
+        tensor.name: _tensor_spec(tensor.name, _leaf(tensor.dtype, tensor.shape), True) for tensor in manifest.state
+    }
+    answered = {
+        tensor.name: _tensor_spec(tensor.name, _leaf(tensor.dtype, tensor.shape))
+        for tensor in manifest.outputs
+        if tensor.name in (ACTION, DIST_INPUTS) or tensor.name.startswith(STATE_OUT)
+    }
+    return Signature(observed | state, answered, ACTION_MASK in observed)
+
+
+def _tensor_spec(name: str, leaf: Leaf, is_state: bool = False) -> TensorSpec:
+    return TensorSpec(name, DATATYPES[leaf.dtype], leaf, is_state)
+
+
+def _leaf(dtype: str, shape: tuple[int | None, ...]) -> Leaf:
+    """A tensor without its batch dimension, the only one without a fixed size."""
+    return Box(dtype=dtype, shape=tuple(size for size in shape[1:] if size is not None), low=None, high=None)
+
 
 NUMBERS = {int, float}
 BOOLEANS = {bool}
 
 
-class Tensor(NamedTuple):
-    """A tensor as it came: declared, but nothing of it checked."""
+class RequestTensor(NamedTuple):
+    """A tensor of a request, not checked yet."""
 
     name: str
     datatype: str
@@ -30,20 +117,20 @@ class Tensor(NamedTuple):
 
 
 Data = list[Any] | bytes | memoryview
-"""Elements in row-major order: lists, flat or nested, or bytes, little-endian."""
+"""Elements in row-major order: lists, flat or nested, or little-endian bytes."""
 
 
-def read_inputs(tensors: Sequence[Tensor], signature: Signature, max_batch: int) -> dict[str, NDArray]:
-    """Input name → array (k, …); without the recurrent state, if none of it was given.
+def read_inputs(tensors: Sequence[RequestTensor], signature: Signature, max_batch: int) -> dict[str, NDArray]:
+    """Check the inputs of a request; input name → array (k, …), without the recurrent state if it is omitted.
 
-    Raises ObservationError, IllegalMask, or BodyTooLarge for a batch of more than `max_batch` rows.
+    Raises ObservationError, IllegalMask, or BodyTooLarge for more than `max_batch` rows.
     """
     arrays: dict[str, NDArray] = {}
     for tensor in tensors:
         port = signature.inputs.get(tensor.name)
         if port is None:
             known = ", ".join(signature.inputs)
-            raise ObservationError(f"there is no input {tensor.name[:64]!r}, expected {known}")
+            raise ObservationError(f"unknown input {tensor.name[:64]!r}, expected {known}")
         if tensor.name in arrays:
             raise ObservationError(f"input {tensor.name} is given twice")
         arrays[tensor.name] = _array(tensor, port, max_batch)
@@ -54,7 +141,7 @@ def read_inputs(tensors: Sequence[Tensor], signature: Signature, max_batch: int)
 
 
 def _check_whole(arrays: dict[str, NDArray], signature: Signature) -> None:
-    """Raise ObservationError unless every input is there, or all but the state, with as many rows each."""
+    """Raise ObservationError unless all inputs, or all but the state, are present with the same number of rows."""
     if len(arrays) < len(signature.inputs):
         has_state = any(port.is_state and name in arrays for name, port in signature.inputs.items())
         for name, port in signature.inputs.items():
@@ -62,11 +149,11 @@ def _check_whole(arrays: dict[str, NDArray], signature: Signature) -> None:
                 raise ObservationError(f"input {name} is missing")
     rows = {len(array) for array in arrays.values()}
     if len(rows) > 1:
-        told = ", ".join(f"{name} has {len(array)}" for name, array in arrays.items())
-        raise ObservationError(f"the inputs have different numbers of rows: {told}")
+        sizes = ", ".join(f"{name} has {len(array)}" for name, array in arrays.items())
+        raise ObservationError(f"the inputs have different numbers of rows: {sizes}")
 
 
-def _array(tensor: Tensor, port: Port, max_batch: int) -> NDArray:
+def _array(tensor: RequestTensor, port: TensorSpec, max_batch: int) -> NDArray:
     if tensor.datatype != port.datatype:
         raise ObservationError(f"{port.name} has datatype {str(tensor.datatype)[:64]}, expected {port.datatype}")
     shape = tuple(tensor.shape)
@@ -75,38 +162,38 @@ def _array(tensor: Tensor, port: Port, max_batch: int) -> NDArray:
         raise ObservationError(f"{port.name} has shape {_list(shape[:16])}, expected {_list(expected)}")
     if shape[0] > max_batch:
         raise BodyTooLarge(f"{port.name} has {shape[0]} rows, expected at most {max_batch}")
-    read = _listed if isinstance(tensor.data, list) else _framed
+    read = _from_list if isinstance(tensor.data, list) else _from_buffer
     return check(port.name, read(tensor.data, shape, port), port.leaf)  # type: ignore[arg-type]
 
 
-def _framed(data: bytes | memoryview, shape: tuple[int, ...], port: Port) -> NDArray:
+def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorSpec) -> NDArray:
     if len(data) != (size := prod(shape) * np.dtype(port.leaf.dtype).itemsize):
         raise ObservationError(f"{port.name} has {len(data)} bytes, expected {size} for {_list(shape)} {port.datatype}")
     array = from_bytes(data, port.leaf.dtype)
     if port.datatype == "BOOL" and (array.view(np.uint8) > 1).any():
         raise ObservationError(f"{port.name} has bytes other than 0 and 1, expected BOOL")
-    if not array.flags.aligned:  # it begins anywhere in the body, and a graph's kernels rely on alignment
+    if not array.flags.aligned:  # kernels of the graph require alignment
         array = array.copy()
     return array.reshape(shape)
 
 
-def _listed(data: list[Any], shape: tuple[int, ...], port: Port) -> NDArray:
+def _from_list(data: list[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:
     flat, kinds = data, set(map(type, data))
     while kinds == {list}:
         flat = list(chain.from_iterable(flat))
         kinds = set(map(type, flat))
     expected = BOOLEANS if port.leaf.dtype == "bool" else NUMBERS
-    # Nothing else may reach NumPy: it would read "1" as a number, and make every element as wide as the longest string.
+    # NumPy would parse "1" as a number, and make every element as wide as the longest string.
     if not kinds <= expected:
-        raise ObservationError(f"{port.name} holds something other than {port.datatype}, or lists of unequal depth")
+        raise ObservationError(f"{port.name} contains values other than {port.datatype}, or lists of unequal depth")
     if len(flat) != (size := prod(shape)):
         raise ObservationError(f"{port.name} has {len(flat)} elements, expected {size} for {_list(shape)}")
     dtype = np.dtype(port.leaf.dtype)
     try:
-        with np.errstate(over="ignore"):  # what overflows becomes infinite, and is refused as such
+        with np.errstate(over="ignore"):  # overflow becomes infinity, which is refused
             array = np.array(flat, None if float in kinds and dtype.kind in "iu" else dtype)
     except OverflowError:
-        raise ObservationError(f"{port.name} holds a number that does not fit {port.datatype}") from None
+        raise ObservationError(f"{port.name} contains a number out of range for {port.datatype}") from None
     return array.reshape(shape)
 
 

@@ -1,34 +1,103 @@
-"""The OpenAPI document of a server: openapi.yaml, with this installation's limits and examples of what it serves."""
+"""Builds the OpenAPI document: openapi.yaml with the limits of this server and examples for its policies."""
 
+from base64 import b64encode
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from functools import cache
 from importlib.metadata import version as installed
+from io import BytesIO
+from math import prod
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
+from PIL import Image
 
-from serve_app.loading import LoadedPolicy, LoadedVersion
-from serve_app.openapi.examples import action_request, infer_request
+from league.policies.actions import bounds
+from league.spaces import ACTION_MASK, Box, DictSpace, Discrete, MultiDiscrete, Space
+from serve_app.inference_protocol.tensors import datatype_of
+from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.settings import ServeSettings
 
+MAX_LISTED = 512
+"""Maximum numbers listed in an example; larger leaves are base64."""
+MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
+"""Channels → Pillow mode."""
+
+
+def action_request(policy: LoadedPolicy) -> dict[str, Any]:
+    """An example body for the action route."""
+    body = {"observation": observation(policy.manifest.observation)}
+    return body | {"state": None} if policy.state else body
+
+
+def infer_request(policy: LoadedPolicy) -> dict[str, Any] | None:
+    """An example body for the Open Inference Protocol in JSON; None if it would be too long."""
+    arrays = {name: _zeros(leaf, (1, *leaf.shape), name == ACTION_MASK) for name, _, leaf in policy.reader.leaves}
+    if sum(array.size for array in arrays.values()) > MAX_LISTED:
+        return None
+    return {
+        "inputs": [
+            {"name": name, "datatype": datatype_of(array), "shape": list(array.shape), "data": array.ravel().tolist()}
+            for name, array in arrays.items()
+        ],
+        "outputs": [{"name": "action"}],
+    }
+
+
+def observation(space: Space, is_mask: bool = False) -> Any:
+    """An example value of a space as JSON, with every action legal."""
+    if isinstance(space, DictSpace):
+        return {key: observation(part, key == ACTION_MASK) for key, part in space.spaces.items()}
+    return _leaf(_zeros(space, space.shape, is_mask))
+
+
+def _zeros(leaf: Any, shape: tuple[int, ...], is_mask: bool = False) -> NDArray:
+    """Zeros or the nearest values in the space; ones for a mask."""
+    if is_mask:
+        return np.ones(shape, leaf.dtype)
+    nothing: Any = 0
+    match leaf:
+        case Discrete(start=start) | MultiDiscrete(start=start):
+            nothing = start
+        case Box():
+            nothing = np.clip(0.0, *bounds(leaf))
+    return np.broadcast_to(np.asarray(nothing), shape).astype(leaf.dtype)
+
+
+def _leaf(array: NDArray) -> Any:
+    if array.size <= MAX_LISTED:
+        return array.tolist()
+    if array.dtype == np.uint8 and array.ndim in (2, 3) and (values := prod(array.shape[2:])) in MODES:
+        return {"png": _picture(array, MODES[values])}
+    data = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+    return {"b64": b64encode(data).decode(), "dtype": array.dtype.name, "shape": list(array.shape)}
+
+
+def _picture(array: NDArray, mode: str) -> str:
+    buffer = BytesIO()
+    Image.frombytes(mode, (array.shape[1], array.shape[0]), array.tobytes()).save(buffer, "PNG")
+    return b64encode(buffer.getvalue()).decode()
+
+
 SOURCE = Path(__file__).with_name("openapi.yaml")
-ACT = "/v1/policies/{model}/action"
-INFER = ("/v2/models/{model}/infer", "/v2/models/{model}/versions/{version}/infer")
+ACTION_PATH = "/v1/policies/{model}/action"
+INFER_PATHS = ("/v2/models/{model}/infer", "/v2/models/{model}/versions/{version}/infer")
 
 Document = dict[str, Any]
 
 
 def document(settings: ServeSettings, served: Iterable[LoadedVersion]) -> Document:
-    """Describe every route; `served`: the versions for whose policies there shall be examples."""
+    """The OpenAPI document. `served`: versions whose policies get examples."""
     described = deepcopy(_source())
     described["info"]["version"] = installed("policy-league")
     schemas = described["components"]["schemas"]
     schemas["ActionRequest"]["properties"]["observations"]["maxItems"] = settings.max_batch
     described["info"]["description"] += (
-        f"\n**Limits.** {settings.max_body:,} bytes and {settings.max_batch:,} observations in one request, "
-        f"{settings.max_in_flight:,} requests at once, {settings.timeout:g} s for each.\n"
+        f"\n**Limits.** {settings.max_body:,} bytes and {settings.max_batch:,} observations per request, "
+        f"{settings.max_in_flight:,} concurrent requests, a timeout of {settings.timeout:g} s.\n"
     )
     policies = dict(_named(served))
     if policies:
@@ -37,16 +106,16 @@ def document(settings: ServeSettings, served: Iterable[LoadedVersion]) -> Docume
 
 
 def _show(described: Document, policies: dict[str, LoadedPolicy]) -> None:
-    """Put examples of the policies before the general ones. `x-model`: the model that an example is for."""
+    """Insert examples of the policies before the general ones. `x-model`: the model of an example."""
     acting = {_key(model): _example(model, action_request(policy)) for model, policy in policies.items()}
-    body = _body(described, ACT)
+    body = _body(described, ACTION_PATH)
     body["examples"] = acting | body["examples"]
     inferring = {
         _key(model): _example(model, request)
         for model, policy in policies.items()
         if (request := infer_request(policy)) is not None
     }
-    for path in INFER:
+    for path in INFER_PATHS:
         body = _body(described, path)
         body["examples"] = inferring | body["examples"]
     parameters = described["components"]["parameters"]
@@ -75,8 +144,7 @@ def _named(served: Iterable[LoadedVersion]) -> Iterator[tuple[str, LoadedPolicy]
 
 @cache
 def _source() -> Document:
-    loader = getattr(
-        yaml, "CSafeLoader", yaml.SafeLoader
-    )  # C's is several times as fast, where PyYAML was built with it
+    # Several times as fast as SafeLoader, if PyYAML was built with libyaml.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     parsed: Document = yaml.load(SOURCE.read_text("utf-8"), loader)
     return parsed

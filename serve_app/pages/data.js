@@ -1,111 +1,114 @@
-// What components read: answers of the server that are fetched again when something says that they have changed.
+// Hooks that load data from the server and reload it when it has changed.
 
 import { createContext, useCallback, useContext, useEffect, useRef, useState } from "./vendor/preact-htm.js";
-import { ask, Fault, follow, key, passes, query } from "./api.js";
+import { ApiError, isTemporary, key, query, request } from "./api.js";
+import { follow } from "./events.js";
 
 const PAGE = 50;
-const LARGEST = 100;
-const LATER = 10000; // milliseconds until what could not be read is tried anew: nobody may sit before the page
+const MAX_LIMIT = 100;
+const RETRY_DELAY = 10000; // milliseconds until a failed load is retried without user action
 
-/** {data, fault, again}. `path` null: nothing is asked. When `mark` changes, the old data stays until the new is there. */
-export function useData(path, mark = "") {
-  return useFetched(path, mark, (signal) => ask(path, { signal }));
+/** {data, error, retry}. Nothing is loaded while `path` is null. When `token` changes, the old data stays until the new data arrives. */
+export function useData(path, token = "") {
+  return useLoaded(path, token, (signal) => request(path, { signal }));
 }
 
-/** {items, more, fault, again} of a paged list: `more()` shows the next page, null where there is none. */
-export function useList(path, name, mark = "") {
-  const [least, setLeast] = useState(PAGE);
-  useEffect(() => setLeast(PAGE), [path]);
-  const load = (signal) => collect(path, name, least, signal);
-  const { data, fault, again } = useFetched(path, `${mark} ${least}`, load);
-  return { items: data?.items ?? null, more: data?.next != null ? () => setLeast(data.items.length + PAGE) : null, fault, again };
+/** {items, more, error, retry} of a list with cursor pagination. `more()` loads the next page; it is null on the last page. */
+export function useList(path, name, token = "") {
+  const [minimum, setMinimum] = useState(PAGE);
+  useEffect(() => setMinimum(PAGE), [path]);
+  const load = (signal) => loadPages(path, name, minimum, signal);
+  const { data, error, retry } = useLoaded(path, `${token} ${minimum}`, load);
+  return { items: data?.items ?? null, more: data?.next != null ? () => setMinimum(data.items.length + PAGE) : null, error, retry };
 }
 
-/** Pages from the first one on, so that a list which is read again has no gap. */
-async function collect(path, name, least, signal) {
+/** Load all pages from the first one, so that a reloaded list has no gaps. */
+async function loadPages(path, name, minimum, signal) {
   const items = [];
   let next = null;
   do {
-    const limit = Math.min(LARGEST, least - items.length);
-    const page = await ask(query(...withQuery(path, { limit, before: next })), { signal });
+    const limit = Math.min(MAX_LIMIT, minimum - items.length);
+    const page = await request(withQuery(path, { limit, before: next }), { signal });
     items.push(...page[name]);
     next = page.next;
-  } while (next != null && items.length < least);
+  } while (next != null && items.length < minimum);
   return { items, next };
 }
 
-function useFetched(path, mark, load) {
-  const [state, setState] = useState({ path: null, data: null, fault: null });
-  const [round, setRound] = useState(0);
+/** {items, page, more, error, retry} of a list with offset pagination (`?limit=&offset=`) and a `total`. */
+export function useOffsetList(path, name, token = "") {
+  const [minimum, setMinimum] = useState(PAGE);
+  useEffect(() => setMinimum(PAGE), [path]);
+  const load = async (signal) => {
+    let page = null;
+    const items = [];
+    do {
+      page = await request(withQuery(path, { limit: Math.min(MAX_LIMIT, minimum - items.length), offset: items.length }), { signal });
+      items.push(...page[name]);
+    } while (items.length < Math.min(minimum, page.total) && page[name].length);
+    return { items, page };
+  };
+  const { data, error, retry } = useLoaded(path, `${token} ${minimum}`, load);
+  const more = data && data.items.length < data.page.total ? () => setMinimum(data.items.length + PAGE) : null;
+  return { items: data?.items ?? null, page: data?.page ?? null, more, error, retry };
+}
+
+function useLoaded(path, token, load) {
+  const [state, setState] = useState({ path: null, data: null, error: null });
+  const [attempt, setAttempt] = useState(0);
   useEffect(() => {
     if (!path) return undefined;
     const closed = new AbortController();
     load(closed.signal).then(
-      (data) => closed.signal.aborted || setState({ path, data, fault: null }),
-      (fault) => closed.signal.aborted || setState((was) => ({ path, data: was.path === path ? was.data : null, fault })),
+      (data) => closed.signal.aborted || setState({ path, data, error: null }),
+      (error) => closed.signal.aborted || setState((previous) => ({ path, data: previous.path === path ? previous.data : null, error })),
     );
     return () => closed.abort();
-  }, [path, mark, round]);
-  const again = useCallback(() => setRound((was) => was + 1), []);
+  }, [path, token, attempt]);
+  const retry = useCallback(() => setAttempt((previous) => previous + 1), []);
   useEffect(() => {
-    const timer = state.fault instanceof Fault && passes(state.fault, true) && setTimeout(again, LATER);
+    const timer = state.error instanceof ApiError && isTemporary(state.error, true) && setTimeout(retry, RETRY_DELAY);
     return () => clearTimeout(timer);
-  }, [state.fault]);
-  return state.path === path ? { ...state, again } : { data: null, fault: null, again };
+  }, [state.error]);
+  return state.path === path ? { ...state, retry } : { data: null, error: null, retry };
 }
 
-/** Why the key that was entered may not do this in a league, in a sentence; null if it may, or none was: then one is asked for. */
-export function useRefusal(scope, league) {
-  const shown = key.get();
-  const own = useData(shown ? "/v1/key" : null, shown ?? "").data?.key;
+/** Why the entered key lacks a scope in a league, as a sentence. Null if the key has the scope, or if no key was entered. */
+export function useMissingScope(scope, league) {
+  const entered = key.get();
+  const own = useData(entered ? "/v1/key" : null, entered ?? "").data?.key;
   if (!own || (own.scopes.includes(scope) && (own.leagues?.includes(league) ?? true))) return null;
-  return `The key ${own.name} may not ${scope} in ${league}.`;
+  return `The key ${own.name} does not have the scope ${scope} in ${league}.`;
 }
 
-/** Follow a stream of events while a component is there. */
-export function useEvents(path, heard, ends) {
-  const latest = useRef(heard);
-  latest.current = heard;
-  useEffect(() => (path ? follow(path, (name, data) => latest.current(name, data), { ends }) : undefined), [path]);
+/** Follow an event stream while the component is mounted. */
+export function useEvents(path, onEvent, isLast) {
+  const latest = useRef(onEvent);
+  latest.current = onEvent;
+  useEffect(() => (path ? follow(path, (name, data) => latest.current(name, data), { isLast }) : undefined), [path]);
 }
 
-/** What the league's stream said last: names and marks. A page fetches again when a mark that it names has changed. */
-export const Marks = createContext({});
+/** The newest `league` event. Its fields change whenever the corresponding data of the league changes. */
+export const LeagueState = createContext({});
 
-export function useMark(...names) {
-  const marks = useContext(Marks);
-  return JSON.stringify(names.map((name) => marks[name] ?? null));
+/** A string that changes when any of these fields of the league's event changes: pass it to useData or useList to reload. */
+export function useChangeToken(...fields) {
+  const state = useContext(LeagueState);
+  return JSON.stringify(fields.map((field) => state[field] ?? null));
 }
 
-/** A number that grows every so many milliseconds, while the page is seen. */
+/** A number that increases at an interval, in milliseconds, while the page is visible. */
 export function useTicks(milliseconds) {
   const [ticks, setTicks] = useState(0);
   useEffect(() => {
-    const timer = setInterval(() => document.hidden || setTicks((was) => was + 1), milliseconds);
+    const timer = setInterval(() => document.hidden || setTicks((previous) => previous + 1), milliseconds);
     return () => clearInterval(timer);
   }, [milliseconds]);
   return ticks;
 }
 
-/** {items, page, more, fault, again} of a list that is read by place: `?limit=&offset=`, with its `total`. */
-export function useOffsets(path, name, mark = "") {
-  const [least, setLeast] = useState(PAGE);
-  useEffect(() => setLeast(PAGE), [path]);
-  const load = async (signal) => {
-    let page = null;
-    const items = [];
-    do {
-      page = await ask(query(...withQuery(path, { limit: Math.min(LARGEST, least - items.length), offset: items.length })), { signal });
-      items.push(...page[name]);
-    } while (items.length < Math.min(least, page.total) && page[name].length);
-    return { items, page };
-  };
-  const { data, fault, again } = useFetched(path, `${mark} ${least}`, load);
-  const more = data && data.items.length < data.page.total ? () => setLeast(data.items.length + PAGE) : null;
-  return { items: data?.items ?? null, page: data?.page ?? null, more, fault, again };
-}
-
+/** Add parameters to a path that may have a query string. */
 function withQuery(path, parameters) {
-  const [place, given] = path.split("?");
-  return [place, { ...Object.fromEntries(new URLSearchParams(given)), ...parameters }];
+  const [base, given] = path.split("?");
+  return query(base, { ...Object.fromEntries(new URLSearchParams(given)), ...parameters });
 }

@@ -1,125 +1,126 @@
-// A game of the ledger, played again: step by step, or by itself, at any speed.
+// The player for recorded games.
 
 import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
-import { ask, of, query } from "./api.js";
-import { useKeys } from "./keys.js";
-import { Await, Facts, league as at, notify, Trouble, useTitle } from "./parts.js";
-import { did, Moves, Picture } from "./stage.js";
-import { go, useAddress } from "./router.js";
-import { number, several, tail } from "./words.js";
+import { apiPath, query, request } from "./api.js";
+import { useKeys } from "./keyboard.js";
+import { Await, ErrorNotice, leaguePath, notify, Properties, useTitle } from "./components.js";
+import { describe, Moves, Picture } from "./step.js";
+import { navigate, useAddress } from "./router.js";
+import { number, plural, shortRef } from "./format.js";
 
 const PAGE = 50;
 const SPEEDS = [0.5, 1, 2, 4, 8];
 
 export function Game({ league, schedule, position, game }) {
-  const path = of(league, "matches", schedule, position, "games", game);
-  const [show, fault, wants] = useSteps(path);
-  useTitle(show && Object.values(show.cast).map(tail).join(" against "), league);
+  const path = apiPath(league, "matches", schedule, position, "games", game);
+  const [recording, error, loadFrom] = useSteps(path);
+  useTitle(recording && Object.values(recording.players).map(shortRef).join(" against "), league);
   return html`<section aria-labelledby="heading">
-    <p class="crumbs"><a href=${at(league, "matches", schedule, position)}>The match</a></p>
-    <div class="head"><h2 id="heading">Game ${game}</h2>${show && !show.fault && html`<${Film} path=${path} name="${league}-${schedule}-${position}-${game}.gif" />`}</div>
-    <${Await} of=${{ data: show, fault, again: wants }} words="The game is being played again …">${show && (show.fault
-      ? html`<${Trouble} fault=${{ message: show.fault }} />`
-      : html`<${Player} show=${show} wants=${wants} />`)}<//>
+    <p class="crumbs"><a href=${leaguePath(league, "matches", schedule, position)}>Match</a></p>
+    <div class="head"><h2 id="heading">Game ${game}</h2>${recording && !recording.fault && html`<${DownloadGif} path=${path} name="${league}-${schedule}-${position}-${game}.gif" />`}</div>
+    <${Await} result=${{ data: recording, error, retry: () => loadFrom(0) }} message="Replaying the game …">${recording && (recording.fault
+      ? html`<${ErrorNotice} error=${{ message: recording.fault }} />`
+      : html`<${Player} recording=${recording} loadFrom=${loadFrom} />`)}<//>
   </section>`;
 }
 
-/** The steps of a game as far as they were fetched, in pages: [show, fault, wants(step)]. */
+/** The steps of a game, loaded in pages: [recording, error, loadFrom(step)]. */
 function useSteps(path) {
-  const [show, setShow] = useState(null);
-  const [fault, setFault] = useState(null);
-  const asked = useRef(new Set());
-  const wants = (step = 0) => {
+  const [recording, setRecording] = useState(null);
+  const [error, setError] = useState(null);
+  const requested = useRef(new Set());
+  const loadFrom = (step = 0) => {
     const from = step - (step % PAGE);
-    if (asked.current.has(from)) return;
-    asked.current.add(from);
-    ask(query(path, { from: String(from), to: from + PAGE })).then(
-      (found) => { setFault(null); setShow((was) => ({ ...found, steps: { ...was?.steps, ...byNumber(found.steps) } })); },
-      (error) => { asked.current.delete(from); setFault(error); },
+    if (requested.current.has(from)) return;
+    requested.current.add(from);
+    request(query(path, { from: String(from), to: from + PAGE })).then(
+      (loaded) => { setError(null); setRecording((previous) => ({ ...loaded, steps: { ...previous?.steps, ...byNumber(loaded.steps) } })); },
+      (failure) => { requested.current.delete(from); setError(failure); },
     );
   };
-  useEffect(() => wants(0), [path]);
-  return [show, fault, wants];
+  useEffect(() => loadFrom(0), [path]);
+  return [recording, error, loadFrom];
 }
 
 const byNumber = (steps) => Object.fromEntries(steps.map((step) => [step.step, step]));
 
-function Player({ show, wants }) {
+function Player({ recording, loadFrom }) {
   const { fragment } = useAddress();
-  const last = show.length;
+  const last = recording.length;
   const [at, setAt] = useState(() => Math.min(last, Math.max(0, Number(fragment) || 0)));
   const [isPlaying, setIsPlaying] = useState(false);
   const [speed, setSpeed] = useState(1);
-  const step = show.steps[at];
+  const step = recording.steps[at];
   const move = (to) => { setIsPlaying(false); setAt(Math.min(last, Math.max(0, to))); };
   const toggle = () => { if (!isPlaying && at === last) setAt(0); setIsPlaying(!isPlaying); };
-  useEffect(() => { wants(at); if (at + PAGE / 2 <= last) wants(at + PAGE / 2); go(`#${at}`, { replace: true }); }, [at]);
+  useEffect(() => { loadFrom(at); if (at + PAGE / 2 <= last) loadFrom(at + PAGE / 2); navigate(`#${at}`, { replace: true }); }, [at]);
   useEffect(() => {
-    if (!isPlaying || !step) return undefined; // it waits for what is not here yet
+    if (!isPlaying || !step) return undefined; // waits until the step is loaded
     if (at === last) { setIsPlaying(false); return undefined; }
     const timer = setTimeout(() => setAt(at + 1), (last > 60 ? 250 : 800) / speed);
     return () => clearTimeout(timer);
   }, [isPlaying, at, speed, !!step]);
-  useKeys((pressed) => {
-    const act = { " ": toggle, ArrowLeft: () => move(at - 1), ArrowRight: () => move(at + 1), Home: () => move(0), End: () => move(last),
-      "+": () => setSpeed(faster(speed, 1)), "-": () => setSpeed(faster(speed, -1)) }[pressed];
-    act?.();
-    return !!act;
+  useKeys((key) => {
+    const action = { " ": toggle, ArrowLeft: () => move(at - 1), ArrowRight: () => move(at + 1), Home: () => move(0), End: () => move(last),
+      "+": () => setSpeed(otherSpeed(speed, 1)), "-": () => setSpeed(otherSpeed(speed, -1)) }[key];
+    action?.();
+    return !!action;
   });
   return html`<div class="player">
     <div class="screen">
-      <${Picture} src=${step?.picture} words=${did(step)} />
-      <div class="controls" role="group" aria-label="Steps of the game">
-        <button type="button" onClick=${() => move(0)} aria-label="To the beginning"><${Icon} of="M2 2h2v10H2zM12 2v10L5 7z" /></button>
-        <button type="button" onClick=${() => move(at - 1)} aria-label="One step back"><${Icon} of="M11 2v10L3 7z" /></button>
+      <${Picture} src=${step?.picture} alt=${describe(step)} />
+      <div class="controls" role="group" aria-label="Playback">
+        <button type="button" onClick=${() => move(0)} aria-label="First step"><${Icon} path="M2 2h2v10H2zM12 2v10L5 7z" /></button>
+        <button type="button" onClick=${() => move(at - 1)} aria-label="Previous step"><${Icon} path="M11 2v10L3 7z" /></button>
         <button type="button" class="primary" onClick=${toggle}>${isPlaying ? "Pause" : "Play"}</button>
-        <button type="button" onClick=${() => move(at + 1)} aria-label="One step on"><${Icon} of="M3 2v10l8-5z" /></button>
-        <button type="button" onClick=${() => move(last)} aria-label="To the end"><${Icon} of="M10 2h2v10h-2zM2 2v10l7-5z" /></button>
+        <button type="button" onClick=${() => move(at + 1)} aria-label="Next step"><${Icon} path="M3 2v10l8-5z" /></button>
+        <button type="button" onClick=${() => move(last)} aria-label="Last step"><${Icon} path="M10 2h2v10h-2zM2 2v10l7-5z" /></button>
         <label class="inline">Speed <select value=${speed} onChange=${(event) => setSpeed(Number(event.target.value))}>${SPEEDS.map((each) => html`<option value=${each}>${each} ×</option>`)}</select></label>
       </div>
-      <label class="seek"><span class="unseen">Step</span>
-        <input type="range" min="0" max=${last} value=${at} aria-valuetext="step ${at}: ${did(step)}" onInput=${(event) => move(Number(event.target.value))} />
+      <label class="seek"><span class="visually-hidden">Step</span>
+        <input type="range" min="0" max=${last} value=${at} aria-valuetext="step ${at}: ${describe(step)}" onInput=${(event) => move(Number(event.target.value))} />
         <output>${at} of ${last}</output></label>
     </div>
-    <div class="told" aria-live=${isPlaying ? "off" : "polite"}>
+    <div class="game-info" aria-live=${isPlaying ? "off" : "polite"}>
       <h3>${step ? (at === 0 ? "Start" : `Step ${at}`) : "Loading …"}${at === last ? " · end" : ""}</h3>
-      <${Moves} of=${step} />
-      <${Cast} of=${show} isOver=${at === last} />
-      <p class="soft small keys"><kbd>Space</kbd> plays, <kbd>←</kbd> <kbd>→</kbd> step, <kbd>Home</kbd> <kbd>End</kbd>, <kbd>+</kbd> <kbd>−</kbd> speed.</p>
+      <${Moves} step=${step} />
+      <${Players} recording=${recording} isOver=${at === last} />
+      <p class="muted small keys"><kbd>Space</kbd> play or pause, <kbd>←</kbd> <kbd>→</kbd> previous or next step, <kbd>Home</kbd> <kbd>End</kbd> first or last step, <kbd>+</kbd> <kbd>−</kbd> speed</p>
     </div>
   </div>`;
 }
 
-function Icon({ of }) {
-  return html`<svg viewBox="0 0 14 14" width="14" height="14" aria-hidden="true"><path d=${of} /></svg>`;
+function Icon({ path }) {
+  return html`<svg viewBox="0 0 14 14" width="14" height="14" aria-hidden="true"><path d=${path} /></svg>`;
 }
 
-function faster(speed, by) {
+/** The next faster (1) or slower (-1) speed. */
+function otherSpeed(speed, by) {
   return SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, SPEEDS.indexOf(speed) + by))];
 }
 
-function Cast({ of: { cast, returns, forfeits }, isOver }) {
-  const agents = Object.entries(cast);
-  if (agents.length > 8) return html`<p class="soft">${several(agents.length, "agent")}: ${[...new Set(Object.values(cast))].join(", ")}.</p>`;
-  return html`<${Facts} of=${agents.map(([agent, ref]) => [agent, html`<span class="ref">${ref}</span>
+function Players({ recording: { players, returns, forfeits }, isOver }) {
+  const agents = Object.entries(players);
+  if (agents.length > 8) return html`<p class="muted">${plural(agents.length, "agent")}: ${[...new Set(Object.values(players))].join(", ")}.</p>`;
+  return html`<${Properties} items=${agents.map(([agent, ref]) => [agent, html`<span class="ref">${ref}</span>
       ${isOver && html`<small>return ${number(returns[agent])}</small>`}`, "name"])} />
-    ${isOver && forfeits.map((each) => html`<p>${each.ref} forfeited the game as ${each.agent}: ${each.reason}.</p>`)}`;
+    ${isOver && forfeits.map((each) => html`<p>${each.ref} forfeited the game as ${each.agent} (${each.reason}).</p>`)}`;
 }
 
-/** The game as a GIF: fetched with the key, then handed to the browser. */
-function Film({ path, name }) {
+/** Download the game as a GIF, with the API key. */
+function DownloadGif({ path, name }) {
   const [busy, setBusy] = useState(false);
-  const fetchFilm = async () => {
+  const download = async () => {
     setBusy(true);
     try {
-      const film = await (await ask(`${path}/film.gif`, { whole: true })).blob();
-      const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(film), download: name });
+      const gif = await (await request(`${path}/video.gif`, { raw: true })).blob();
+      const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(gif), download: name });
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-    } catch (fault) {
-      notify(`There is no film: ${fault.message}`);
+    } catch (error) {
+      notify(`The GIF could not be created: ${error.message}`);
     }
     setBusy(false);
   };
-  return html`<button type="button" onClick=${fetchFilm} aria-busy=${busy} disabled=${busy}>${busy ? "Filming …" : "Download GIF"}</button>`;
+  return html`<button type="button" onClick=${download} aria-busy=${busy} disabled=${busy}>${busy ? "Creating GIF …" : "Download GIF"}</button>`;
 }

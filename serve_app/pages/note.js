@@ -1,29 +1,29 @@
-// What people write of a version: shown with it, and written anew in a dialog.
+// The note of a version, and the dialog to edit it.
 
 import { html } from "./vendor/preact-htm.js";
-import { ask, of } from "./api.js";
-import { Dialog, Form, notify, When } from "./parts.js";
+import { apiPath, request } from "./api.js";
+import { Dialog, Form, notify, Time } from "./components.js";
 
-/** The note in a list of versions, and the button to write one. */
-export function Note({ of: note, name, write, refusal }) {
+/** The note in the list of versions, with a button to add or edit it. */
+export function Note({ note, name, edit, disabledReason }) {
   return html`${note && html`<span title="${note.actor}">${note.text}</span> `}
-    <button type="button" class="small" onClick=${write} disabled=${refusal} title=${refusal} aria-label="${note ? "Change the note of" : "Write a note of"} ${name}">
-      ${note ? "Change …" : "Write …"}</button>`;
+    <button type="button" class="small" onClick=${edit} disabled=${disabledReason} title=${disabledReason} aria-label="${note ? "Edit the note of" : "Add a note to"} ${name}">
+      ${note ? "Edit …" : "Add …"}</button>`;
 }
 
-export function WriteNote({ league, version, note, onClose }) {
+export function EditNote({ league, version, note, onClose }) {
   const name = `${league}@${version}`;
   const submit = async (fields) => {
     const text = fields.get("note");
-    await ask(of(league, "versions", version, "note"), { method: "PUT", body: { note: text }, repeatable: true });
-    notify(text.trim() ? `The note of ${name} is written.` : `${name} has no note any more.`);
+    await request(apiPath(league, "versions", version, "note"), { method: "PUT", body: { note: text }, repeatable: true });
+    notify(text.trim() ? `The note of ${name} was saved.` : `The note of ${name} was deleted.`);
     onClose();
   };
   return html`<${Dialog} title="Note of ${name}" onClose=${onClose}>
-    <${Form} submit=${submit} label="Keep it" onCancel=${onClose}>
+    <${Form} submit=${submit} label="Save" onCancel=${onClose}>
       <label class="field">Note
-        <textarea name="note" rows="4" maxlength="2000" placeholder="What was tried in it, or came of it. Everybody who may look sees it, with the key's name.">${note?.text}</textarea></label>
-      ${note && html`<p class="soft small">Written by ${note.actor}, <${When} at=${note.at} />. Without a word it is taken away.</p>`}
+        <textarea name="note" rows="4" maxlength="2000" placeholder="For example what is different about this version. Visible to all users with read access, with the name of your key.">${note?.text}</textarea></label>
+      ${note && html`<p class="muted small">Written by ${note.actor}, <${Time} at=${note.at} />. Save an empty note to delete it.</p>`}
     <//>
   <//>`;
 }

@@ -1,34 +1,34 @@
-// Addresses and pages: a link within the pages changes the address and what is shown; nothing is loaded anew.
+// Client-side routing: links between pages change the address without reloading the document.
 
 import { useEffect, useState } from "./vendor/preact-htm.js";
 
-const MOVED = "league:moved";
+const NAVIGATED = "league:navigated";
 
-/** Go to an address of these pages. `replace`: the one before is forgotten. */
-export function go(address, { replace = false } = {}) {
-  const isElsewhere = new URL(address, location.href).pathname !== location.pathname;
+/** Navigate to another address. `replace`: replace the current history entry. */
+export function navigate(address, { replace = false } = {}) {
+  const isOtherPage = new URL(address, location.href).pathname !== location.pathname;
   history[replace ? "replaceState" : "pushState"](null, "", address);
-  if (isElsewhere) scrollTo(0, 0);
-  dispatchEvent(new Event(MOVED));
+  if (isOtherPage) scrollTo(0, 0);
+  dispatchEvent(new Event(NAVIGATED));
 }
 
-/** {path, parameters, fragment} of the address, followed. */
+/** {path, parameters, fragment} of the current address; updated on navigation. */
 export function useAddress() {
-  const [at, setAt] = useState(here);
+  const [address, setAddress] = useState(currentAddress);
   useEffect(() => {
-    const look = () => setAt(here());
-    const events = [MOVED, "popstate", "hashchange"];
-    events.forEach((event) => addEventListener(event, look));
-    return () => events.forEach((event) => removeEventListener(event, look));
+    const update = () => setAddress(currentAddress());
+    const events = [NAVIGATED, "popstate", "hashchange"];
+    events.forEach((event) => addEventListener(event, update));
+    return () => events.forEach((event) => removeEventListener(event, update));
   }, []);
-  return at;
+  return address;
 }
 
-function here() {
+function currentAddress() {
   return { path: location.pathname, parameters: new URLSearchParams(location.search), fragment: location.hash.slice(1) };
 }
 
-/** Links of these pages are followed here; those elsewhere, and those that open a tab, by the browser. */
+/** Handle clicks on links to these pages. The browser handles other links, downloads and clicks that open a new tab. */
 export function followLinks() {
   document.addEventListener("click", (event) => {
     const link = event.target.closest?.("a[href]");
@@ -36,18 +36,18 @@ export function followLinks() {
     if (link.origin !== location.origin || link.target || link.hasAttribute("download")) return;
     if (!(link.pathname === "/" || link.pathname.startsWith("/leagues")) || link.getAttribute("href").startsWith("#")) return;
     event.preventDefault();
-    go(link.href);
+    navigate(link.href);
   });
 }
 
-/** The first of `routes`, pairs of a pattern (`/leagues/:league`) and anything, that a path is like: [thing, names]. */
-export function matched(routes, path) {
+/** The first route that matches a path: [value, parameters]. `routes`: pairs of a pattern (`/leagues/:league`) and a value. */
+export function matchRoute(routes, path) {
   const parts = path.replace(/\/+$/, "").split("/");
-  for (const [pattern, found] of routes) {
-    const wanted = pattern.replace(/\/+$/, "").split("/");
-    if (wanted.length !== parts.length || !wanted.every((part, at) => part.startsWith(":") ? parts[at] : part === parts[at])) continue;
-    const names = wanted.map((part, at) => [part, parts[at]]).filter(([part]) => part.startsWith(":"));
-    return [found, Object.fromEntries(names.map(([part, text]) => [part.slice(1), decoded(text)]))];
+  for (const [pattern, value] of routes) {
+    const expected = pattern.replace(/\/+$/, "").split("/");
+    if (expected.length !== parts.length || !expected.every((part, index) => part.startsWith(":") ? parts[index] : part === parts[index])) continue;
+    const parameters = expected.map((part, index) => [part, parts[index]]).filter(([part]) => part.startsWith(":"));
+    return [value, Object.fromEntries(parameters.map(([part, text]) => [part.slice(1), decoded(text)]))];
   }
   return [null, {}];
 }
@@ -56,6 +56,6 @@ function decoded(text) {
   try {
     return decodeURIComponent(text);
   } catch {
-    return text; // not our writing
+    return text; // not a valid encoding
   }
 }

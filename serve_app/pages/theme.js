@@ -1,4 +1,3 @@
-// The colour scheme that was chosen here, before anything is painted: by default the system's.
-// A classic script, for modules run after the first paint.
-const chosen = localStorage.getItem("theme");
-if (chosen) document.documentElement.dataset.theme = chosen;
+// Apply the stored theme before the first paint. A classic script, because modules run after it.
+const theme = localStorage.getItem("theme");
+if (theme) document.documentElement.dataset.theme = theme;

@@ -1,107 +1,107 @@
-// What the gate decided, why, and on what evidence.
+// Verdicts of the gate, with reasons and evidence.
 
 import { html } from "./vendor/preact-htm.js";
-import { of, query } from "./api.js";
-import { Chart, Numbers } from "./chart.js";
-import { useData, useList, useMark } from "./data.js";
-import { Await, Empty, Facts, league as at, More, Outcome, Table, useTitle, When } from "./parts.js";
-import { count, interval, number, percent, signed, tail } from "./words.js";
+import { apiPath, query } from "./api.js";
+import { Chart, DataTable } from "./chart.js";
+import { useChangeToken, useData, useList } from "./data.js";
+import { Await, EmptyState, leaguePath, Outcome, Properties, ShowMore, Table, Time, useTitle } from "./components.js";
+import { count, interval, number, percent, shortRef, signed } from "./format.js";
 
 export function Verdicts({ league }) {
-  const verdicts = useList(of(league, "verdicts"), "verdicts", useMark("verdicts", "computed_at"));
-  const head = [["Candidate"], ["Against"], ["Outcome"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["Decided"]];
+  const verdicts = useList(apiPath(league, "verdicts"), "verdicts", useChangeToken("verdicts", "computed_at"));
+  const head = [["Candidate"], ["Opponent"], ["Outcome"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["Decided"]];
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Verdicts</h2></div>
-    <p class="soft">A new version becomes champion when the gate finds it stronger. Each verdict has its evidence.</p>
-    <${Await} of=${verdicts}>${verdicts.items && (verdicts.items.length
+    <p class="muted">The gate promotes a new version if statistical tests show that it is stronger. Select a verdict to see its evidence.</p>
+    <${Await} result=${verdicts}>${verdicts.items && (verdicts.items.length
       ? html`<${Table} caption="Verdicts, newest first" head=${head} cls="full">
-          ${verdicts.items.map((each) => html`<${Row} key=${each.verdict} league=${league} of=${each} />`)}<//>`
-      : html`<${Empty}>Nothing was judged yet. <code>league nightly</code> judges new versions; so does a night that is
-          <a href=${at(league, "evaluations", "new")}>started here</a>.<//>`)}<//>
-    <${More} of=${verdicts} />
+          ${verdicts.items.map((each) => html`<${Row} key=${each.verdict} league=${league} verdict=${each} />`)}<//>`
+      : html`<${EmptyState}>No verdicts yet. Run <code>league nightly</code> or
+          <a href=${leaguePath(league, "evaluations", "new")}>start a nightly run</a> to test new versions.<//>`)}<//>
+    <${ShowMore} list=${verdicts} />
   </section>`;
 }
 
-function Row({ league, of: each }) {
+function Row({ league, verdict: each }) {
   return html`<tr>
-    <th scope="row"><a href=${at(league, "verdicts", each.verdict)}><span class="ref">${tail(each.candidate)}</span></a></th>
-    <td><span class="ref">${tail(each.opponent)}</span></td>
-    <td class="nowrap"><${Outcome} of=${each.outcome} />${each.promoted && html` <span class="soft small">became champion</span>`}</td>
+    <th scope="row"><a href=${leaguePath(league, "verdicts", each.verdict)}><span class="ref">${shortRef(each.candidate)}</span></a></th>
+    <td><span class="ref">${shortRef(each.opponent)}</span></td>
+    <td class="nowrap"><${Outcome} value=${each.outcome} />${each.promoted && html` <span class="muted small">became champion</span>`}</td>
     <td class="number">${count(each.games)}</td>
     <td class="number">${number(each.llr)}</td>
     <td class="number">${signed(each.elo)}</td>
-    <td class="nowrap"><${When} at=${each.closed_at ?? each.opened_at} /></td>
+    <td class="nowrap"><${Time} at=${each.closed_at ?? each.opened_at} /></td>
   </tr>`;
 }
 
 export function Verdict({ league, verdict }) {
-  const found = useData(of(league, "verdicts", verdict), useMark("verdicts", "computed_at"));
-  const of_ = found.data;
-  useTitle(of_ && `${tail(of_.candidate)} against ${tail(of_.opponent)}`, league);
+  const found = useData(apiPath(league, "verdicts", verdict), useChangeToken("verdicts", "computed_at"));
+  const loaded = found.data;
+  useTitle(loaded && `${shortRef(loaded.candidate)} against ${shortRef(loaded.opponent)}`, league);
   return html`<section aria-labelledby="heading">
-    <p class="crumbs"><a href=${at(league, "verdicts")}>Verdicts</a></p>
-    <${Await} of=${found}>${of_ && html`
-      <div class="head"><h2 id="heading"><span class="ref">${of_.candidate}</span> against <span class="ref">${of_.opponent}</span></h2> <${Outcome} of=${of_.outcome} /></div>
-      ${of_.reason && html`<p class="lead">${of_.reason}</p>`}
-      <${Evidence} of=${of_} />
-      <${Measures} league=${league} of=${of_} />
-      ${of_.anchors?.length > 0 && html`<${Anchors} of=${of_.anchors} />`}
-      ${of_.confirmation && html`<${Confirmation} of=${of_.confirmation} />`}`}
+    <p class="crumbs"><a href=${leaguePath(league, "verdicts")}>Verdicts</a></p>
+    <${Await} result=${found}>${loaded && html`
+      <div class="head"><h2 id="heading"><span class="ref">${loaded.candidate}</span> against <span class="ref">${loaded.opponent}</span></h2> <${Outcome} value=${loaded.outcome} /></div>
+      ${loaded.reason && html`<p class="lead">${loaded.reason}</p>`}
+      <${Evidence} verdict=${loaded} />
+      <${Statistics} league=${league} verdict=${loaded} />
+      ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
+      ${loaded.confirmation && html`<${Confirmation} match=${loaded.confirmation} />`}`}
     <//>
   </section>`;
 }
 
-function Evidence({ of: judged }) {
-  if (!judged.curve?.length) return null;
-  const pairs = judged.curve.map((point, at) => (Array.isArray(point) ? point : [at + 1, point]));
+function Evidence({ verdict }) {
+  if (!verdict.curve?.length) return null;
+  const pairs = verdict.curve.map((point, index) => (Array.isArray(point) ? point : [index + 1, point]));
   const x = [0, ...pairs.map(([block]) => block)];
-  const name = judged.model === "returns" ? "log wealth" : "LLR";
+  const name = verdict.model === "returns" ? "log wealth" : "LLR";
   const lines = [{ name, values: [0, ...pairs.map(([, llr]) => llr)] }];
-  const [low, high] = judged.bounds;
-  const label = `${name} after each of ${count(judged.blocks)} blocks. It ended at ${number(judged.llr)}; at ${number(high)} the candidate is promoted, at ${number(low)} rejected.`;
+  const [low, high] = verdict.bounds;
+  const label = `${name} after each of ${count(verdict.blocks)} blocks. Final value: ${number(verdict.llr)}. The candidate is promoted at ${number(high)} and rejected at ${number(low)}.`;
   return html`<h3>Evidence</h3>
-    <${Chart} label=${label} x=${x} lines=${lines} xName="blocks" yName=${name} words=${(value) => number(value)}
-      levels=${[{ name: `promote at ${signed(high, 2)}`, value: high, tone: "good" }, { name: `reject at ${signed(low, 2)}`, value: low, tone: "bad" }]} />
-    <${Numbers} x=${x} lines=${lines} xName="blocks" caption="${name} after each block" words=${(value) => number(value)} />`;
+    <${Chart} label=${label} x=${x} lines=${lines} xName="blocks" yName=${name} format=${(value) => number(value)}
+      thresholds=${[{ name: `promote at ${signed(high, 2)}`, value: high, tone: "good" }, { name: `reject at ${signed(low, 2)}`, value: low, tone: "bad" }]} />
+    <${DataTable} x=${x} lines=${lines} xName="blocks" caption="${name} after each block" format=${(value) => number(value)} />`;
 }
 
-function Measures({ league, of: judged }) {
-  const unit = judged.model === "returns" ? "return" : "Elo";
-  const difference = judged.difference;
-  return html`<${Facts} of=${[
-      ["Games", html`<a href=${query(at(league, "matches"), { first: judged.candidate, second: judged.opponent })}>${count(judged.games)}</a>`],
-      judged.distinct_games != null && ["Different ones", count(judged.distinct_games)],
-      ["Blocks", count(judged.blocks)],
-      ["Score", percent(judged.score)],
-      judged.elo != null && ["Elo difference", html`${signed(judged.elo)} <small>${interval(judged.interval)}</small>`],
-      difference && ["Difference of returns", html`${signed(difference.mean, 2)} <small>${number(difference.low)} to ${number(difference.high)}</small>`],
-      judged.hypotheses && ["Hypotheses", html`${signed(judged.hypotheses[0])} or ${signed(judged.hypotheses[1])} <small>${unit}, ${judged.model}</small>`],
-      judged.alpha != null && ["Error it may spend", percent(judged.alpha, 2)],
-      ["Opened", html`<${When} at=${judged.opened_at} date />`],
-      judged.closed_at && ["Decided", html`<${When} at=${judged.closed_at} date />`],
+function Statistics({ league, verdict }) {
+  const unit = verdict.model === "returns" ? "return" : "Elo";
+  const difference = verdict.difference;
+  return html`<${Properties} items=${[
+      ["Games", html`<a href=${query(leaguePath(league, "matches"), { first: verdict.candidate, second: verdict.opponent })}>${count(verdict.games)}</a>`],
+      verdict.unique_games != null && ["Unique games", count(verdict.unique_games)],
+      ["Blocks", count(verdict.blocks)],
+      ["Score", percent(verdict.score)],
+      verdict.elo != null && ["Elo difference", html`${signed(verdict.elo)} <small>${interval(verdict.interval)}</small>`],
+      difference && ["Difference in mean return", html`${signed(difference.mean, 2)} <small>${number(difference.low)} to ${number(difference.high)}</small>`],
+      verdict.hypotheses && ["Hypotheses", html`${signed(verdict.hypotheses[0])} vs ${signed(verdict.hypotheses[1])} <small>${unit}, ${verdict.model}</small>`],
+      verdict.alpha != null && ["Alpha budget", percent(verdict.alpha, 2)],
+      ["Opened", html`<${Time} at=${verdict.opened_at} date />`],
+      verdict.closed_at && ["Decided", html`<${Time} at=${verdict.closed_at} date />`],
     ]} />
-    ${judged.counts?.length > 0 && html`<h3>Blocks by result</h3><${Counts} of=${judged.counts} />`}`;
+    ${verdict.counts?.length > 0 && html`<h3>Blocks by result</h3><${Counts} counts=${verdict.counts} />`}`;
 }
 
-/** How the blocks came out, worst for the candidate first. */
-function Counts({ of: counts }) {
+/** The number of blocks by result, worst result for the candidate first. */
+function Counts({ counts }) {
   const most = Math.max(1, ...counts);
-  const name = (at) => (at === 0 ? "lost all" : at === counts.length - 1 ? "won all" : at === (counts.length - 1) / 2 ? "even" : "");
-  return html`<ol class="counts" aria-label="Blocks, from the worst result for the candidate to the best">${counts.map((each, at) => html`<li>
+  const name = (index) => (index === 0 ? "lost all" : index === counts.length - 1 ? "won all" : index === (counts.length - 1) / 2 ? "even" : "");
+  return html`<ol class="counts" aria-label="Blocks by result, from worst to best for the candidate">${counts.map((each, index) => html`<li>
     <span class="value">${count(each)}</span><svg viewBox="0 0 10 100" preserveAspectRatio="none" aria-hidden="true"><rect x="0" width="10" y=${100 - (100 * each) / most} height=${(100 * each) / most} /></svg>
-    <span class="soft small">${name(at)}</span></li>`)}</ol>`;
+    <span class="muted small">${name(index)}</span></li>`)}</ol>`;
 }
 
-function Anchors({ of: anchors }) {
-  return html`<h3>Not inferior to</h3>
-    <${Table} caption="Tests of non-inferiority" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["95 % interval"]]}>
+function Anchors({ anchors }) {
+  return html`<h3>Non-inferiority tests</h3>
+    <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["95 % interval"]]}>
       ${anchors.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td>${each.outcome}</td><td class="number">${each.margin}</td>
         <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${signed(each.elo)}</td><td class="nowrap">${interval(each.interval)}</td></tr>`)}
     <//>`;
 }
 
-function Confirmation({ of: fresh }) {
-  return html`<h3>Confirmed</h3>
-    <p>A fresh match of ${count(fresh.games)} games against ${fresh.opponent} after the promotion: a score of ${percent(fresh.score)},
-      ${" "}${signed(fresh.elo)} Elo, 95 % interval ${interval(fresh.interval)}.</p>`;
+function Confirmation({ match }) {
+  return html`<h3>Confirmation match</h3>
+    <p>${count(match.games)} new games against ${match.opponent} after the promotion: score ${percent(match.score)},
+      ${" "}${signed(match.elo)} Elo, 95 % interval ${interval(match.interval)}.</p>`;
 }

@@ -1,66 +1,66 @@
-// Versions on their way: how strong each is, which ones became champion, and what they were made by.
+// The versions of a league, with their ratings and notes.
 
 import { html, useState } from "./vendor/preact-htm.js";
-import { of } from "./api.js";
+import { apiPath } from "./api.js";
 import { Chart } from "./chart.js";
-import { useData, useList, useMark, useRefusal } from "./data.js";
-import { Note, WriteNote } from "./note.js";
-import { Await, Badge, Empty, More, Ref, Table, When } from "./parts.js";
-import { Promote } from "./promoting.js";
-import { count, interval, several, short, signed } from "./words.js";
+import { useChangeToken, useData, useList, useMissingScope } from "./data.js";
+import { EditNote, Note } from "./note.js";
+import { Await, Badge, EmptyState, Ref, ShowMore, Table, Time } from "./components.js";
+import { Promote } from "./promotion.js";
+import { count, interval, plural, short, signed } from "./format.js";
 
 export function Versions({ league, about }) {
-  const [promoted, setPromoted] = useState(null);
-  const [noted, setNoted] = useState(null);
-  const refusal = useRefusal("promote", league);
-  const mark = useMark("computed_at", "aliases", "version", "note");
-  const ratings = useData(of(league, "ratings"), mark);
-  const versions = useList(of(league, "versions"), "versions", mark);
+  const [promoting, setPromoting] = useState(null);
+  const [editing, setEditing] = useState(null);
+  const disabledReason = useMissingScope("promote", league);
+  const token = useChangeToken("computed_at", "aliases", "version", "note");
+  const ratings = useData(apiPath(league, "ratings"), token);
+  const versions = useList(apiPath(league, "versions"), "versions", token);
   const rated = ratings.data?.versions ?? [];
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Versions</h2></div>
-    ${rated.some((each) => each.rating != null) && html`<${Way} of=${rated} />`}
-    <${Await} of=${versions}>${versions.items && html`<${List} league=${league} versions=${versions.items}
-      rated=${new Map(rated.map((each) => [each.number, each]))} champion=${about.champion} promote=${setPromoted} write=${setNoted} refusal=${refusal} />`}<//>
-    <${More} of=${versions} />
-    ${promoted != null && html`<${Promote} league=${league} champion=${about.champion} version=${promoted} onClose=${() => setPromoted(null)} />`}
-    ${noted && html`<${WriteNote} league=${league} version=${noted.version} note=${noted.note} onClose=${() => setNoted(null)} />`}
+    ${rated.some((each) => each.rating != null) && html`<${RatingChart} versions=${rated} />`}
+    <${Await} result=${versions}>${versions.items && html`<${List} league=${league} versions=${versions.items}
+      rated=${new Map(rated.map((each) => [each.number, each]))} champion=${about.champion} promote=${setPromoting} edit=${setEditing} disabledReason=${disabledReason} />`}<//>
+    <${ShowMore} list=${versions} />
+    ${promoting != null && html`<${Promote} league=${league} champion=${about.champion} version=${promoting} onClose=${() => setPromoting(null)} />`}
+    ${editing && html`<${EditNote} league=${league} version=${editing.version} note=${editing.note} onClose=${() => setEditing(null)} />`}
   </section>`;
 }
 
-function Way({ of: all }) {
-  const rated = all.filter((each) => each.rating != null);
+function RatingChart({ versions }) {
+  const rated = versions.filter((each) => each.rating != null);
   const champions = rated.filter((each) => each.champion_at.length);
   const best = rated.reduce((one, other) => (other.rating > one.rating ? other : one));
-  const label = `Ratings of ${several(rated.length, "version")}, from ${signed(rated[0].rating)} to ${signed(rated.at(-1).rating)} Elo; the best is `
-    + `${best.ref} with ${signed(best.rating)}. Champions were ${champions.map((each) => each.ref).join(", ") || "none of them"}. The table below has the numbers.`;
-  return html`<${Chart} label=${label} xName="version" yName="Elo" height=${300} words=${(value) => signed(value)}
+  const label = `Ratings of ${plural(rated.length, "version")}, from ${signed(rated[0].rating)} to ${signed(rated.at(-1).rating)} Elo. Best version: `
+    + `${best.ref} with ${signed(best.rating)}. Champions: ${champions.map((each) => each.ref).join(", ") || "none"}. The table below lists all values.`;
+  return html`<${Chart} label=${label} xName="version" yName="Elo" height=${300} format=${(value) => signed(value)}
       x=${rated.map((each) => each.number)} lines=${[{ name: "rating", values: rated.map((each) => each.rating), dots: rated.length < 80 }]}
-      spans=${rated.map((each) => each.interval)} stars=${rated.map((each) => each.champion_at.length > 0)} />
-    <p class="soft small">Bars are 95 % intervals; a filled ◆ became champion.</p>`;
+      intervals=${rated.map((each) => each.interval)} markers=${rated.map((each) => each.champion_at.length > 0)} />
+    <p class="muted small">Bars show 95 % intervals. ◆ marks versions that became champion.</p>`;
 }
 
-function List({ league, versions, rated, champion, promote, write, refusal }) {
-  if (!versions.length) return html`<${Empty}>No version is published yet.<//>`;
-  const head = [["Version"], ["Rating", "number"], ["95 % interval"], ["Games", "number"], ["Made by"], ["Steps", "number"], ["From"], ["Made"], ["Note"], ["Promote", "", true]];
+function List({ league, versions, rated, champion, promote, edit, disabledReason }) {
+  if (!versions.length) return html`<${EmptyState}>No versions yet.<//>`;
+  const head = [["Version"], ["Rating", "number"], ["95 % interval"], ["Games", "number"], ["Algorithm"], ["Steps", "number"], ["Parent"], ["Created"], ["Note"], ["Promote", "", true]];
   return html`<${Table} caption="Versions, newest first" head=${head} cls="full">
-    ${versions.map((each) => html`<${Row} key=${each.version} league=${league} of=${each} rated=${rated.get(each.version)} champion=${champion} promote=${promote} write=${write} refusal=${refusal} />`)}
+    ${versions.map((each) => html`<${Row} key=${each.version} league=${league} version=${each} rated=${rated.get(each.version)} champion=${champion} promote=${promote} edit=${edit} disabledReason=${disabledReason} />`)}
   <//>`;
 }
 
-function Row({ league, of: each, rated, champion, promote, write, refusal }) {
+function Row({ league, version: each, rated, champion, promote, edit, disabledReason }) {
   const others = each.aliases.filter((alias) => alias !== "champion");
-  return html`<tr class=${each.version === champion ? "leads" : ""}>
-    <th scope="row"><${Ref} of="${league}@${each.version}" champion=${champion} />${others.map((alias) => html` <${Badge}>${alias}<//>`)}</th>
+  return html`<tr class=${each.version === champion ? "champion-row" : ""}>
+    <th scope="row"><${Ref} value="${league}@${each.version}" champion=${champion} />${others.map((alias) => html` <${Badge}>${alias}<//>`)}</th>
     <td class="number strong">${signed(rated?.rating)}</td>
-    <td class="nowrap soft">${interval(rated?.interval)}</td>
+    <td class="nowrap muted">${interval(rated?.interval)}</td>
     <td class="number">${count(rated?.games)}</td>
     <td>${each.algorithm}</td>
     <td class="number">${short(each.steps)}</td>
-    <td>${each.parent == null ? html`<span class="soft">–</span>` : `@${each.parent}`}</td>
-    <td class="nowrap"><${When} at=${each.created_at} /></td>
-    <td class="words"><${Note} of=${each.note} name="${league}@${each.version}" write=${() => write(each)} refusal=${refusal} /></td>
-    <td>${each.version !== champion && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${refusal} title=${refusal}
+    <td>${each.parent == null ? html`<span class="muted">–</span>` : `@${each.parent}`}</td>
+    <td class="nowrap"><${Time} at=${each.created_at} /></td>
+    <td class="wrap"><${Note} note=${each.note} name="${league}@${each.version}" edit=${() => edit(each)} disabledReason=${disabledReason} /></td>
+    <td>${each.version !== champion && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
       aria-label="Promote ${league}@${each.version}">Promote …</button>`}</td>
   </tr>`;
 }

@@ -1,12 +1,12 @@
-"""Evaluations: games between a league's versions, played by the studio, followed and stopped from here.
+"""Starts, lists and stops evaluations: games between versions of a league, played by the evaluation service.
 
-POST    /v1/leagues/{league}/evaluations        {"contestants": ["connect_four@3", "script:one_ply"], "blocks": 64}
-GET     /v1/leagues/{league}/evaluations        newest first; ?limit= &before=
-GET     /v1/leagues/{league}/evaluations/{evaluation}
-DELETE  /v1/leagues/{league}/evaluations/{evaluation}
+    POST    /v1/leagues/{league}/evaluations        {"contestants": ["connect_four@3", "script:one_ply"], "blocks": 64}
+    GET     /v1/leagues/{league}/evaluations        newest first; ?limit= &before=
+    GET     /v1/leagues/{league}/evaluations/{evaluation}
+    DELETE  /v1/leagues/{league}/evaluations/{evaluation}
 
-What is asked is checked at once, written to the registry, and played by whoever runs the studio; any replica can tell
-how far it is. Starting and stopping take a key of scope `evaluate`, a night of scope `promote` as well.
+A request is validated, written to the registry, and played by the evaluation service; any replica reports its progress.
+Starting and stopping require a key of scope `evaluate`; a nightly run also requires the scope `promote`.
 """
 
 from typing import Any
@@ -14,127 +14,101 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
-from league.errors import Forbidden, NoStudio, UnknownEvaluation
-from league.evaluations import Asked, Night, Tournament
-from league.policies.pinning import check_eligible, eligible, pinned
+from league.errors import Forbidden
+from league.policies.loading import check_eligible, eligible, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.rows import EvaluationRow
-from serve_app import queries
-from serve_app.bodies import read_body
-from serve_app.doors import KEY
-from serve_app.keyring import Key
-from serve_app.models import Models
-from serve_app.routes.promotion import call_of, parse
+from league.registry.storage.rows import EvaluationRow
+from league.service_requests import EvaluationRequest, NightlyRequest, TournamentRequest
+from serve_app.access.access_control import KEY
+from serve_app.access.api_keys import ApiKey
+from serve_app.access.request_body import read_body
+from serve_app.evaluation_client import EvaluationClient, require_client
+from serve_app.models.resolver import ModelResolver
+from serve_app.routes import documents, parsing
 from serve_app.settings import ServeSettings
-from serve_app.studio import Studio
 
-PAGE, LARGEST_PAGE = 20, 100
+PAGE, MAX_PAGE = 20, 100
 
 
 class EvaluationRoutes:
-    """The endpoints. Doors lets only keys of scope `evaluate` start and stop."""
+    """The endpoints. Access control requires the scope `evaluate` for POST and DELETE."""
 
-    def __init__(self, models: Models, settings: ServeSettings, studio: Studio | None) -> None:
+    def __init__(
+        self, models: ModelResolver, settings: ServeSettings, evaluation_client: EvaluationClient | None
+    ) -> None:
         self._models = models
         self._settings = settings
-        self._studio = studio
+        self._evaluation_client = evaluation_client
 
     async def start(self, request: Request) -> JSONResponse:
-        """Queue an evaluation: 202.
+        """Queue an evaluation, and respond with 202.
 
-        Raises NoStudio, InvalidInput, Forbidden, InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias,
-        UnknownPolicy, EnvironmentMismatch, TooManyEvaluations or KeyReused.
+        Raises NoEvaluationService, InvalidInput, Forbidden, InvalidReference, UnknownLeague, UnknownVersion,
+        UnknownAlias, UnknownPolicy, EnvironmentMismatch, TooManyEvaluations or KeyReused.
         """
         league = check_slug("league", request.path_params["league"])
         body = await read_body(request.scope, request.receive, self._settings.max_body)
-        asked = parse(Asked, body or b"{}")
-        key, call = call_of(request, asked)
-        if isinstance(asked.root, Night) and "promote" not in key.scopes:
-            raise Forbidden(f"a night may promote: this needs a key of scope promote as well, which {key.name} is not")
-        if self._studio is None:
-            raise NoStudio("this server plays no games: `studio` is not set in its deploy.yaml")
+        evaluation_request = parsing.parse_body(EvaluationRequest, body or b"{}")
+        key, call = parsing.idempotent_call(request, evaluation_request)
+        if isinstance(evaluation_request.root, NightlyRequest) and "promote" not in key.scopes:
+            raise Forbidden(f"a nightly run requires a key with the scope promote; the key {key.name} does not have it")
+        evaluation_client = require_client(self._evaluation_client)
 
-        def ask(registry: Registry) -> EvaluationRow:
-            return registry.ask_evaluation(
+        def submit(registry: Registry) -> EvaluationRow:
+            return registry.evaluations.submit(
                 league,
-                _pinned(asked, league, registry),
+                _pinned(evaluation_request, league, registry),
                 actor=key.name,
                 key=key.id,
-                reason=asked.root.reason,
-                most=self._settings.max_evaluations,
+                reason=evaluation_request.root.reason,
+                max_active=self._settings.max_evaluations,
                 call=call,
             )
 
-        row = await self._models.ask(ask)
-        self._studio.look()
-        return JSONResponse(evaluation_document(row), 202, {"location": f"{request.url.path}/{row.id}"})
+        row = await self._models.query(submit)
+        evaluation_client.notify()
+        return JSONResponse(documents.evaluation_document(row), 202, {"location": f"{request.url.path}/{row.id}"})
 
-    async def every(self, request: Request) -> JSONResponse:
-        """A page of a league's evaluations, without their results. Raises UnknownLeague or InvalidInput."""
+    async def page(self, request: Request) -> JSONResponse:
+        """A page of a league's evaluations, without results. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        limit = queries.number(request, "limit", LARGEST_PAGE) or PAGE
-        before = queries.number(request, "before")
-        rows = await self._models.ask(lambda registry: registry.evaluations(league, before=before, limit=limit + 1))
-        page, more = queries.paged(rows, limit, lambda row: row.id)
-        documents = [_document(row) for row in page]
-        return JSONResponse({"league": league, "evaluations": documents, "next": more})
+        limit = parsing.query_number(request, "limit", MAX_PAGE) or PAGE
+        before = parsing.query_number(request, "before")
+        rows = await self._models.query(
+            lambda registry: registry.evaluations.newest(league, before=before, limit=limit + 1)
+        )
+        page, more = parsing.paginate(rows, limit, lambda row: row.id)
+        summaries = [documents.evaluation_summary(row) for row in page]
+        return JSONResponse({"league": league, "evaluations": summaries, "next": more})
 
-    async def one(self, request: Request) -> JSONResponse:
-        """One evaluation: how far it is, and what it has brought. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = named(request)
+    async def get(self, request: Request) -> JSONResponse:
+        """One evaluation with its progress and result. Raises UnknownLeague or UnknownEvaluation."""
+        league, number = parsing.evaluation_path(request)
         return JSONResponse(
-            evaluation_document(await self._models.ask(lambda registry: registry.evaluation(league, number)))
+            documents.evaluation_document(
+                await self._models.query(lambda registry: registry.evaluations.get(league, number))
+            )
         )
 
     async def stop(self, request: Request) -> JSONResponse:
-        """Ask for its end; what has ended stays as it is. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = named(request)
-        key: Key = request.scope[KEY]
-        row = await self._models.ask(lambda registry: registry.stop_evaluation(league, number, actor=key.name))
-        if self._studio is not None:
-            self._studio.look()
-        return JSONResponse(evaluation_document(row))
+        """Request the end of an evaluation; a finished one is unchanged. Raises UnknownLeague or UnknownEvaluation."""
+        league, number = parsing.evaluation_path(request)
+        key: ApiKey = request.scope[KEY]
+        row = await self._models.query(lambda registry: registry.evaluations.stop(league, number, actor=key.name))
+        if self._evaluation_client is not None:
+            self._evaluation_client.notify()
+        return JSONResponse(documents.evaluation_document(row))
 
 
-def _pinned(asked: Asked, league: str, registry: Registry) -> dict[str, Any]:
-    """What is kept: with versions that are the same when it is played, or played on after a fault."""
-    row = registry.league(league)
-    document = asked.root.model_dump(mode="json", exclude={"reason"})
-    if isinstance(asked.root, Tournament):
+def _pinned(evaluation_request: EvaluationRequest, league: str, registry: Registry) -> dict[str, Any]:
+    """The stored request, in which aliases are replaced by versions so that a resumed evaluation plays the same."""
+    row = registry.leagues.get(league)
+    document = evaluation_request.root.model_dump(mode="json", exclude={"reason"})
+    if isinstance(evaluation_request.root, TournamentRequest):
         for name in ("contestants", "against"):
-            document[name] = [pinned(ref, league, registry) for ref in getattr(asked.root, name)]
+            document[name] = [pinned(ref, league, registry) for ref in getattr(evaluation_request.root, name)]
             for ref in document[name]:
                 check_eligible(ref, registry, row.config)
         document["contestants"] = document["contestants"] or [version.ref for version in eligible(registry, league)]
     return document
-
-
-def named(request: Request) -> tuple[str, int]:
-    """The league and the number of an evaluation that a path names. Raises InvalidReference or UnknownEvaluation."""
-    league, number = check_slug("league", request.path_params["league"]), request.path_params["evaluation"]
-    if not (number.isascii() and number.isdigit() and len(number) <= 10 and int(number) <= queries.LARGEST):
-        raise UnknownEvaluation(f"league {league} has no evaluation {number[:32]!r}: it is a number")
-    return league, int(number)
-
-
-def _document(row: EvaluationRow) -> dict[str, Any]:
-    instants = {"created_at": row.created_at, "started_at": row.started_at, "ended_at": row.ended_at}
-    return {
-        "league": row.league,
-        "evaluation": row.id,
-        "state": row.state,
-        "asked": row.asked,
-        "progress": row.progress,
-        "error": row.error,
-        "actor": row.actor,
-        "reason": row.reason,
-        "workers": row.workers,
-        "stopped_by": row.stopped_by,
-        "heartbeat_at": row.heartbeat_at and row.heartbeat_at.isoformat(),
-    } | {name: instant and instant.isoformat() for name, instant in instants.items()}
-
-
-def evaluation_document(row: EvaluationRow) -> dict[str, Any]:
-    """An evaluation as JSON, with its result."""
-    return _document(row) | {"result": row.result}

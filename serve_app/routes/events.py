@@ -1,108 +1,230 @@
-"""Server-sent events: what of a league, or of an evaluation, has changed, as soon as it has.
+"""Streams server-sent events: changes of a league or of an evaluation.
 
-GET  /v1/leagues/{league}/events                            event `league`: where it stands, so what to ask for again
-GET  /v1/leagues/{league}/evaluations/{evaluation}/events   event `evaluation`: all of it, until it has ended
+    GET  /v1/leagues/{league}/events                            event `league`: change tokens of what can be requested
+    GET  /v1/leagues/{league}/evaluations/{evaluation}/events   event `evaluation`: the evaluation, until it has ended
 
-A stream begins with what there is. It ends when the replica stops, or the key that opened it is valid no longer:
-whoever wants more opens it again. It is read by `fetch`, for the `EventSource` of browsers sends no key.
+A stream starts with the current state. Listeners get the newest state, not every intermediate one, so slow readers
+delay nobody. A stream ends when the replica stops or its key becomes invalid; clients reconnect. Clients read it with
+`fetch`, because the `EventSource` of browsers cannot send a key.
 """
 
+import asyncio
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from typing import Any
 
 import orjson
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import Unauthenticated
+from league.errors import DeadlineExceeded, NotReady, Overloaded, Unauthenticated
 from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.rows import Pulse
-from serve_app.doors import KEY, Doors
-from serve_app.events import Document, Events
-from serve_app.routes.evaluations import evaluation_document, named
-from serve_app.settings import ACKNOWLEDGED_WITHIN
+from league.registry.storage.rows import ChangeToken
+from serve_app.access.access_control import KEY, AccessControl
+from serve_app.models.polling import Polling
+from serve_app.models.resolver import ModelResolver
+from serve_app.routes import documents, parsing
+from serve_app.settings import ServeSettings
+
+Document = dict[str, Any]
+Query = Callable[[Registry], Document]
+
+KEEPALIVE_INTERVAL = 2.0
+"""Seconds between keep-alive comments. Less than half of RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy
+considers the replica dead."""
+
+
+class Topic:
+    """A state that listeners follow. It exists while it has listeners."""
+
+    __slots__ = ("changed", "document", "listeners", "query")
+
+    def __init__(self, query: Query, document: Document) -> None:
+        self.query = query
+        self.document = document
+        """The state at the last poll."""
+        self.changed = asyncio.Event()
+        """Set at the next change, and then replaced."""
+        self.listeners = 0
+
+    def update(self, document: Document) -> None:
+        """Store the state, and notify listeners if it has changed."""
+        if document != self.document:
+            self.document = document
+            self.wake()
+
+    def wake(self) -> None:
+        """Wake all listeners."""
+        self.changed.set()
+        self.changed = asyncio.Event()
+
+
+class EventBroker:
+    """The topics of a replica. All methods run on the event loop."""
+
+    def __init__(self, models: ModelResolver, settings: ServeSettings) -> None:
+        self._models = models
+        self._settings = settings
+        self._topics: dict[str, Topic] = {}
+        self._is_over = False
+        self.open = 0
+        """Number of listeners."""
+        slowest = max(settings.poll_events, settings.poll_slowest)
+        pace = settings.model_copy(update={"poll": settings.poll_events, "poll_slowest": slowest})
+        self._polling = Polling(self._poll, "event streams", pace)
+
+    @property
+    def topics(self) -> int:
+        """Number of topics."""
+        return len(self._topics)
+
+    @asynccontextmanager
+    async def watching(self) -> AsyncIterator[None]:
+        """Poll for changes while the context is active."""
+        async with self._polling.running():
+            try:
+                yield
+            finally:
+                self.end()
+
+    @asynccontextmanager
+    async def subscribe(self, name: str, query: Query) -> AsyncIterator[AsyncIterator[Document | None]]:
+        """Follow the result of `query`, which is the same for all listeners of `name`.
+
+        Yields the current state and each change; None if nothing has changed for KEEPALIVE_INTERVAL seconds. Raises
+        Overloaded, NotReady, DeadlineExceeded or the errors of `query`.
+        """
+        if self._is_over:
+            raise NotReady("this replica is shutting down: reconnect")
+        if self.open >= self._settings.max_listeners:
+            raise Overloaded(f"{self.open} event streams are open in this replica")
+        self.open += 1
+        try:
+            topic = self._topics.get(name) or self._topics.setdefault(name, await self._create_topic(query))
+            topic.listeners += 1
+            try:
+                yield self._updates(topic)
+            finally:
+                topic.listeners -= 1
+                if not topic.listeners:
+                    del self._topics[name]
+        finally:
+            self.open -= 1
+
+    def end(self) -> None:
+        """End all streams: the replica stops."""
+        self._is_over = True
+        for topic in self._topics.values():
+            topic.wake()
+
+    async def _create_topic(self, query: Query) -> Topic:
+        try:
+            async with asyncio.timeout(self._settings.timeout):
+                return Topic(query, await self._models.query(query))
+        except TimeoutError:
+            raise DeadlineExceeded(f"the request timed out after {self._settings.timeout:g} s") from None
+
+    async def _updates(self, topic: Topic) -> AsyncIterator[Document | None]:
+        document: Document | None = topic.document
+        while not self._is_over:
+            changed = topic.changed
+            yield document
+            with suppress(TimeoutError):
+                async with asyncio.timeout(KEEPALIVE_INTERVAL):
+                    await changed.wait()
+            document = topic.document if changed.is_set() else None
+
+    async def _poll(self) -> None:
+        """Query all topics. Raises StorageError."""
+        self._polling.mark_ready()
+        if topics := list(self._topics.values()):
+            found = await self._models.query(lambda registry: [topic.query(registry) for topic in topics])
+            for topic, document in zip(topics, found, strict=True):
+                topic.update(document)
+
 
 EVENT_STREAM = "text/event-stream"
 HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
-"""The second is for nginx, which would gather what it passes on."""
-NOTHING_NEW = b": nothing new\n\n"
+"""The second disables buffering in nginx."""
+KEEPALIVE = b": keep-alive\n\n"
 
 
 class EventRoutes:
     """The endpoints."""
 
-    def __init__(self, events: Events, doors: Doors) -> None:
+    def __init__(self, events: EventBroker, access: AccessControl) -> None:
         self._events = events
-        self._doors = doors
+        self._access = access
 
     async def league(self, request: Request) -> ASGIApp:
-        """Where a league stands. Raises UnknownLeague."""
+        """Events of a league. Raises UnknownLeague."""
         league = check_slug("league", request.path_params["league"])
 
-        def look(registry: Registry) -> Document:
-            return _pulse(registry.pulse(league, since=ACKNOWLEDGED_WITHIN))
+        def query(registry: Registry) -> Document:
+            return _league_document(registry.changes.token(league))
 
-        return self._stream(request, "league", look, is_last=lambda _: False)
+        return self._stream(request, "league", query, is_last=lambda _: False)
 
     async def evaluation(self, request: Request) -> ASGIApp:
-        """One evaluation. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = named(request)
+        """Events of an evaluation. Raises UnknownLeague or UnknownEvaluation."""
+        league, number = parsing.evaluation_path(request)
 
-        def look(registry: Registry) -> Document:
-            return evaluation_document(registry.evaluation(league, number))
+        def query(registry: Registry) -> Document:
+            return documents.evaluation_document(registry.evaluations.get(league, number))
 
-        return self._stream(request, "evaluation", look, is_last=lambda document: document["ended_at"] is not None)
+        return self._stream(request, "evaluation", query, is_last=lambda document: document["ended_at"] is not None)
 
     def _stream(
-        self, request: Request, kind: str, look: Callable[[Registry], Document], is_last: Callable[[Document], bool]
+        self, request: Request, kind: str, query: Callable[[Registry], Document], is_last: Callable[[Document], bool]
     ) -> ASGIApp:
         if request.method == "HEAD":
             return Response(headers=HEADERS, media_type=EVENT_STREAM)
 
         async def stream(scope: Scope, receive: Receive, send: Send) -> None:
-            async with self._events.listening(scope["path"], look) as documents:
-                messages = _messages(documents, kind, is_last, lambda: self._doors.admit_still(scope.get(KEY)))
+            async with self._events.subscribe(scope["path"], query) as states:
+                messages = _messages(states, kind, is_last, lambda: self._access.check_key(scope.get(KEY)))
                 await StreamingResponse(messages, headers=HEADERS, media_type=EVENT_STREAM)(scope, receive, send)
 
         return stream
 
 
 async def _messages(
-    documents: AsyncIterator[Document | None],
+    states: AsyncIterator[Document | None],
     kind: str,
     is_last: Callable[[Document], bool],
     check: Callable[[], None],
 ) -> AsyncIterator[bytes]:
-    """A stream of events of one kind (HTML Standard, section 9.2.5), for as long as `check` lets it go on."""
-    async for document in documents:
+    """A stream of events of one kind (HTML Standard, section 9.2.5), until `check` raises Unauthenticated."""
+    async for document in states:
         try:
             check()
         except Unauthenticated:
             return
         if document is None:
-            yield NOTHING_NEW
+            yield KEEPALIVE
             continue
         yield b"event: %b\ndata: %b\n\n" % (kind.encode(), orjson.dumps(document))
         if is_last(document):
             return
 
 
-def _pulse(pulse: Pulse) -> Document:
+def _league_document(token: ChangeToken) -> Document:
     return {
-        "league": pulse.league,
-        "aliases": pulse.aliases,
-        "event": pulse.event,
-        "version": pulse.version,
-        "note": pulse.note,
-        "traffic": pulse.traffic,
-        "serving": {str(version): replicas for version, replicas in pulse.serving.items()},
-        "verdicts": pulse.verdicts,
-        "evaluation": pulse.evaluation,
+        "league": token.league,
+        "aliases": token.aliases,
+        "event": token.event,
+        "version": token.version,
+        "note": token.note,
+        "traffic": token.traffic,
+        "serving": {str(version): replicas for version, replicas in token.serving.items()},
+        "verdicts": token.verdicts,
+        "evaluation": token.evaluation,
         "evaluations": [
-            {"evaluation": row.id, "state": row.state, "progress": row.progress} for row in pulse.evaluations
+            {"evaluation": row.id, "state": row.state, "progress": row.progress} for row in token.evaluations
         ],
-        "run": pulse.run,
-        "runs": [{"run": row.id, "state": row.state, "steps": row.steps} for row in pulse.runs],
-        "computed_at": pulse.computed_at and pulse.computed_at.isoformat(),
+        "run": token.run,
+        "runs": [{"run": row.id, "state": row.state, "steps": row.steps} for row in token.runs],
+        "computed_at": token.computed_at and token.computed_at.isoformat(),
     }

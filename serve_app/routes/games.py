@@ -1,11 +1,11 @@
-"""Games to look at, and to play: what needs an environment is asked of the studio, and goes on as it answers.
+"""Shows recorded games, and plays games of people against policies, with the evaluation service.
 
-GET   /v1/leagues/{league}/matches/{schedule}/{position}/games/{game}            its steps: ?from=0&to=100&every=1
-GET   /v1/leagues/{league}/matches/{schedule}/{position}/games/{game}/film.gif
-GET   /v1/leagues/{league}/playable                                              as whom, and against whom
-POST  /v1/leagues/{league}/play    {"opponent": "connect_four@champion", "agent": "player_0", "seed": 7, "actions": [3]}
+    GET   /v1/leagues/{league}/matches/{schedule}/{position}/games/{game}            its steps: ?from=0&to=100&every=1
+    GET   /v1/leagues/{league}/matches/{schedule}/{position}/games/{game}/video.gif
+    GET   /v1/leagues/{league}/playable                                              playable agents and opponents
+    POST  /v1/leagues/{league}/play {"opponent": "connect_four@champion", "agent": "player_0", "actions": [3]}
 
-Nothing of a game is kept for whoever plays it: seed and actions are the game, and come with each request.
+The server keeps no state of a person's game: each request contains the seed and all actions.
 """
 
 from collections.abc import Callable
@@ -13,99 +13,115 @@ from collections.abc import Callable
 from starlette.requests import Request
 from starlette.responses import Response
 
-from league.errors import NoStudio, UnknownMatch
-from league.games import Film, Order, Play, Recording, Sitting, Table
-from league.policies.pinning import check_eligible, pinned
+from league.errors import UnknownMatch
+from league.policies.loading import check_eligible, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from serve_app import queries
-from serve_app.bodies import read_body
-from serve_app.models import Models
-from serve_app.routes.promotion import parse
+from league.service_requests import (
+    GameOperation,
+    GameRequest,
+    GameResponse,
+    HumanPlayRequest,
+    PlayabilityRequest,
+    PlayBody,
+    RecordingRequest,
+    VideoRequest,
+)
+from serve_app.access.request_body import read_body
+from serve_app.evaluation_client import EvaluationClient, require_client
+from serve_app.models.resolver import ModelResolver
+from serve_app.routes import parsing
 from serve_app.settings import ServeSettings
-from serve_app.studio import Answer, Studio
 
 DIGITS = 10
-"""No number of a game has as many."""
+"""Exclusive maximum of digits in the number of a game."""
 
 
 class GameRoutes:
     """The endpoints."""
 
-    def __init__(self, models: Models, settings: ServeSettings, studio: Studio | None) -> None:
+    def __init__(
+        self, models: ModelResolver, settings: ServeSettings, evaluation_client: EvaluationClient | None
+    ) -> None:
         self._models = models
         self._settings = settings
-        self._studio = studio
+        self._evaluation_client = evaluation_client
 
     async def recording(self, request: Request) -> Response:
-        """Steps of a recorded game. Raises UnknownLeague, UnknownMatch, InvalidInput, and what the studio does."""
+        """Steps of a recorded game. Raises UnknownLeague, UnknownMatch, InvalidInput, and the errors of the evaluation
+        service.
+        """
         match, game = _named(request)
-        first, end = (queries.number(request, name, smallest=0) for name in ("from", "to"))
-        every = queries.number(request, "every")
-        asked = Recording(match=match, game=game, first=first or 0, end=end, every=every or 1)
-        return _response(await self._of_match(request, match, game, asked))
+        first, end = (parsing.query_number(request, name, smallest=0) for name in ("from", "to"))
+        every = parsing.query_number(request, "every")
+        operation = RecordingRequest(match=match, game=game, first=first or 0, end=end, every=every or 1)
+        return _response(await self._of_match(request, match, game, operation))
 
-    async def film(self, request: Request) -> Response:
-        """A recorded game as a GIF, to be kept. Raises what `recording` does."""
+    async def video(self, request: Request) -> Response:
+        """A recorded game as a GIF to download. Raises the errors of `recording`."""
         match, game = _named(request)
-        answer = await self._of_match(request, match, game, Film(match=match, game=game))
+        video = await self._of_match(request, match, game, VideoRequest(match=match, game=game))
         name = f"{match.replace('/', '-')}-{game}.gif"
-        return _response(answer, {"content-disposition": f'attachment; filename="{name}"'})
+        return _response(video, {"content-disposition": f'attachment; filename="{name}"'})
 
-    async def table(self, request: Request) -> Response:
-        """Whether and how a league can be played. Raises UnknownLeague, and what the studio does."""
-        return _response(await self._ask(request, lambda *_: Table()))
+    async def playability(self, request: Request) -> Response:
+        """Whether and how a league can be played. Raises UnknownLeague and the errors of the evaluation service."""
+        return _response(await self._request_game(request, lambda *_: PlayabilityRequest()))
 
     async def play(self, request: Request) -> Response:
         """A person's game up to the next choice.
 
         Raises InvalidInput, InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy,
-        EnvironmentMismatch, IllegalAction, and what the studio does.
+        EnvironmentMismatch, IllegalAction, and the errors of the evaluation service.
         """
-        body = parse(Play, await read_body(request.scope, request.receive, self._settings.max_body))
+        body = parsing.parse_body(PlayBody, await read_body(request.scope, request.receive, self._settings.max_body))
 
-        def sitting(registry: Registry, league: str) -> Sitting:
+        def build_operation(registry: Registry, league: str) -> HumanPlayRequest:
             opponent = pinned(body.opponent, league, registry)
-            check_eligible(opponent, registry, registry.league(league).config)
-            return Sitting(**body.model_dump() | {"opponent": opponent})
+            check_eligible(opponent, registry, registry.leagues.get(league).config)
+            return HumanPlayRequest(**body.model_dump() | {"opponent": opponent})
 
-        return _response(await self._ask(request, sitting))
+        return _response(await self._request_game(request, build_operation))
 
-    async def _of_match(self, request: Request, match: str, game: int, asked: Recording | Film) -> Answer:
-        def check(registry: Registry, league: str) -> Recording | Film:
+    async def _of_match(
+        self, request: Request, match: str, game: int, operation: RecordingRequest | VideoRequest
+    ) -> GameResponse:
+        def check(registry: Registry, league: str) -> RecordingRequest | VideoRequest:
             record = Ledger(registry).match(match)
             if record.league != league or game >= len(record.games):
                 raise UnknownMatch(f"league {league} has no game {game} of match {match}")
-            return asked
+            return operation
 
-        return await self._ask(request, check)
+        return await self._request_game(request, check)
 
-    async def _ask(
-        self, request: Request, question: Callable[[Registry, str], Recording | Film | Table | Sitting]
-    ) -> Answer:
-        """What the studio says to a question about the league of a request, which is made with the registry."""
+    async def _request_game(
+        self, request: Request, build_operation: Callable[[Registry, str], GameOperation]
+    ) -> GameResponse:
+        """Build an operation with the registry and send it to the evaluation service."""
         league = check_slug("league", request.path_params["league"])
 
-        def order(registry: Registry) -> Order:
-            return Order(
-                league=league, environment=registry.league(league).environment_digest, asked=question(registry, league)
+        def build_request(registry: Registry) -> GameRequest:
+            return GameRequest(
+                league=league,
+                environment=registry.leagues.get(league).environment_digest,
+                operation=build_operation(registry, league),
             )
 
-        asked = await self._models.ask(order)
-        if self._studio is None:
-            raise NoStudio("this server plays no games: `studio` is not set in its deploy.yaml")
-        return await self._studio.ask(asked)
+        game_request = await self._models.query(build_request)
+        return await require_client(self._evaluation_client).request_game(game_request)
 
 
-def _response(answer: Answer, headers: dict[str, str] | None = None) -> Response:
-    return Response(answer.content, headers=headers, media_type=answer.media_type)
+def _response(game: GameResponse, headers: dict[str, str] | None = None) -> Response:
+    return Response(game.content, headers=headers, media_type=game.media_type)
 
 
 def _named(request: Request) -> tuple[str, int]:
-    """The match and the game that a path names. Raises UnknownMatch."""
-    schedule, position, game = (queries.named(request, key, UnknownMatch) for key in ("schedule", "position", "game"))
+    """The match and the game in a path. Raises UnknownMatch."""
+    schedule, position, game = (
+        parsing.path_name(request, key, UnknownMatch) for key in ("schedule", "position", "game")
+    )
     match = f"{schedule}/{position}"
     if not (game.isascii() and game.isdigit() and len(game) < DIGITS):
-        raise UnknownMatch(f"match {match} has no game {game[:32]!r}: it is a number")
+        raise UnknownMatch(f"match {match} has no game {game[:32]!r}: expected a number")
     return match, int(game)

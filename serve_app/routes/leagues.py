@@ -1,60 +1,87 @@
-"""What there is to ask for: leagues, their versions, and which replica serves what.
+"""Lists leagues, their versions and what each replica serves; writes notes on versions.
 
-GET  /v1/leagues                      by name, all of them; with ?limit= or &before= a page
-GET  /v1/leagues/{league}
-GET  /v1/leagues/{league}/versions    ascending, all of them; with ?limit= or &before= a page, newest first
+    GET  /v1/leagues                      by name; a page with ?limit= or &before=
+    GET  /v1/leagues/{league}
+    GET  /v1/leagues/{league}/versions    ascending; with ?limit= or &before= a page, newest first
+    PUT  /v1/leagues/{league}/versions/{version}/note   {"note": "…"}
+
+PUT requires an API key of scope `promote`, whose name is stored with the note. It replaces the note; an empty one
+deletes it. PUT is idempotent and needs no `Idempotency-Key`.
 """
 
 from typing import Any
 
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import JSONResponse, Response
 
-from league.refs import CHAMPION, check_slug
+from league.refs import CHAMPION, CheckpointRef, check_slug, parse_version
 from league.registry.registry import Registry
-from league.registry.rows import Acknowledgement, VersionRow
 from league.registry.snapshots import SUMMARY
-from serve_app import queries
-from serve_app.lookups import looked_up
-from serve_app.models import Models
-from serve_app.request_rates import Requests, requests
-from serve_app.routes.traffic import setting_document
-from serve_app.routes.verdicts import brief
-from serve_app.settings import ACKNOWLEDGED_WITHIN
+from league.registry.storage.rows import Acknowledgement, VersionRow
+from league.registry.versions import MAX_NOTE_LENGTH
+from serve_app.access.access_control import KEY
+from serve_app.access.api_keys import ApiKey
+from serve_app.access.request_body import read_body
+from serve_app.models.resolver import ModelResolver
+from serve_app.observability.metrics_reporter import RequestCounts, request_counts
+from serve_app.routes import documents, parsing
+from serve_app.settings import ServeSettings
 
-NONE_YET = Requests()
+
+class NoteBody(BaseModel):
+    """The body of a note."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    note: str = Field(max_length=MAX_NOTE_LENGTH, pattern=r"^[^\x00]*$")
+
+
+NO_REQUESTS = RequestCounts()
 
 
 class LeagueRoutes:
-    """GET /v1/leagues and below."""
+    """The endpoints. Access control requires the scope `promote` for PUT."""
 
-    def __init__(self, models: Models) -> None:
+    def __init__(self, models: ModelResolver, settings: ServeSettings) -> None:
         self._models = models
+        self._settings = settings
 
-    async def leagues(self, request: Request) -> Response:
-        """Leagues: their champions, and what goes on in each. Raises InvalidInput."""
-        limit = queries.limit(request) if _is_paged(request) else None
-        before = queries.name(request, "before")
-        return await looked_up(self._models, lambda registry: _leagues(registry, before, limit))
+    async def page(self, request: Request) -> Response:
+        """Leagues with their champions and current activity. Raises InvalidInput."""
+        limit = parsing.page_size(request) if _is_paged(request) else None
+        before = parsing.query_name(request, "before")
+        return await parsing.query_response(self._models, lambda registry: _leagues(registry, before, limit))
 
-    async def league(self, request: Request) -> Response:
-        """One league: aliases, policies, and what each replica serves. Raises UnknownLeague."""
+    async def get(self, request: Request) -> Response:
+        """A league: aliases, policies, and what each replica serves. Raises UnknownLeague."""
         league = check_slug("league", request.path_params["league"])
-        return await looked_up(self._models, lambda registry: _league(registry, league))
+        return await parsing.query_response(self._models, lambda registry: _league(registry, league))
 
     async def versions(self, request: Request) -> Response:
         """The versions of a league. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
         if not _is_paged(request):
-            return await looked_up(self._models, lambda registry: _all_versions(registry, league))
-        limit, before = queries.limit(request), queries.number(request, "before")
+            return await parsing.query_response(self._models, lambda registry: _all_versions(registry, league))
+        limit, before = parsing.page_size(request), parsing.query_number(request, "before")
 
-        def question(registry: Registry) -> dict[str, Any]:
-            rows = registry.newest_versions(league, before=before, limit=limit + 1)
-            page, more = queries.paged(rows, limit, lambda row: row.number)
+        def query(registry: Registry) -> dict[str, Any]:
+            rows = registry.versions.newest(league, before=before, limit=limit + 1)
+            page, more = parsing.paginate(rows, limit, lambda row: row.number)
             return {"league": league, "versions": list(map(version_document, page)), "next": more}
 
-        return await looked_up(self._models, question)
+        return await parsing.query_response(self._models, query)
+
+    async def put_note(self, request: Request) -> JSONResponse:
+        """Set the note of a version. Raises InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias or
+        InvalidInput.
+        """
+        league = check_slug("league", request.path_params["league"])
+        ref = CheckpointRef(league, parse_version(request.path_params["version"]))
+        body = parsing.parse_body(NoteBody, await read_body(request.scope, request.receive, self._settings.max_body))
+        key: ApiKey = request.scope[KEY]
+        row = await self._models.query(lambda registry: registry.versions.set_note(ref, body.note, actor=key.name))
+        return JSONResponse(version_document(row))
 
 
 def _is_paged(request: Request) -> bool:
@@ -62,16 +89,17 @@ def _is_paged(request: Request) -> bool:
 
 
 def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[str, Any]:
-    """By name, at most `limit` of those behind the one that ended the page before."""
-    names = sorted(row.slug for row in registry.leagues() if before is None or row.slug > before)
-    page, more = queries.paged(names, len(names) if limit is None else limit, lambda name: name)
+    """At most `limit` leagues by name, after the cursor."""
+    names = sorted(row.slug for row in registry.leagues.all() if before is None or row.slug > before)
+    page, more = parsing.paginate(names, len(names) if limit is None else limit, lambda name: name)
     aliases: dict[str, dict[str, int]] = {league: {} for league in page}
-    for (league, alias), number in registry.all_aliases().items():
+    for (league, alias), number in registry.aliases.all().items():
         if league in aliases:
             aliases[league][alias] = number
-    versions, verdicts, summaries = registry.version_numbers(), registry.last_verdicts(), registry.snapshots(SUMMARY)
-    evaluations, runs = registry.evaluation_counts(), registry.run_counts()
-    asked = requests(registry.reports(since=ACKNOWLEDGED_WITHIN).values())
+    versions, verdicts = registry.versions.numbers(), registry.verdicts.last_closed()
+    summaries = registry.snapshots.of_part(SUMMARY)
+    evaluations, runs = registry.evaluations.counts(), registry.runs.counts()
+    counts = request_counts(registry.replicas.reports().values())
 
     def document(league: str, found: dict[str, int]) -> dict[str, Any]:
         summary = summaries[league].document if league in summaries else {}
@@ -82,20 +110,20 @@ def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[
             "versions": len(versions.get(league, ())),
             "games": summary.get("games"),
             "matches": summary.get("matches"),
-            "last_verdict": brief(verdicts[league]) if league in verdicts else None,
+            "last_verdict": documents.verdict_summary(verdicts[league]) if league in verdicts else None,
             "running_evaluations": sum(evaluations.get(league, {}).values()),
             "running_runs": runs.get(league, 0),
-        } | _asked(asked.get(league, NONE_YET))
+        } | _requests(counts.get(league, NO_REQUESTS))
 
     return {"leagues": [document(league, found) for league, found in aliases.items()], "next": more}
 
 
 def _league(registry: Registry, league: str) -> dict[str, Any]:
-    row = registry.league(league)
-    aliases = registry.aliases(league)
-    said = registry.acknowledgements(league, since=ACKNOWLEDGED_WITHIN)
-    asked = requests(registry.reports(since=ACKNOWLEDGED_WITHIN).values())
-    summary = registry.snapshot(league, SUMMARY)
+    row = registry.leagues.get(league)
+    aliases = registry.aliases.current(league)
+    acknowledgements = registry.replicas.acknowledgements(league)
+    counts = request_counts(registry.replicas.reports().values())
+    summary = registry.snapshots.get(league, SUMMARY)
     interface = row.interface
     return {
         "league": league,
@@ -104,32 +132,32 @@ def _league(registry: Registry, league: str) -> dict[str, Any]:
         "aliases": aliases,
         "policies": {policy: interface.of_policy(policy).model_dump(mode="json") for policy in interface.policy_ids},
         "agents": interface.policies,
-        "replicas": [_replica(acknowledgement) for acknowledgement in said],
-        "faults": sorted({acknowledgement.fault for acknowledgement in said if acknowledgement.fault}),
-        "traffic": setting_document(registry.traffic(league)),
+        "replicas": list(map(_replica, acknowledgements)),
+        "faults": sorted({each.fault for each in acknowledgements if each.fault}),
+        "traffic": documents.traffic_document(registry.traffic.current(league)),
         "summary": summary and summary.document,
         "computed_at": summary and summary.at.isoformat(),
-        "up_to_date": summary is not None and summary.mark == registry.marks()[league],
-    } | _asked(asked.get(league, NONE_YET))
+        "up_to_date": summary is not None and summary.mark == registry.snapshots.current_marks()[league],
+    } | _requests(counts.get(league, NO_REQUESTS))
 
 
-def _asked(asked: Requests) -> dict[str, Any]:
-    return {"requests": asked.count, "requests_per_second": asked.rate}
+def _requests(counts: RequestCounts) -> dict[str, Any]:
+    return {"requests": counts.count, "requests_per_second": counts.rate}
 
 
-def _replica(said: Acknowledgement) -> dict[str, Any]:
+def _replica(acknowledgement: Acknowledgement) -> dict[str, Any]:
     return {
-        "replica": said.replica,
-        "version": said.version,
-        "sha256": said.sha256,
-        "aliases": said.aliases,
-        "fault": said.fault,
-        "seen_at": said.seen_at.isoformat(),
+        "replica": acknowledgement.replica,
+        "version": acknowledgement.version,
+        "sha256": acknowledgement.sha256,
+        "aliases": acknowledgement.aliases,
+        "fault": acknowledgement.fault,
+        "seen_at": acknowledgement.seen_at.isoformat(),
     }
 
 
 def _all_versions(registry: Registry, league: str) -> dict[str, Any]:
-    return {"league": league, "versions": list(map(version_document, registry.versions(league))), "next": None}
+    return {"league": league, "versions": list(map(version_document, registry.versions.all(league))), "next": None}
 
 
 def version_document(row: VersionRow) -> dict[str, Any]:

@@ -1,25 +1,81 @@
-"""The league in the browser: one application of static files, which reads the same JSON as programs do.
+"""Serves the web pages, the OpenAPI document and its page.
 
-GET /, /leagues, /leagues/…    the document; which page it is, its script sees from the address
-GET /pages/{file}              scripts, styles and what they need
+    GET /docs, /openapi.json
+    GET /, /leagues, /leagues/…    the document; its script selects the page from the address
+    GET /pages/{file}              scripts, styles and images
 
-Open, as the description is: nothing of a league is in them. They load nothing from elsewhere, run no script but their
-own, and cannot be framed. A browser asks whether its copy is still the one, by its digest.
+None of them requires a key. The OpenAPI document contains examples of policies only if the presented key may read all
+leagues. Pages load nothing from other origins, run only their own scripts, and cannot be framed. Browsers revalidate
+their copies by ETag.
 """
 
 from __future__ import annotations
 
+import asyncio
 import gzip
+from base64 import b64encode
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from re import DOTALL, findall
 
+import orjson
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
 import serve_app
+from serve_app import openapi
+from serve_app.access.access_control import AccessControl
+from serve_app.models.alias_slots import AliasSlots
+from serve_app.models.version_cache import LoadedVersion
+from serve_app.openapi.document import document
+from serve_app.settings import ServeSettings
+
+PAGE = Path(openapi.__file__).with_name("page.html")
+FRESH = {"cache-control": "no-cache", "vary": "authorization, x-api-key"}
+
+
+class DocsRoutes:
+    """The OpenAPI document and its page."""
+
+    def __init__(self, slots: AliasSlots, access: AccessControl, settings: ServeSettings) -> None:
+        self._slots = slots
+        self._access = access
+        self._settings = settings
+        self._page = PAGE.read_bytes()
+        self._rules = {"content-security-policy": _content_security_policy(self._page), "cache-control": "no-cache"}
+        self._described: dict[tuple[str, ...], bytes] = {}
+        """Digests of the served versions → the document: the latest, and the one without examples."""
+
+    async def openapi(self, request: Request) -> Response:
+        """An OpenAPI 3.1 document."""
+        served: list[LoadedVersion] = []
+        if self._access.may_read_all(request.scope["headers"]):
+            champions = (self._slots.champion(league) for league in self._slots.leagues())
+            served = [version for version in champions if version is not None]
+        digests = tuple(version.sha256 for version in served)
+        if (body := self._described.get(digests)) is None:
+            body = await asyncio.to_thread(lambda: orjson.dumps(document(self._settings, served)))
+            without = {key: kept for key, kept in self._described.items() if not key}
+            self._described = without | {digests: body}
+        return Response(body, media_type="application/json", headers=FRESH)
+
+    async def docs(self, _: Request) -> Response:
+        """A page that shows the document and sends requests to this server."""
+        return Response(self._page, media_type="text/html", headers=self._rules)
+
+
+def _content_security_policy(page: bytes) -> str:
+    """A Content-Security-Policy that permits only the page's own script and requests to its own server."""
+    scripts = [b64encode(sha256(code).digest()).decode() for code in findall(rb"<script>(.*?)</script>", page, DOTALL)]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+
 
 FILES = Path(serve_app.__file__).with_name("pages")
 DOCUMENT = "index.html"
@@ -29,8 +85,8 @@ MEDIA_TYPES = {
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-"""Of the files that are served; the others beside them (licences) are for people."""
-RULES = {
+"""Served files; others, such as licences, are not served."""
+HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -40,13 +96,13 @@ RULES = {
     "cache-control": "no-cache",
     "vary": "accept-encoding",
 }
-SMALLEST = 1024
-"""Bytes below which compression saves nothing."""
+MIN_COMPRESSED_BYTES = 1024
+"""Smaller files are not compressed."""
 
 
 @dataclass(frozen=True, slots=True)
-class File:
-    """A file as it is sent."""
+class StaticFile:
+    """A file with its compressed form."""
 
     plain: bytes
     zipped: bytes | None
@@ -54,15 +110,15 @@ class File:
     etag: str
 
     @classmethod
-    def read(cls, path: Path) -> File:
-        """Read it, and compress it once."""
+    def read(cls, path: Path) -> StaticFile:
+        """Read and compress a file."""
         plain = path.read_bytes()
-        zipped = gzip.compress(plain, mtime=0) if len(plain) >= SMALLEST else None
+        zipped = gzip.compress(plain, mtime=0) if len(plain) >= MIN_COMPRESSED_BYTES else None
         return cls(plain, zipped, MEDIA_TYPES[path.suffix], f'W/"{sha256(plain).hexdigest()[:24]}"')
 
-    def answer(self, request: Request) -> Response:
-        """The file, or that the browser's copy is the same."""
-        headers = RULES | {"etag": self.etag}
+    def response(self, request: Request) -> Response:
+        """The file, or 304 if the browser's copy is current."""
+        headers = HEADERS | {"etag": self.etag}
         if self.etag in (tag.strip() for tag in request.headers.get("if-none-match", "").split(",")):
             return Response(status_code=304, headers=headers)
         if self.zipped is not None and "gzip" in request.headers.get("accept-encoding", ""):
@@ -71,25 +127,25 @@ class File:
 
 
 class PageRoutes:
-    """The endpoints. All files are read at the start: they are few and small."""
+    """The web pages. All files are read at start-up; they are few and small."""
 
     def __init__(self) -> None:
         paths = (path for path in FILES.rglob("*") if path.suffix in MEDIA_TYPES)
-        self._files = {path.relative_to(FILES).as_posix(): File.read(path) for path in paths}
+        self._files = {path.relative_to(FILES).as_posix(): StaticFile.read(path) for path in paths}
 
     def routes(self) -> list[Route]:
-        """Where they stand. They are no part of the API."""
+        """The routes, which are not part of the API."""
         document = [(path, self.document) for path in ("/", "/leagues", "/leagues/{page:path}")]
         places = [*document, ("/pages/{file:path}", self.file)]
         return [Route(path, endpoint, include_in_schema=False) for path, endpoint in places]
 
     async def document(self, request: Request) -> Response:
-        """The same for every page: its script shows what the address names, or that there is no such thing."""
-        return self._files[DOCUMENT].answer(request)
+        """The HTML document, the same for every page: its script renders what the address names."""
+        return self._files[DOCUMENT].response(request)
 
     async def file(self, request: Request) -> Response:
-        """One of the files."""
+        """A static file."""
         found = self._files.get(request.path_params["file"])
         if found is None:
             raise HTTPException(404)
-        return found.answer(request)
+        return found.response(request)

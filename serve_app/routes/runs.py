@@ -1,4 +1,4 @@
-"""Training runs, as their drivers tell of them: how far they are, and the curves of each policy.
+"""Lists training runs with their progress and the learning curves of each policy.
 
 GET  /v1/leagues/{league}/runs          newest first; ?limit= &before=
 GET  /v1/leagues/{league}/runs/{run}    with settings and curves
@@ -12,40 +12,39 @@ from starlette.responses import Response
 from league.errors import UnknownRun
 from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.rows import RunPoint, RunRow
-from serve_app import queries
-from serve_app.lookups import looked_up
-from serve_app.models import Models
+from league.registry.storage.rows import RunPoint, RunRow
+from serve_app.models.resolver import ModelResolver
+from serve_app.routes import parsing
 
 
 class RunRoutes:
     """The endpoints."""
 
-    def __init__(self, models: Models) -> None:
+    def __init__(self, models: ModelResolver) -> None:
         self._models = models
 
-    async def every(self, request: Request) -> Response:
+    async def page(self, request: Request) -> Response:
         """A page of a league's training runs. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        limit, before = queries.limit(request), queries.name(request, "before")
+        limit, before = parsing.page_size(request), parsing.query_name(request, "before")
 
-        def question(registry: Registry) -> dict[str, Any]:
-            rows = registry.runs(league, before=before, limit=limit + 1)
-            page, more = queries.paged(rows, limit, lambda row: row.id)
+        def query(registry: Registry) -> dict[str, Any]:
+            rows = registry.runs.newest(league, before=before, limit=limit + 1)
+            page, more = parsing.paginate(rows, limit, lambda row: row.id)
             return {"league": league, "runs": list(map(_listed, page)), "next": more}
 
-        return await looked_up(self._models, question)
+        return await parsing.query_response(self._models, query)
 
-    async def one(self, request: Request) -> Response:
-        """One training run. Raises UnknownLeague or UnknownRun."""
+    async def get(self, request: Request) -> Response:
+        """A training run. Raises UnknownLeague or UnknownRun."""
         league = check_slug("league", request.path_params["league"])
-        run = queries.named(request, "run", UnknownRun)
+        run = parsing.path_name(request, "run", UnknownRun)
 
-        def question(registry: Registry) -> dict[str, Any]:
-            row, points = registry.run(league, run), registry.run_points(league, run)
+        def query(registry: Registry) -> dict[str, Any]:
+            row, points = registry.runs.get(league, run), registry.runs.points(league, run)
             return {"league": league} | _listed(row) | {"settings": row.settings, "points": list(map(_point, points))}
 
-        return await looked_up(self._models, question)
+        return await parsing.query_response(self._models, query)
 
 
 def _listed(row: RunRow) -> dict[str, Any]:
@@ -60,7 +59,7 @@ def _listed(row: RunRow) -> dict[str, Any]:
         "seconds": row.seconds,
         "seed": row.seed,
         "parent": row.parent,
-        "lives": row.lives,
+        "attempts": row.attempts,
         "curves": row.curves,
         "began_at": row.began_at.isoformat(),
         "heartbeat_at": row.heartbeat_at.isoformat(),

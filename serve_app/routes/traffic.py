@@ -1,10 +1,10 @@
-"""Canary and shadow of a league: how they are set, and what they have shown.
+"""Sets the canary and shadow of a league, and reports their statistics.
 
-GET   /v1/leagues/{league}/traffic
-POST  /v1/leagues/{league}/traffic    {"canary": {"version": "candidate", "share": 0.05}, "shadow": null, "reason": "…"}
+    GET   /v1/leagues/{league}/traffic
+    POST /v1/leagues/{league}/traffic  {"canary": {"version": "candidate", "share": 0.1}, "shadow": null, "reason": "…"}
 
-`version` is a number or an alias. null ends a canary or shadow; what is left out stays. As promotions do, it takes a
-key of scope `promote` and an `Idempotency-Key`.
+`version` is a number or an alias. null removes the canary or shadow; an omitted one is unchanged. POST requires a key
+of scope `promote` and an `Idempotency-Key`.
 """
 
 from typing import Any
@@ -16,17 +16,17 @@ from starlette.responses import JSONResponse
 from league.histograms import Histogram
 from league.refs import check_slug, parse_version
 from league.registry.registry import Registry
-from league.registry.rows import Portion, Shadowing, Traffic
+from league.registry.storage.rows import Portion, ShadowCounts
 from league.registry.traffic import KEEP, Unchanged
-from serve_app.bodies import read_body
-from serve_app.metrics import Metrics, Report
-from serve_app.models import Models
-from serve_app.routes.promotion import Change, call_of, parse
-from serve_app.settings import ACKNOWLEDGED_WITHIN, ServeSettings
-from serve_app.shadow import Shadow
+from serve_app.access.request_body import read_body
+from serve_app.models.resolver import ModelResolver
+from serve_app.models.shadow import Shadow
+from serve_app.observability.metrics import Metrics, Report
+from serve_app.routes import documents, parsing
+from serve_app.settings import ServeSettings
 
 
-class Share(BaseModel):
+class VersionShare(BaseModel):
     """A version and its share of requests."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -35,17 +35,19 @@ class Share(BaseModel):
     share: float = Field(ge=0, le=1)
 
 
-class Setting(Change):
+class TrafficBody(parsing.ChangeBody):
     """The body of a change."""
 
-    canary: Share | None = None
-    shadow: Share | None = None
+    canary: VersionShare | None = None
+    shadow: VersionShare | None = None
 
 
 class TrafficRoutes:
     """The endpoints."""
 
-    def __init__(self, models: Models, metrics: Metrics, shadow: Shadow, settings: ServeSettings, replica: str) -> None:
+    def __init__(
+        self, models: ModelResolver, metrics: Metrics, shadow: Shadow, settings: ServeSettings, replica: str
+    ) -> None:
         self._models = models
         self._metrics = metrics
         self._shadow = shadow
@@ -53,43 +55,30 @@ class TrafficRoutes:
         self._replica = replica
 
     async def show(self, request: Request) -> JSONResponse:
-        """The setting, who follows it, and statistics of this replica and of all. Raises UnknownLeague."""
+        """The setting, the replicas that apply it, and statistics of this replica and of all. Raises UnknownLeague."""
         league = check_slug("league", request.path_params["league"])
         here = [one for one in self._shadow.shadowings() if one.league == league]
         mine = {"replica": self._replica} | _statistics(league, [self._metrics.report()], here)
-        document = await self._models.ask(lambda registry: _document(registry, league))
+        document = await self._models.query(lambda registry: _document(registry, league))
         return JSONResponse(document | {"here": mine})
 
     async def put(self, request: Request) -> JSONResponse:
         """Set canary or shadow. Raises UnknownLeague, UnknownVersion, UnknownAlias, KeyReused or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        body = parse(Setting, await read_body(request.scope, request.receive, self._settings.max_body))
+        body = parsing.parse_body(TrafficBody, await read_body(request.scope, request.receive, self._settings.max_body))
         canary = _portion(body.canary) if "canary" in body.model_fields_set else KEEP
         shadow = _portion(body.shadow) if "shadow" in body.model_fields_set else KEEP
-        key, call = call_of(request, body)
-        setting = await self._models.ask(
-            lambda registry: registry.set_traffic(
+        key, call = parsing.idempotent_call(request, body)
+        setting = await self._models.query(
+            lambda registry: registry.traffic.set(
                 league, canary=canary, shadow=shadow, actor=key.name, reason=body.reason, call=call
             )
         )
-        return JSONResponse(setting_document(setting))
+        return JSONResponse(documents.traffic_document(setting))
 
 
-def setting_document(setting: Traffic) -> dict[str, Any]:
-    """A setting as JSON."""
-    return {
-        "league": setting.league,
-        "setting": setting.id,
-        "canary": _portion_document(setting.canary),
-        "shadow": _portion_document(setting.shadow),
-        "actor": setting.actor,
-        "reason": setting.reason,
-        "at": setting.at and setting.at.isoformat(),
-    }
-
-
-def shadow_document(shadowing: Shadowing) -> dict[str, Any]:
-    """What a shadow has shown, as JSON; times are in milliseconds."""
+def shadow_document(shadowing: ShadowCounts) -> dict[str, Any]:
+    """Statistics of a shadow as JSON; times are in milliseconds."""
     return {
         "candidate": shadowing.candidate,
         "champion": shadowing.champion,
@@ -104,26 +93,24 @@ def shadow_document(shadowing: Shadowing) -> dict[str, Any]:
     }
 
 
-def _portion(share: Share | None) -> Portion | Unchanged | None:
+def _portion(share: VersionShare | None) -> Portion | Unchanged | None:
     if share is None:
         return None
     return Portion(parse_version(str(share.version)), share.share)
 
 
-def _portion_document(portion: Portion | None) -> dict[str, Any] | None:
-    return None if portion is None else {"version": portion.version, "share": portion.share}
-
-
 def _document(registry: Registry, league: str) -> dict[str, Any]:
-    setting = registry.traffic(league)
-    said = registry.acknowledgements(league, since=ACKNOWLEDGED_WITHIN)
-    reports = list(registry.reports(since=ACKNOWLEDGED_WITHIN).values())
-    replicas = [{"replica": one.replica, "follows": one.traffic == setting.id, "fault": one.fault} for one in said]
-    statistics = _statistics(league, reports, registry.shadowings(league))
-    return setting_document(setting) | {"replicas": replicas, "all": statistics}
+    setting = registry.traffic.current(league)
+    acknowledgements = registry.replicas.acknowledgements(league)
+    reports = list(registry.replicas.reports().values())
+    replicas = [
+        {"replica": one.replica, "follows": one.traffic == setting.id, "fault": one.fault} for one in acknowledgements
+    ]
+    statistics = _statistics(league, reports, registry.traffic.shadow_counts(league))
+    return documents.traffic_document(setting) | {"replicas": replicas, "all": statistics}
 
 
-def _statistics(league: str, reports: list[Report], shadowings: list[Shadowing]) -> dict[str, Any]:
+def _statistics(league: str, reports: list[Report], shadowings: list[ShadowCounts]) -> dict[str, Any]:
     latencies: dict[int, Histogram] = {}
     canaried: dict[int, int] = {}
     for report in reports:

@@ -1,7 +1,7 @@
-"""Verdicts: what a gate has decided, or is deciding, and on which evidence.
+"""Lists verdicts of the promotion gate, open and decided, with their evidence.
 
 GET  /v1/leagues/{league}/verdicts              newest first; ?limit= &before=
-GET  /v1/leagues/{league}/verdicts/{verdict}    with the test's curve, and all that was last computed of it
+GET  /v1/leagues/{league}/verdicts/{verdict}    with the curve of the test and all computed evidence
 """
 
 from typing import Any
@@ -12,73 +12,58 @@ from starlette.responses import Response
 from league.errors import UnknownVerdict
 from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.rows import VerdictRow
-from serve_app import queries
-from serve_app.lookups import looked_up
-from serve_app.models import Models
+from league.registry.storage.rows import VerdictRow
+from serve_app.models.resolver import ModelResolver
+from serve_app.routes import documents, parsing
 
-OPEN = "open"
 SHOWN = ("llr", "bounds", "blocks", "games", "score", "elo", "interval")
-"""Of the evidence, in lists. A verdict that is open has none."""
+"""Evidence in lists. An open verdict has none."""
 
 
 class VerdictRoutes:
     """The endpoints."""
 
-    def __init__(self, models: Models) -> None:
+    def __init__(self, models: ModelResolver) -> None:
         self._models = models
 
-    async def every(self, request: Request) -> Response:
+    async def page(self, request: Request) -> Response:
         """A page of a league's verdicts. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        limit, before = queries.limit(request), queries.name(request, "before")
+        limit, before = parsing.page_size(request), parsing.query_name(request, "before")
 
-        def question(registry: Registry) -> dict[str, Any]:
-            rows = registry.newest_verdicts(league, before=before, limit=limit + 1)
-            page, more = queries.paged(rows, limit, lambda row: row.id)
-            told = registry.verdict_reasons(league, [row.id for row in page])
-            verdicts = [_listed(row) | {"reason": _reason(row, *told.get(row.id, (None, None)))} for row in page]
+        def query(registry: Registry) -> dict[str, Any]:
+            rows = registry.verdicts.newest(league, before=before, limit=limit + 1)
+            page, more = parsing.paginate(rows, limit, lambda row: row.id)
+            reasons = registry.snapshots.verdict_reasons(league, [row.id for row in page])
+            verdicts = [_listed(row) | {"reason": _reason(row, *reasons.get(row.id, (None, None)))} for row in page]
             return {"league": league, "verdicts": verdicts, "next": more}
 
-        return await looked_up(self._models, question)
+        return await parsing.query_response(self._models, query)
 
-    async def one(self, request: Request) -> Response:
-        """One verdict, all of it. Raises UnknownLeague or UnknownVerdict."""
+    async def get(self, request: Request) -> Response:
+        """A verdict with all its evidence. Raises UnknownLeague or UnknownVerdict."""
         league = check_slug("league", request.path_params["league"])
-        verdict = queries.named(request, "verdict", UnknownVerdict)
-        return await looked_up(self._models, lambda registry: _one(registry, league, verdict))
-
-
-def brief(row: VerdictRow) -> dict[str, Any]:
-    """What was decided, as JSON."""
-    return {
-        "verdict": row.id,
-        "candidate": f"{row.league}@{row.candidate}",
-        "opponent": row.champion,
-        "outcome": row.outcome or OPEN,
-        "promoted": bool((row.evidence or {}).get("promoted")),
-        "opened_at": row.opened_at.isoformat(),
-        "closed_at": row.closed_at and row.closed_at.isoformat(),
-    }
+        verdict = parsing.path_name(request, "verdict", UnknownVerdict)
+        return await parsing.query_response(self._models, lambda registry: _one(registry, league, verdict))
 
 
 def _listed(row: VerdictRow) -> dict[str, Any]:
     evidence = row.evidence or {}
-    return brief(row) | {name: evidence.get(name) for name in SHOWN}
+    return documents.verdict_summary(row) | {name: evidence.get(name) for name in SHOWN}
 
 
 def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
-    found, row = registry.snapshot(league, f"verdict/{verdict}"), registry.verdict(verdict)
+    found, row = registry.snapshots.get(league, f"verdict/{verdict}"), registry.verdicts.get(verdict)
     if row.league != league:
         raise UnknownVerdict(f"league {league} has no verdict {verdict!r}")
     document = {"league": league, "reason": None, "computed_at": None} | _listed(row)
     if found is not None:
         judgement = found.document
-        document |= {"computed_at": found.at.isoformat()} | judgement | brief(row)
+        document |= {"computed_at": found.at.isoformat()} | judgement | documents.verdict_summary(row)
         document["reason"] = _reason(row, judgement["outcome"], judgement["reason"])
     return document
 
 
 def _reason(row: VerdictRow, outcome: str | None, reason: str | None) -> str | None:
-    """What was computed while the outcome was another is no reason for this one."""
-    return reason if outcome == (row.outcome or OPEN) else None
+    """The reason, unless it was computed for an earlier outcome."""
+    return reason if outcome == (row.outcome or documents.OPEN) else None

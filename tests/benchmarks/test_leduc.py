@@ -1,4 +1,4 @@
-"""The tree is the game that PettingZoo plays, and best responses in it are those known by hand or from elsewhere."""
+"""The game tree equals PettingZoo's game, and its best responses equal known values."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from pettingzoo.classic import leduc_holdem_v4
 from benchmarks.leduc import CALL, CHECK, FOLD, RAISE, RANKS, Hand, best_response, uniform
 
 
-def test_hands_go_as_pettingzoo_plays_them() -> None:
+def test_hands_equal_those_of_pettingzoo() -> None:
     env = leduc_holdem_v4.env()
     for seed in range(200):
         env.reset(seed=seed)
@@ -37,15 +37,15 @@ def test_hands_go_as_pettingzoo_plays_them() -> None:
             assert env.rewards[agent] == hand.payoff(player, held)
 
 
-def always(*wanted: int) -> object:
-    def acting(_: NDArray, mask: NDArray) -> NDArray:
-        return np.eye(4)[next(action for action in wanted if mask[action])]
+def always(*actions: int) -> object:
+    def act(_: NDArray, mask: NDArray) -> NDArray:
+        return np.eye(4)[next(action for action in actions if mask[action])]
 
-    return acting
+    return act
 
 
-def test_best_responses_that_are_known() -> None:
-    """Who always folds gives the small blind or lets the big one be won: (0.5 + 1) / 2."""
+def test_known_best_responses() -> None:
+    """A policy that always folds loses the small blind or the big blind: (0.5 + 1) / 2."""
     assert best_response(uniform) == pytest.approx(1.4716, abs=1e-4)
     assert best_response(always(FOLD)) == pytest.approx(0.75)
     assert best_response(always(CALL, CHECK)) > 0

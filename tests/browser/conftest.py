@@ -1,49 +1,36 @@
-"""A real server with leagues that have results, and a browser before it."""
+"""A real server with leagues that have results, and a browser."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from shutil import which
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 
-from league.registry.registry import Registry
-from serve_app.launch import running
-from tests.browser import leagues
-from tests.evaluation.examples import LEAGUE
+from serve_app.runtime.launch import running
+from tests.support import browser_leagues
+from tests.support.browsers import ARGUMENTS, Served, Tab
+from tests.support.tictactoe import LEAGUE
 
-ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update"]
-PATIENCE = 20_000
-"""Milliseconds for whatever is to come: a machine may be busy."""
-EXPECTED = "Failed to load resource: the server responded with a status of "
-"""What a browser says of every request that is refused, however well the page takes it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Served:
-    """A server, its registry, and keys for it by name."""
-
-    url: str
-    registry: Registry
-    keys: dict[str, str]
+TIMEOUT = 20_000
+"""Timeout of each expectation, in milliseconds."""
 
 
 @pytest.fixture(scope="package")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with leagues.of_every_page(tmp_path_factory.mktemp("pages")) as registry:
-        keys = {name: registry.create_key(name, scopes)[1] for name, scopes in leagues.KEYS.items()}
+    with browser_leagues.leagues_of_every_page(tmp_path_factory.mktemp("pages")) as registry:
+        keys = {name: registry.keys.create(name, scopes)[1] for name, scopes in browser_leagues.KEYS.items()}
         with pytest.MonkeyPatch.context() as environment:
             environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
             with running(registry.storage, replicas=1, insecure=True) as url:
-                for league in (LEAGUE, leagues.CONNECT_FOUR):
-                    leagues.answer("GET", f"{url}/v1/leagues/{league}/playable")  # the studio has started
+                for league in (LEAGUE, browser_leagues.CONNECT_FOUR):
+                    browser_leagues.answer("GET", f"{url}/v1/leagues/{league}/playable")  # the service has started
                 yield Served(url, registry, keys)
 
 
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
-    """Debian's Chromium, or Playwright's own."""
+    """The Chromium of the system, or the one of Playwright."""
     with sync_playwright() as playwright:
         path = which("chromium") or playwright.chromium.executable_path
         if not Path(path).is_file():
@@ -53,32 +40,17 @@ def browser() -> Iterator[Browser]:
         browser.close()
 
 
-@dataclass
-class Tab:
-    """A tab that notes whatever the browser complains of."""
-
-    page: Page
-    url: str
-    complaints: list[str] = field(default_factory=list)
-
-    def open(self, path: str) -> Page:
-        self.page.goto(self.url + path)
-        return self.page
-
-    def forgive(self, status: int) -> None:
-        """Requests that were refused with a status were meant to be."""
-        self.complaints = [each for each in self.complaints if not each.startswith(f"{EXPECTED}{status}")]
-
-
 @pytest.fixture
 def tab(served: Served, browser: Browser, request: pytest.FixtureRequest) -> Iterator[Tab]:
-    """A tab of its own session. Parametrised indirectly: options of its context."""
+    """A tab in a new session. Indirect parameters are options of the browser context."""
     context = browser.new_context(**{"viewport": {"width": 1180, "height": 800}} | getattr(request, "param", {}))
-    context.set_default_timeout(PATIENCE)
-    expect.set_options(timeout=PATIENCE)
+    context.set_default_timeout(TIMEOUT)
+    expect.set_options(timeout=TIMEOUT)
     tab = Tab(context.new_page(), served.url)
-    tab.page.on("console", lambda said: tab.complaints.append(said.text) if said.type in ("error", "warning") else None)
-    tab.page.on("pageerror", lambda error: tab.complaints.append(str(error)))
+    tab.page.on(
+        "console", lambda message: tab.errors.append(message.text) if message.type in ("error", "warning") else None
+    )
+    tab.page.on("pageerror", lambda error: tab.errors.append(str(error)))
     yield tab
     context.close()
-    assert tab.complaints == []
+    assert tab.errors == []

@@ -1,4 +1,4 @@
-"""The pictures of docs/pages.md: every page of a league with real results.
+"""Take the screenshots of docs/pages.md: every page of a league with real results.
 
 python -m tests.browser.screenshots [DIRECTORY]
 """
@@ -17,22 +17,22 @@ from tempfile import TemporaryDirectory
 from PIL import Image
 from playwright.sync_api import Browser, expect, sync_playwright
 
-from evaluation.nightly import nightly
-from evaluation.tournament import evaluate
+from evaluation.gating.nightly import nightly
+from evaluation.matches.tournament import evaluate
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
-from league.registry.rows import Portion
-from serve_app.launch import running
-from tests.browser.conftest import ARGUMENTS
-from tests.browser.leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
-from tests.evaluation import examples
-from tests.evaluation.examples import LEAGUE
-from training.run import train
+from league.registry.storage.rows import Portion
+from serve_app.runtime.launch import running
+from tests.support import tictactoe
+from tests.support.browser_leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
+from tests.support.browsers import ARGUMENTS
+from tests.support.tictactoe import LEAGUE
+from training.runs.train import train
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
-CONFIG = examples.config(play={"opening_plies": 2, "copies": 8})
+CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 8})
 SEED = 4
 COLORS = 160
 DESK, PHONE = {"width": 1180, "height": 780}, {"width": 390, "height": 780}
@@ -43,55 +43,55 @@ PLAYED = f"/leagues/{CONNECT_FOUR}/play#opponent=script:one_ply&agent=player_0&s
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A page as it is shown when it says `words`."""
+    """A screenshot of a page, taken as soon as the page contains `text`."""
 
     name: str
     path: str
-    words: str
+    text: str
     is_dark: bool = False
     is_phone: bool = False
 
 
 PICTURES = (
     Picture("leagues", "/", CONNECT_FOUR),
-    Picture("standings", L, "95 % interval"),
-    Picture("standings-dark", L, "95 % interval", is_dark=True),
-    Picture("standings-phone", L, "95 % interval", is_phone=True),
+    Picture("leaderboard", L, "95 % interval"),
+    Picture("leaderboard-dark", L, "95 % interval", is_dark=True),
+    Picture("leaderboard-phone", L, "95 % interval", is_phone=True),
     Picture("payoff", f"{L}/payoff", "always wins"),
     Picture("versions", f"{L}/versions", "became champion"),
     Picture("verdicts", f"{L}/verdicts", "▲ promote"),
     Picture("verdict", f"{L}/verdicts/{{verdict}}", "Blocks by result"),
     Picture("verdict-dark", f"{L}/verdicts/{{verdict}}", "Blocks by result", is_dark=True),
     Picture("history", f"{L}/history", "promoted by the gate"),
-    Picture("traffic", f"{L}/traffic", "answers"),
+    Picture("traffic", f"{L}/traffic", "of requests"),
     Picture("matches", f"{L}/matches", r"#\d+"),
     Picture("game", f"{L}/matches/{{verdict}}/0/0#5", "Step 5"),
     Picture("play", PLAYED, "Your turn"),
     Picture("play-dark", PLAYED, "Your turn", is_dark=True),
     Picture("play-phone", PLAYED, "Your turn", is_phone=True),
-    Picture("evaluations", f"{L}/evaluations", "Start one"),
-    Picture("evaluation-new", f"{L}/evaluations/new", "Contestants: every version"),
+    Picture("evaluations", f"{L}/evaluations", "New evaluation"),
+    Picture("evaluation-new", f"{L}/evaluations/new", "Contestants: all versions"),
     Picture("run", f"/leagues/{TRAINED}/runs/{{run}}", "entropy"),
 )
 
 
 @contextmanager
 def leagues(home: Path) -> Iterator[Registry]:
-    """Tic-tac-toe with twelve versions that come a night each, and connect four between scripts."""
-    registry = examples.registry(home, play=CONFIG.play.model_dump())
+    """Tic-tac-toe with twelve versions and a nightly run for each, and connect four between scripts."""
+    registry = tictactoe.registry(home, play=CONFIG.play.model_dump())
     chance = Random(SEED)
     for wins, blocks, centre in sorted(product((False, True), repeat=3)):
-        best = list(examples.CENTRE_FIRST if centre else examples.EDGES_FIRST)
+        best = list(tictactoe.CENTRE_FIRST if centre else tictactoe.EDGES_FIRST)
         for order in (chance.sample(best, 9), best) if wins or blocks else (best,):
-            examples.publish(registry, examples.graph(wins=wins, blocks=blocks, order=tuple(order)))
+            tictactoe.publish(registry, tictactoe.graph(wins=wins, blocks=blocks, order=tuple(order)))
             nightly(CONFIG, registry=registry)
     evaluate(LEAGUE, registry=registry, blocks=8)
     for name in (CONNECT_FOUR, EMPTY):
         config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
-        registry.register(config, interface(config))
+        registry.leagues.register(config, interface(config))
     evaluate(CONNECT_FOUR, ["script:one_ply", "script:random"], registry=registry, blocks=4)
-    registry.set_traffic(LEAGUE, canary=Portion(2, 0.05), shadow=None, actor="release-bot", reason="try it")
-    registry.note(CheckpointRef(LEAGUE, 11), "takes the centre first", actor="ada")
+    registry.traffic.set(LEAGUE, canary=Portion(2, 0.05), shadow=None, actor="release-bot", reason="trial")
+    registry.versions.set_note(CheckpointRef(LEAGUE, 11), "takes the centre first", actor="ada")
     _train(registry)
     compute(registry)
     yield registry
@@ -99,13 +99,13 @@ def leagues(home: Path) -> Iterator[Registry]:
 
 
 def _train(registry: Registry) -> None:
-    """A minute of self-play, in a league of its own."""
+    """Train by self-play for up to two minutes, in a separate league."""
     config = LeagueConfig.load(CONFIGS / "tictactoe.yaml").model_copy(update={"league": TRAINED})
-    train(config.with_training(runners=1, checkpoint_every=None), registry=registry)
+    train(config.with_training(runners=1, checkpoint_every=None, minutes=2), registry=registry)
 
 
 def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], directory: Path) -> None:
-    """One picture, in few colours."""
+    """Take one screenshot, with a reduced palette."""
     size = PHONE if picture.is_phone else DESK
     page = browser.new_page(
         viewport=size,
@@ -114,7 +114,7 @@ def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], di
         reduced_motion="reduce",
     )
     page.goto(url + picture.path.format(**names))
-    expect(page.locator("main")).to_contain_text(re.compile(picture.words), timeout=90_000)
+    expect(page.locator("main")).to_contain_text(re.compile(picture.text), timeout=90_000)
     for unfinished in (".loading", ".plot:not(:has(canvas))", ".screen:not(:has(img))"):
         expect(page.locator(unfinished)).to_have_count(0, timeout=30_000)
     path = directory / f"{picture.name}.png"
@@ -126,11 +126,11 @@ def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], di
 
 
 def main(directory: Path) -> None:
-    """Take them all."""
+    """Take all screenshots."""
     with TemporaryDirectory() as home, leagues(Path(home)) as registry, running(registry.storage, replicas=1) as url:
         for league in (LEAGUE, CONNECT_FOUR):
             answer("GET", f"{url}/v1/leagues/{league}/playable")
-        names = {"verdict": verdict_between_versions(registry).id, "run": registry.runs(TRAINED)[0].id}
+        names = {"verdict": verdict_between_versions(registry).id, "run": registry.runs.newest(TRAINED)[0].id}
         with sync_playwright() as playwright:
             path = which("chromium") or playwright.chromium.executable_path
             browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)

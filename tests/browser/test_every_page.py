@@ -1,4 +1,4 @@
-"""Each page, with real results: it says what it is to say, in light and dark, on a phone, without a fault."""
+"""Each page with real results: expected texts, accessibility, light and dark theme, phone width."""
 
 import re
 from typing import Any
@@ -7,38 +7,40 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from tests.browser.conftest import Served, Tab
-from tests.browser.leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
-from tests.evaluation.examples import LEAGUE
+from tests.support.browser_leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
+from tests.support.browsers import Served, Tab
+from tests.support.tictactoe import LEAGUE
+
+pytestmark = pytest.mark.slow  # a browser and a server take all cores
 
 L = f"/leagues/{LEAGUE}"
 PAGES = {
     "/": (r"tictactoe", r"@3", r"two_step_game"),
     "/leagues": (r"connect_four",),
     L: (r"tictactoe@3\s*★\s*champion", r"script:random", r"95 % interval"),
-    f"/leagues/{EMPTY}": (r"none yet", r"Standings are not computed yet|Nobody has played yet"),
+    f"/leagues/{EMPTY}": (r"Champion\s*none", r"The leaderboard has not been computed yet|No games yet"),
     f"{L}/payoff": (r"always wins", r"script:random"),
     f"{L}/versions": (r"tictactoe@1", r"became champion", r"Promote …"),
     f"{L}/verdicts": (r"▲ promote", r"@2"),
-    f"{L}/verdicts/{{verdict}}": (r"tictactoe@\d against", r"It is the stronger one", r"Blocks by result"),
+    f"{L}/verdicts/{{verdict}}": (r"tictactoe@\d against", r"Stronger: ", r"Blocks by result"),
     f"{L}/history": (r"rolled back", r"as it was", r"promoted by the gate"),
-    f"{L}/traffic": (r"answers 5\.0 %", r"is shown 100\.0 %"),
+    f"{L}/traffic": (r"5\.0 % of requests", r"100\.0 % of requests copied"),
     f"{L}/matches?first=tictactoe%403&second=tictactoe%401": (r"tictactoe@3 against tictactoe@1", r"#\d+"),
-    f"{L}/matches/{{schedule}}/0": (r"Watch 0", r"Watch 1"),
+    f"{L}/matches/{{schedule}}/0": (r"Game 0", r"Game 1"),
     f"{L}/matches/{{schedule}}/0/0": (r"player_1", r"of \d"),
-    f"{L}/evaluations": (r"None was asked for yet|#\d",),
-    f"{L}/evaluations/new": (r"Contestants: every version", r"At most minutes"),
+    f"{L}/evaluations": (r"No evaluations yet|#\d",),
+    f"{L}/evaluations/new": (r"Contestants: all versions", r"Maximum minutes"),
     f"{L}/runs": (RUN, r"7\d %"),
-    f"{L}/runs/{RUN}": (r"2\d,000 of 40,000", r"entropy", r"More curves"),
-    f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your seat"),
+    f"{L}/runs/{RUN}": (r"2\d,000 of 40,000", r"entropy", r"Show all metrics"),
+    f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your agent"),
     f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
-    f"{L}/nothing": (r"There is no such page",),
+    f"{L}/nothing": (r"Page not found",),
 }
 
 
 @pytest.fixture(scope="module")
 def names(served: Served) -> dict[str, str]:
-    """What a path of a page may name."""
+    """Values for the placeholders of the paths."""
     verdict = verdict_between_versions(served.registry)
     return {"verdict": verdict.id, "schedule": verdict.schedule}
 
@@ -55,11 +57,13 @@ def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
     assert page.title().endswith("Policy League")
     assert serious(tab) == []
     page.set_viewport_size({"width": 360, "height": 740})
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "it scrolls sideways on a phone"
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
+        "the page scrolls horizontally on a phone"
+    )
 
 
 def serious(tab: Tab) -> list[dict[str, Any]]:
-    """The serious and critical faults that axe finds."""
+    """The serious and critical violations that axe finds."""
     found = Axe().run(tab.page).response["violations"]
     return [
         {
@@ -74,69 +78,69 @@ def serious(tab: Tab) -> list[dict[str, Any]]:
 def test_a_dialog(tab: Tab) -> None:
     page = tab.open(L)
     page.get_by_role("button", name="Roll back …").click()
-    expect(page.get_by_role("dialog")).to_contain_text("becomes the champion again, instead of")
+    expect(page.get_by_role("dialog")).to_contain_text(re.compile(r"becomes champion again and replaces\s+tictactoe@"))
     assert serious(tab) == []
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     expect(page.get_by_role("button", name="Roll back …")).to_be_focused()
 
 
-def test_the_dialog_of_a_note(tab: Tab) -> None:
+def test_the_note_dialog(tab: Tab) -> None:
     page = tab.open(f"{L}/versions")
-    page.get_by_role("button", name=f"Change the note of {LEAGUE}@2").click()
-    expect(page.get_by_role("dialog", name=f"Note of {LEAGUE}@2")).to_contain_text("Without a word it is taken away")
+    page.get_by_role("button", name=f"Edit the note of {LEAGUE}@2").click()
+    expect(page.get_by_role("dialog", name=f"Note of {LEAGUE}@2")).to_contain_text("Save an empty note to delete it")
     assert serious(tab) == []
 
 
 def test_an_unknown_league(tab: Tab) -> None:
     page = tab.open("/leagues/chess/verdicts")
-    expect(page.get_by_role("heading", level=1)).to_have_text("There is no league chess")
-    tab.forgive(404)
+    expect(page.get_by_role("heading", level=1)).to_have_text("League chess not found")
+    tab.ignore(404)
 
 
 def test_the_first_paint_waits_for_no_data(tab: Tab) -> None:
-    """Nothing of the API answers, and there is a page all the same."""
+    """The title and the tabs are shown even if the API does not respond."""
     tab.page.route("**/v1/**", lambda route: None)
     page = tab.open(L)
     expect(page.get_by_role("heading", level=1)).to_have_text(LEAGUE)
     expect(page.get_by_role("navigation", name=re.compile("Pages"))).to_be_visible()
 
 
-def test_colours_are_chosen_and_kept(tab: Tab) -> None:
+def test_the_theme_is_selected_and_stored(tab: Tab) -> None:
     page = tab.open("/")
-    paper = "getComputedStyle(document.body).backgroundColor"
-    light = page.evaluate(paper)
-    switch = page.get_by_role("button", name="Colours")
+    background = "getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(background)
+    switch = page.get_by_role("button", name="Theme")
     switch.click()  # light
     switch.click()  # dark
-    expect(switch).to_have_accessible_name("Colours: dark")
-    dark = page.evaluate(paper)
+    expect(switch).to_have_accessible_name("Theme: dark")
+    dark = page.evaluate(background)
     page.reload()
-    assert page.evaluate(paper) == dark != light
+    assert page.evaluate(background) == dark != light
 
 
-def test_a_phone_shows_the_present_tab(tab: Tab) -> None:
+def test_a_phone_shows_the_selected_tab(tab: Tab) -> None:
     tab.page.set_viewport_size({"width": 360, "height": 740})
     page = tab.open(f"{L}/play")
     expect(page.get_by_role("link", name="Play", exact=True)).to_be_in_viewport(ratio=0.9)
 
 
-def test_everything_is_reached_by_keyboard(tab: Tab) -> None:
+def test_pages_are_navigable_by_keyboard(tab: Tab) -> None:
     page = tab.open("/")
     expect(page.get_by_role("link", name=LEAGUE, exact=True)).to_be_visible()
     page.keyboard.press("Tab")
-    expect(page.get_by_role("link", name="To the content")).to_be_focused()
+    expect(page.get_by_role("link", name="Skip to content")).to_be_focused()
     page.get_by_role("link", name=LEAGUE, exact=True).focus()
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", level=1)).to_have_text(LEAGUE)
-    page.get_by_role("link", name="Who beats whom").focus()
+    page.get_by_role("link", name="Payoff matrix").focus()
     page.keyboard.press("Enter")
     cell = page.get_by_role("link", name=re.compile("tictactoe@3 scores .* against script:random"))
     cell.focus()
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", level=2)).to_contain_text("against script:random")
     page.go_back()
-    expect(page.get_by_role("heading", level=2)).to_have_text("Who beats whom")
+    expect(page.get_by_role("heading", level=2)).to_have_text("Payoff matrix")
 
 
 def test_a_long_list_is_shown_page_by_page(tab: Tab) -> None:

@@ -1,30 +1,13 @@
-import json
-import os
-import subprocess
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from league.registry.registry import Registry
-from tests.evaluation import examples
-
-
-@dataclass(frozen=True)
-class Outcome:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-
-League = Callable[..., Outcome]
+from league.settings import Storage
+from tests.support import tictactoe
+from tests.support.command import League, in_process, in_subprocess
+from tests.support.templates import copy_of
 
 
 @pytest.fixture
@@ -34,26 +17,24 @@ def home(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def registry(home: Path) -> Registry:
-    """Three versions of tic-tac-toe: one that sees nothing, one that blocks, one that wins and blocks."""
-    registry = examples.registry(home)
-    for graph in (examples.graph(), examples.graph(blocks=True), examples.graph(wins=True, blocks=True)):
-        examples.publish(registry, graph)
+    """Three versions of tic-tac-toe: one that ignores threats, one that blocks, and one that wins and blocks."""
+    return copy_of(_with_three_versions, Storage.at(home))
+
+
+def _with_three_versions(storage: Storage) -> Registry:
+    registry = tictactoe.registry(storage.home)
+    for graph in (tictactoe.graph(), tictactoe.graph(blocks=True), tictactoe.graph(wins=True, blocks=True)):
+        tictactoe.publish(registry, graph)
     return registry
 
 
 @pytest.fixture
 def league(home: Path) -> League:
-    """Run the command as a person does, in a process of its own."""
+    """The command in this process."""
+    return partial(in_process, home)
 
-    def run(*arguments: str, stdin: str | None = None, timeout: float = 120) -> Outcome:
-        done = subprocess.run(
-            [sys.executable, "-c", "from cli.main import run; run()", *arguments],
-            env=os.environ | {"LEAGUE_HOME": str(home), "COLUMNS": "200", "NO_COLOR": "1"},
-            input=stdin,
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-        )
-        return Outcome(done.returncode, done.stdout, done.stderr)
 
-    return run
+@pytest.fixture
+def league_process(home: Path) -> League:
+    """The command in a subprocess, for commands that start Ray, and for exit codes and signals."""
+    return partial(in_subprocess, home)

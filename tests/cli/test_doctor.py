@@ -1,21 +1,24 @@
 from pathlib import Path
 
-from tests.cli.conftest import League
+import pytest
+
+from tests.support.command import League
 
 
-def test_the_doctor_looks_at_everything_and_finds_this_machine_fit(league: League) -> None:
-    outcome = league("doctor", "--json")
-    document = outcome.json
+@pytest.mark.slow
+def test_all_checks_of_doctor_pass(league_process: League) -> None:
+    result = league_process("doctor", "--json")
+    document = result.json
     found = {check["what"]: check["status"] for check in document["checks"]}
     assert {"Python", "ray", "torch", "CPU", "GPU", "LEAGUE_HOME", "disk", "registry", "Ray", "HAProxy"} <= set(found)
     assert document["ok"], document
-    assert outcome.code == 0
+    assert result.code == 0
 
 
-def test_the_doctor_says_what_to_do_about_a_broken_home(league: League, home: Path) -> None:
+def test_doctor_explains_a_broken_home(league_process: League, home: Path) -> None:
     home.mkdir()
     (home / "league.db").write_text("no database")
-    document = league("doctor", "--json").json
+    document = league_process("doctor", "--json").json
     broken = [check for check in document["checks"] if check["status"] == "fail"]
     assert [check["what"] for check in broken] == ["registry"]
     assert "LEAGUE_HOME" in broken[0]["advice"]

@@ -1,16 +1,19 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import typer
 
-from cli.main import app
+from cli.main import SUBCOMMANDS, app
 from league.registry.registry import Registry
-from tests.cli.conftest import League
+from tests.support.command import League
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
-def test_the_commands_are_those_of_the_mission() -> None:
+def test_the_commands_are_complete() -> None:
     assert set(COMMANDS) == {
         "doctor", "check-env", "train", "sweep", "versions", "note", "evaluate", "promote", "rollback", "history",
         "nightly", "replay", "serve", "act", "demo", "keys", "traffic", "verify", "void", "report",
@@ -18,7 +21,7 @@ def test_the_commands_are_those_of_the_mission() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_each_command_and_option_explains_itself(name: str) -> None:
+def test_each_command_and_option_has_help(name: str) -> None:
     command = COMMANDS[name]
     assert command.help
     assert len(command.help) > 40
@@ -30,13 +33,13 @@ def test_each_command_and_option_explains_itself(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "messages"),
     [
         (("versions", "chess"), ("no league 'chess'", "tictactoe")),
         (("versions", "A/B"), ("'A/B' must consist of",)),
         (("promote", "tictactoe@9"), ("tictactoe", "9")),
         (("promote", "tictactoe@champion"), ("champion",)),
-        (("promote", "tictactoe"), ("names no version",)),
+        (("promote", "tictactoe"), ("contains no version",)),
         (("promote", "tictactoe@1", "--alias", "12"), ("version number",)),
         (("promote", "tictactoe@1", "--expected", "x"), ("--expected",)),
         (("history", "tictactoe", "--at", "noon"), ("--at 'noon'",)),
@@ -50,33 +53,92 @@ def test_each_command_and_option_explains_itself(name: str) -> None:
         (("nightly", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
         (("train", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
         (("act", "script:random"), ("script",)),
-        (("act", "tictactoe@1", "--local", "-o", "[[["), ("no JSON",)),
+        (("act", "tictactoe@1", "--local", "-o", "[[["), ("not valid JSON",)),
         (("act", "tictactoe@1", "--local", "-o", '{"observation": [[1]]}'), ("action_mask",)),
         (("act", "tictactoe@1", "--local", "--policy", "other"), ("other",)),
     ],
 )
-def test_a_mistake_is_one_line_that_names_the_thing_and_exits_2(
-    league: League, registry: Registry, arguments: tuple[str, ...], words: tuple[str, ...]
+def test_a_usage_error_is_one_line_and_exits_with_2(
+    league: League, registry: Registry, arguments: tuple[str, ...], messages: tuple[str, ...]
 ) -> None:
-    outcome = league(*arguments)
-    assert outcome.code == 2, outcome.err
-    assert outcome.out == ""
-    assert outcome.err.count("\n") == 1
-    assert outcome.err.startswith("league: ")
-    for word in words:
-        assert word in outcome.err
+    result = league(*arguments)
+    assert result.code == 2, result.err
+    assert result.out == ""
+    assert result.err.count("\n") == 1
+    assert result.err.startswith("league: ")
+    for word in messages:
+        assert word in result.err
 
 
-def test_a_home_that_cannot_be_written_is_one_line(league: League, home: Path) -> None:
+def test_an_unusable_home_is_reported_in_one_line(league: League, home: Path) -> None:
     home.write_text("a file, where a directory is wanted")
-    outcome = league("versions", "tictactoe")
-    assert outcome.code == 1
-    assert outcome.err.count("\n") == 1
-    assert "home" in outcome.err
+    result = league("versions", "tictactoe")
+    assert result.code == 1
+    assert result.err.count("\n") == 1
+    assert "home" in result.err
 
 
-def test_a_server_that_is_not_there_is_one_line(league: League, registry: Registry) -> None:
-    outcome = league("act", "tictactoe@1", "--url", "http://127.0.0.1:9")
-    assert outcome.code == 1
-    assert outcome.err.count("\n") == 1
-    assert "http://127.0.0.1:9" in outcome.err
+def test_an_unreachable_server_is_reported_in_one_line(league: League, registry: Registry) -> None:
+    result = league("act", "tictactoe@1", "--url", "http://127.0.0.1:9")
+    assert result.code == 1
+    assert result.err.count("\n") == 1
+    assert "http://127.0.0.1:9" in result.err
+
+
+@pytest.mark.parametrize("name", sorted(SUBCOMMANDS))
+def test_the_listed_help_of_a_command_is_the_first_paragraph_of_its_help(name: str) -> None:
+    own = COMMANDS[name].help.partition("\n\n")[0]
+    assert SUBCOMMANDS[name].help == own.replace("\n", " ")
+
+
+LARGE_PACKAGES = (
+    "alembic",
+    "gymnasium",
+    "httpx",
+    "league.config",
+    "numpy",
+    "onnxruntime",
+    "pettingzoo",
+    "ray",
+    "scipy",
+    "sqlalchemy",
+    "torch",
+)
+
+
+def test_help_imports_no_large_package() -> None:
+    program = f"""if True:
+        import sys
+        from typer.testing import CliRunner
+        from cli.main import SUBCOMMANDS, app
+        for arguments in ([], *([name] for name in SUBCOMMANDS)):
+            done = CliRunner().invoke(app, [*arguments, "--help"])
+            assert done.exit_code == 0, done.output
+        print(sorted(sys.modules.keys() & set({LARGE_PACKAGES})))
+    """
+    assert _last_line(program) == "[]"
+
+
+def test_the_versions_of_a_league_without_games_are_listed_without_numpy(home: Path, registry: Registry) -> None:
+    program = f"""if True:
+        import sys
+        from typer.testing import CliRunner
+        from cli.main import app
+        done = CliRunner().invoke(app, ["versions", "tictactoe"])
+        assert done.exit_code == 0, done.output
+        print(sorted(sys.modules.keys() & ({set(LARGE_PACKAGES)} - {{"sqlalchemy"}})))
+    """
+    assert _last_line(program, LEAGUE_HOME=str(home)) == "[]"
+
+
+def _last_line(program: str, **environment: str) -> str:
+    """Run a program in a process of its own and return the last line that it prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return done.stdout.splitlines()[-1]

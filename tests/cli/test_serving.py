@@ -1,7 +1,7 @@
 import json
 
 from league.registry.registry import Registry
-from tests.cli.conftest import League
+from tests.support.command import League
 
 EMPTY = {"observation": [[[0, 0]] * 3] * 3, "action_mask": [1] * 9}
 
@@ -18,9 +18,9 @@ def test_act_locally_on_text_a_file_and_stdin(league: League, registry: Registry
         document = league("act", "tictactoe@3", "--local", "--json", "-o", source, stdin=stdin).json
         assert document["action"] == 0
         assert document["version"] == 3
-        assert document["sha256"] == registry.version("tictactoe", 3).sha256
+        assert document["sha256"] == registry.versions.get("tictactoe", 3).sha256
 
 
-def test_exploration_is_reproducible_by_its_seed(league: League, registry: Registry) -> None:
+def test_exploration_with_a_seed_is_reproducible(league: League, registry: Registry) -> None:
     first = league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out
     assert first == league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out

@@ -1,11 +1,10 @@
-"""`league train` and `league sweep` as a person runs them, and ends them."""
+"""`league train` and `league sweep` as run and interrupted by a user."""
 
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,13 +14,14 @@ import yaml
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.haproxy import free_ports
-from tests.cli.conftest import League
+from serve_app.runtime.haproxy import free_ports
+from tests.support.command import League
+from tests.support.waiting import until
 
 DEADLINE = 180
 COMMAND = (sys.executable, "-c", "from cli.main import run; run()")
 TRAINING = {
-    "runners": 1, "copies": 4, "hidden": [16], "train_batch_size": 256, "minibatch_size": 128, "epochs": 1,
+    "runners": 1, "num_envs": 4, "hidden": [16], "train_batch_size": 256, "minibatch_size": 128, "epochs": 1,
     "checkpoint_every": 1024, "steps": 10**9,
 }  # fmt: skip
 
@@ -37,8 +37,8 @@ def config(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def started(home: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Start the command in a process group of its own, as a shell does for a terminal."""
+def start_command(home: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start the command in its own process group, like a shell in a terminal."""
     processes = []
 
     def start(*arguments: str) -> subprocess.Popen[str]:
@@ -61,93 +61,90 @@ def started(home: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
             process.wait()
 
 
-def wait_for(is_there: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + DEADLINE
-    while not is_there():
-        assert time.monotonic() < deadline, f"not within {DEADLINE} s"
-        time.sleep(0.05)
-
-
-def test_ctrl_c_publishes_what_there_is_and_a_second_one_ends_at_once(
-    started: Callable[..., subprocess.Popen[str]], config: Path, home: Path
+@pytest.mark.slow
+def test_ctrl_c_publishes_the_current_checkpoint_and_a_second_one_exits_at_once(
+    start_command: Callable[..., subprocess.Popen[str]], config: Path, home: Path
 ) -> None:
-    first = started("train", str(config))
-    wait_for(lambda: any(home.glob("artifacts/tictactoe/1/manifest.json")))
+    first = start_command("train", str(config))
+    until(lambda: any(home.glob("artifacts/tictactoe/1/manifest.json")), DEADLINE)
     os.killpg(first.pid, signal.SIGINT)
     out, _ = first.communicate(timeout=DEADLINE)
     assert first.returncode == 130, out
     assert "Traceback" not in out
-    versions = Registry.open(Storage.at(home)).versions("tictactoe")
+    versions = Registry.open(Storage.at(home)).versions.all("tictactoe")
     assert f"Ended early. Published: {', '.join(version.ref for version in versions)}." in out
     assert "--resume" in out
     (run,) = home.glob("runs/tictactoe/*/run.json")
-    assert str(run.parent) in out, "where the curves are"
+    assert str(run.parent) in out, "the directory of the curves is printed"
     assert not json.loads(run.read_text())["complete"]
-    assert not list(run.parent.glob("life-*/checkpoints/*")), "all that was learned is published"
+    assert not list(run.parent.glob("attempt-*/checkpoints/*")), "all checkpoints are published"
 
-    second = started("train", str(config), "--resume")
-    wait_for(lambda: len(Registry.open(Storage.at(home)).versions("tictactoe")) > len(versions))
+    second = start_command("train", str(config), "--resume")
+    until(lambda: len(Registry.open(Storage.at(home)).versions.all("tictactoe")) > len(versions), DEADLINE)
     os.killpg(second.pid, signal.SIGINT)
-    wait_for(lambda: any(home.glob("runs/tictactoe/*/life-2/end")))
+    until(lambda: any(home.glob("runs/tictactoe/*/attempt-2/stop")), DEADLINE)
     os.killpg(second.pid, signal.SIGINT)
     out, _ = second.communicate(timeout=DEADLINE)
     assert second.returncode == 130, out
     assert "Traceback" not in out
 
-    later = Registry.open(Storage.at(home)).versions("tictactoe")
+    later = Registry.open(Storage.at(home)).versions.all("tictactoe")
     budget = f"--steps={later[-1].steps + 256}"
-    third = started("train", str(config), "--resume", budget)
+    third = start_command("train", str(config), "--resume", budget)
     out, _ = third.communicate(timeout=DEADLINE)
     assert third.returncode == 0, out
-    last = Registry.open(Storage.at(home)).versions("tictactoe")
+    last = Registry.open(Storage.at(home)).versions.all("tictactoe")
     assert [version.ref for version in last[: len(later)]] == [version.ref for version in later]
     assert last[-1].steps >= later[-1].steps + 256
     assert [version.steps for version in last] == sorted({version.steps for version in last})
 
 
-def test_a_sweep_prints_its_trials_and_the_best_ones_settings(league: League, config: Path, home: Path) -> None:
-    outcome = league("sweep", str(config), "--steps=256", "--cpus=2", "--dashboard", timeout=DEADLINE)
-    assert outcome.code == 0, outcome.err
-    assert "Ray's dashboard: http://127.0.0.1:" in outcome.out
-    lines = [line.split() for line in outcome.out.splitlines()]
+@pytest.mark.slow
+def test_a_sweep_prints_its_trials_and_the_best_settings(league_process: League, config: Path, home: Path) -> None:
+    result = league_process("sweep", str(config), "--steps=256", "--cpus=2", "--dashboard", timeout=DEADLINE)
+    assert result.code == 0, result.err
+    assert "Ray's dashboard: http://127.0.0.1:" in result.out
+    lines = [line.split() for line in result.out.splitlines()]
     rows = [line for line in lines if line[:1] in (["0"], ["1"]) and "of" not in line]
     assert [row[1:3] for row in rows] == [["[8]", "0.01"], ["[16]", "0.01"]]
     best = max(range(2), key=lambda number: float(rows[number][3]))
-    assert f"Trial {best} is the best." in outcome.out
-    snippet = outcome.out.partition("Its settings:")[2].partition("Published")[0]
+    assert f"Best trial: {best}." in result.out
+    snippet = result.out.partition("Settings:")[2].partition("Published")[0]
     assert yaml.safe_load(snippet) == {
         "training": {"hidden": [[8], [16]][best], "per_policy": {"shared": {"lr": 0.01}}},
     }
-    assert "Published it as tictactoe@1." in outcome.out
+    assert "Published as tictactoe@1." in result.out
     assert len(list(home.glob("sweeps/tictactoe/*/trial-*/outcome.json"))) == 2
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
-        (("--job",), "--job needs --address http://HOST:8265"),
+        (("--job",), "--job requires --address http://HOST:8265"),
         (("--job", "--address", "127.0.0.1:6379"), "expected --address http://HOST:8265"),
         (("--job", "--address", "http://127.0.0.1:9"), "no Ray dashboard at http://127.0.0.1:9"),
         (("--job", "--address", "http://192.0.2.77:8265"), "192.0.2.77 is another machine: set LEAGUE_DATABASE_URL"),
         (("--address", "127.0.0.1:9", "--cpus", "1"), "for a local Ray"),
         (("--object-store", "5"), "at least 80 MB, got 5"),
-        (("--gpus", "64"), "64 GPUs are asked for"),
+        (("--gpus", "64"), "64 GPUs requested"),
         (("--resume",), "nothing to resume"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(
-    league: League, config: Path, arguments: tuple[str, ...], words: str
+def test_invalid_options_are_rejected_in_one_line(
+    league: League, config: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    outcome = league("train", str(config), *arguments)
-    assert outcome.code == 2, outcome.err
-    assert outcome.err.startswith("league: ")
-    assert outcome.err.count("\n") == 1
-    assert words in outcome.err
+    result = league("train", str(config), *arguments)
+    assert result.code == 2, result.err
+    assert result.err.startswith("league: ")
+    assert result.err.count("\n") == 1
+    assert message in result.err
 
 
 @pytest.fixture
 def cluster() -> Iterator[str]:
-    """A cluster of one machine, with ports of its own, as other Rays may be running; the address of its dashboard."""
+    """A cluster of one machine with its own ports, as other Ray instances may be running; yields the address of its
+    dashboard.
+    """
     gcs, dashboard, agent = free_ports(3, "127.0.0.1")
     ports = {"port": gcs, "dashboard-port": dashboard, "dashboard-agent-listen-port": agent}
     command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--num-cpus=2"]
@@ -161,7 +158,7 @@ def cluster() -> Iterator[str]:
 
 
 def is_up(address: str) -> bool:
-    """Whether something answers, if only that it wants a token."""
+    """Whether the address responds, even if only to require a token."""
     try:
         httpx.get(address)
     except httpx.TransportError:
@@ -169,16 +166,17 @@ def is_up(address: str) -> bool:
     return True
 
 
-def test_training_as_a_job_of_a_cluster(league: League, config: Path, home: Path, cluster: str) -> None:
-    wait_for(lambda: is_up(cluster))
-    outcome = league("train", str(config), "--job", "--address", cluster, "--steps=256", timeout=DEADLINE)
-    assert outcome.code == 0, outcome.out + outcome.err
-    assert "To stop it: ray job stop raysubmit_" in outcome.out
-    assert "Published tictactoe@1." in outcome.out
-    (version,) = Registry.open(Storage.at(home)).versions("tictactoe")
+@pytest.mark.slow
+def test_training_as_a_job_of_a_cluster(league_process: League, config: Path, home: Path, cluster: str) -> None:
+    until(lambda: is_up(cluster), DEADLINE)
+    result = league_process("train", str(config), "--job", "--address", cluster, "--steps=256", timeout=DEADLINE)
+    assert result.code == 0, result.out + result.err
+    assert "To stop it: ray job stop raysubmit_" in result.out
+    assert "Published tictactoe@1." in result.out
+    (version,) = Registry.open(Storage.at(home)).versions.all("tictactoe")
     assert version.steps == 256
 
-    outcome = league("train", str(config), "--job", "--address", cluster, "--from=@7", timeout=DEADLINE)
-    assert outcome.code == 1
-    assert "has no version 7" in outcome.out
-    assert outcome.err.startswith("league: job raysubmit_")
+    result = league_process("train", str(config), "--job", "--address", cluster, "--from=@7", timeout=DEADLINE)
+    assert result.code == 1
+    assert "has no version 7" in result.out
+    assert result.err.startswith("league: job raysubmit_")

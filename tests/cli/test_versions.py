@@ -1,7 +1,7 @@
 from concurrent.futures import ThreadPoolExecutor
 
 from league.registry.registry import Registry
-from tests.cli.conftest import League
+from tests.support.command import League
 
 
 def test_versions_as_json(league: League, registry: Registry) -> None:
@@ -19,42 +19,42 @@ def test_versions_as_a_table(league: League, registry: Registry) -> None:
     assert len(lines) == 4
 
 
-def test_notes_are_written_shown_and_taken_away(league: League, registry: Registry) -> None:
+def test_notes_are_added_shown_and_removed(league: League, registry: Registry) -> None:
     assert league("note", "tictactoe@2", "[bold]entropy", "--actor", "ada").out == "tictactoe@2: [bold]entropy\n"
     assert league("versions", "tictactoe").out.splitlines()[2].endswith("[bold]entropy")
     notes = [version["note"] for version in league("versions", "tictactoe", "--json").json["versions"]]
     assert [note and (note["text"], note["actor"]) for note in notes] == [None, ("[bold]entropy", "ada"), None]
-    assert league("note", "tictactoe@2", "").out == "tictactoe@2: there is no note any more\n"
-    assert registry.version("tictactoe", 2).note is None
+    assert league("note", "tictactoe@2", "").out == "tictactoe@2: note cleared\n"
+    assert registry.versions.get("tictactoe", 2).note is None
 
 
-def test_words_that_a_terminal_would_obey_are_shown(league: League, registry: Registry) -> None:
+def test_terminal_control_characters_are_escaped(league: League, registry: Registry) -> None:
     hostile = "\x1b]0;owned\x07 \x9b31m\r"
-    shown = [
+    outputs = [
         league("note", "tictactoe@2", hostile).out,
         league("promote", "tictactoe@2", "--reason", hostile, "--actor", hostile).out,
         league("versions", "tictactoe").out,
         league("history", "tictactoe").out,
     ]
-    for out in shown:
+    for out in outputs:
         assert not set(out) & {"\x1b", "\x07", "\x9b", "\r"}, out
-    assert "�]0;owned�" in shown[2]
-    assert "�]0;owned�" in shown[3]
+    assert "�]0;owned�" in outputs[2]
+    assert "�]0;owned�" in outputs[3]
 
 
-def test_what_is_no_text_is_refused_in_a_line(league: League, registry: Registry) -> None:
+def test_text_with_invalid_unicode_is_rejected(league: League, registry: Registry) -> None:
     for arguments in (("note", "tictactoe@2", "a\udcff"), ("promote", "tictactoe@2", "--reason", "a\udcff")):
-        outcome = league(*arguments)
-        assert outcome.code == 2
-        assert outcome.err.startswith("league: ")
-        assert "is no text" in outcome.err
-    assert registry.aliases("tictactoe") == {}
-    assert registry.version("tictactoe", 2).note is None
+        result = league(*arguments)
+        assert result.code == 2
+        assert result.err.startswith("league: ")
+        assert "is not valid text" in result.err
+    assert registry.aliases.current("tictactoe") == {}
+    assert registry.versions.get("tictactoe", 2).note is None
 
 
-def test_promote_roll_back_and_the_history_of_both(league: League, registry: Registry) -> None:
-    assert "now version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
-    assert "now version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out
+def test_promotions_rollbacks_and_their_history(league: League, registry: Registry) -> None:
+    assert "now points to version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
+    assert "now points to version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out
     assert league("rollback", "tictactoe", "--json").json["version"] == 1
     events = league("history", "tictactoe", "--json").json["events"]
     assert [(event["version"], event["previous"], event["kind"]) for event in events] == [
@@ -71,19 +71,18 @@ def test_promote_roll_back_and_the_history_of_both(league: League, registry: Reg
     assert outcome.err.startswith("league: ")
 
 
-def test_of_two_promotions_that_expect_the_same_one_wins_and_the_other_is_told(
-    league: League, registry: Registry
-) -> None:
-    league("promote", "tictactoe@1")
+def test_of_two_concurrent_promotions_one_fails(league_process: League, registry: Registry) -> None:
+    league_process("promote", "tictactoe@1")
     with ThreadPoolExecutor(2) as pool:
-        outcomes = list(pool.map(lambda ref: league("promote", ref, "--expected", "1"), ("tictactoe@2", "tictactoe@3")))
-    assert sorted(outcome.code for outcome in outcomes) == [0, 1]
-    loser = max(outcomes, key=lambda outcome: outcome.code)
-    winner = registry.aliases("tictactoe")["champion"]
+        refs = ("tictactoe@2", "tictactoe@3")
+        results = list(pool.map(lambda ref: league_process("promote", ref, "--expected", "1"), refs))
+    assert sorted(outcome.code for outcome in results) == [0, 1]
+    loser = max(results, key=lambda outcome: outcome.code)
+    winner = registry.aliases.current("tictactoe")["champion"]
     assert loser.err.startswith("league: ")
     assert str(winner) in loser.err
 
 
 def test_another_alias_can_be_moved(league: League, registry: Registry) -> None:
     league("promote", "tictactoe@2", "--alias", "candidate", "--expected", "none")
-    assert registry.aliases("tictactoe") == {"candidate": 2}
+    assert registry.aliases.current("tictactoe") == {"candidate": 2}

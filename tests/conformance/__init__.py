@@ -1,1 +1,1 @@
-"""Reusable checks: whoever implements a contract calls the assertion that the project itself uses."""
+"""Reusable conformance checks: an implementation of a contract calls the assertion that the project itself uses."""

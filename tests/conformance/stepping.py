@@ -1,7 +1,8 @@
-"""The contract of batched stepping: n copies in lockstep give each agent what its API's plain loop gives it.
+"""The contract of batched stepping: n environments in lockstep give each agent the results of the plain loop of its
+API.
 
-Environments are PettingZoo's AEC or Parallel, or RLlib's MultiAgentEnv. The plain loops are written as their own
-documentation writes them, and know nothing of the stepping.
+Environments are PettingZoo's AEC or Parallel API, or RLlib's MultiAgentEnv. The plain loops follow the documentation of
+these APIs and are independent of the stepping.
 """
 
 from collections import defaultdict
@@ -13,17 +14,19 @@ import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
 
 from league.environments.building import action_space, observation_space
-from league.environments.stepping import BatchedEnvironment, Episode, Turn
+from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
 from league.seeds import generator
-from league.spaces import ACTION_MASK, from_gymnasium, tensors
+from league.spaces import ACTION_MASK
+from league.spaces.arrays import tensors
+from league.spaces.conversion import from_gymnasium
 
 Report = tuple[str, dict[str, Any], float, bool, bool]
-"""(agent, observation, reward, terminated, truncated), in the order of an agent's own turns."""
+"""(agent, observation, reward, terminated, truncated), in the order of the agent's turns."""
 Reports = dict[str, list[Report]]
 
 
 def draw(space: gymnasium.Space, seed: int, agent: int, turn: int, mask: np.ndarray | None) -> Any:
-    """A random legal action that depends on the episode, the agent and its turn alone."""
+    """A random legal action that depends only on the episode, the agent and its turn."""
     rng = generator(seed, agent, turn)
     if isinstance(space, gymnasium.spaces.Discrete):
         legal = np.arange(space.n) if mask is None else np.flatnonzero(mask)
@@ -35,12 +38,12 @@ def draw(space: gymnasium.Space, seed: int, agent: int, turn: int, mask: np.ndar
 
 
 def plain_loop(env: Any, seed: int) -> Reports:
-    """What the API's own loop reports to each agent over one episode."""
+    """The results of the API's loop for each agent over one episode."""
     reports: Reports = defaultdict(list)
     if isinstance(env, AECEnv):
         _agent_iter(env, seed, reports)
     elif isinstance(env, ParallelEnv):
-        _all_at_once(env, seed, reports)
+        _parallel(env, seed, reports)
     else:
         _multi_agent(env, seed, reports)
     return reports
@@ -54,7 +57,7 @@ def _agent_iter(env: AECEnv, seed: int, reports: Reports) -> None:
         env.step(None if terminated or truncated else _answer(env, seed, agent, reports))
 
 
-def _all_at_once(env: ParallelEnv, seed: int, reports: Reports) -> None:
+def _parallel(env: ParallelEnv, seed: int, reports: Reports) -> None:
     observations, _ = env.reset(seed=seed)
     for agent, value in observations.items():
         _report(env, reports, agent, value, 0.0, False, False)
@@ -67,28 +70,28 @@ def _all_at_once(env: ParallelEnv, seed: int, reports: Reports) -> None:
 
 def _multi_agent(env: Any, seed: int, reports: Reports) -> None:
     observations, _ = env.reset(seed=seed)
-    owed: dict[str, float] = defaultdict(float)
-    living = set(observations)
+    pending: dict[str, float] = defaultdict(float)
+    alive = set(observations)
     for agent, value in observations.items():
         _report(env, reports, agent, value, 0.0, False, False)
     while True:
         observations, rewards, terminated, truncated, _ = env.step(
-            {agent: _answer(env, seed, agent, reports) for agent in observations if agent in living}
+            {agent: _answer(env, seed, agent, reports) for agent in observations if agent in alive}
         )
         for agent, reward in rewards.items():
-            owed[agent] += reward
-        living |= set(observations)
+            pending[agent] += reward
+        alive |= set(observations)
         everybody = (terminated["__all__"], truncated["__all__"])
-        for agent in sorted(living):
+        for agent in sorted(alive):
             own = (terminated.get(agent, False), truncated.get(agent, False))
             flags = own if any(own) else everybody
             if agent in observations:
-                _report(env, reports, agent, observations[agent], owed.pop(agent, 0.0), *flags)
+                _report(env, reports, agent, observations[agent], pending.pop(agent, 0.0), *flags)
             elif any(flags):
                 last = reports[agent][-1][1]
-                reports[agent].append((agent, last, owed.pop(agent, 0.0), *flags))
+                reports[agent].append((agent, last, pending.pop(agent, 0.0), *flags))
             if any(flags):
-                living.discard(agent)
+                alive.discard(agent)
         if any(everybody):
             return
 
@@ -111,48 +114,49 @@ def lockstep(
     spaces: Mapping[str, gymnasium.Space],
     seeds: list[int],
     steps: int | None = None,
-    broken: Mapping[int, int] | None = None,
+    abandon: Mapping[int, int] | None = None,
 ) -> dict[int, Reports]:
-    """What the batched environment reports to each agent of each episode; episodes queue for the copies.
+    """The results of the batched environment for each agent of each episode; episodes are assigned to free
+    environments.
 
-    spaces: agent → how it acts. steps: calls of `step` after which to stop; None until all episodes are over.
-    broken: seeds of episodes that are abandoned, and after how many steps.
+    spaces: agent → action space. steps: the number of calls of `step`; None until all episodes are over. abandon: seeds
+    of episodes to abandon, and after how many steps.
     """
-    broken, left = broken or {}, dict(broken or {})
+    left = dict(abandon or {})
     queue = list(seeds)
     reports: dict[int, Reports] = {seed: defaultdict(list) for seed in seeds}
     playing: dict[int, int] = {}
     starting: dict[int, int | None] = {}
 
-    def next_episode(copy: int) -> Episode | None:
-        starting[copy] = queue.pop(0) if queue else None
-        seed = starting[copy]
-        return None if seed is None else Episode(seed, batched.agents)
+    def next_episode(env: int) -> EpisodeStart | None:
+        starting[env] = queue.pop(0) if queue else None
+        seed = starting[env]
+        return None if seed is None else EpisodeStart(seed, batched.agents)
 
     turn = batched.start(next_episode)
     taken = 0
     while True:
         _read_endings(turn, batched, playing, reports)
-        playing.update({copy: seed for copy, seed in starting.items() if seed is not None})
+        playing.update({env: seed for env, seed in starting.items() if seed is not None})
         starting.clear()
         if not turn.batches or taken == steps:
             return reports
-        acting = {copy for batch in turn.batches.values() for copy in batch.copies}
-        abandoned = [copy for copy in acting if left.get(playing[copy]) == 0]
+        acting = {env for batch in turn.batches.values() for env in batch.envs}
+        abandoned = [env for env in acting if left.get(playing[env]) == 0]
         left |= {seed: left[seed] - 1 for seed in map(playing.get, acting) if seed in left}
         if abandoned:
             batched.abandon(abandoned)
         actions = {}
         for group, batch in turn.batches.items():
             chosen = []
-            for row, (copy, index) in enumerate(zip(batch.copies, batch.agents, strict=True)):
-                if copy in abandoned:
+            for row, (env, index) in enumerate(zip(batch.envs, batch.agents, strict=True)):
+                if env in abandoned:
                     continue
                 agent = batched.agents[index]
                 assert group == agent, "a row is in the batch of another group"
                 arrays = {name: array[row] for name, array in batch.observations.items()}
-                own = reports[playing[copy]][agent]
-                chosen.append(draw(spaces[agent], playing[copy], index, len(own), arrays.get(ACTION_MASK)))
+                own = reports[playing[env]][agent]
+                chosen.append(draw(spaces[agent], playing[env], index, len(own), arrays.get(ACTION_MASK)))
                 own.append((agent, arrays, batch.rewards[row], False, False))
             if chosen:
                 actions[group] = np.array(chosen)
@@ -166,115 +170,116 @@ def _read_endings(
     for ending in turn.endings:
         agent = batched.agents[ending.agent]
         last = (agent, ending.observation, ending.reward, ending.terminated, ending.truncated)
-        reports[playing[ending.copy]][agent].append(last)
+        reports[playing[ending.env]][agent].append(last)
 
 
 def assert_stepping_conforms(
-    make: Callable[[int], BatchedEnvironment], stock: Callable[[], Any], seeds: list[int], copies: int
+    make: Callable[[int], BatchedEnvironment], create: Callable[[], Any], seeds: list[int], num_envs: int
 ) -> None:
-    """Compare every report of `seeds`, played in `copies` copies, with the plain loop of a fresh `stock()` for each."""
-    env = stock()
+    """Compare all reports of `seeds` in `num_envs` environments with the plain loop of a new `create()` per seed."""
+    env = create()
     spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    batched = lockstep(make(copies), spaces, seeds)
+    batched = lockstep(make(num_envs), spaces, seeds)
     for seed in seeds:
-        assert_same_episode(batched[seed], plain_loop(stock(), seed))
+        assert_same_episode(batched[seed], plain_loop(create(), seed))
 
 
 def assert_abandoning_conforms(
-    make: Callable[[int], BatchedEnvironment], stock: Callable[[], Any], seeds: list[int], copies: int
+    make: Callable[[int], BatchedEnvironment], create: Callable[[], Any], seeds: list[int], num_envs: int
 ) -> None:
-    """Every other episode is broken off, after one step more than the one before that: up to there it is reported as
-    ever, and of the others nothing changes.
+    """Abandon every other episode, each after one more step than the last: its reports until then, and all other
+    episodes, must be unchanged.
     """
-    env = stock()
+    env = create()
     spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    broken = {seed: number for number, seed in enumerate(seeds[::2])}
-    reported = lockstep(make(copies), spaces, seeds, broken=broken)
+    abandoned = {seed: number for number, seed in enumerate(seeds[::2])}
+    reported = lockstep(make(num_envs), spaces, seeds, abandon=abandoned)
     for seed in seeds:
-        expected = plain_loop(stock(), seed)
-        if seed in broken:
+        expected = plain_loop(create(), seed)
+        if seed in abandoned:
             expected = {agent: expected[agent][: len(own)] for agent, own in reported[seed].items()}
         assert_same_episode(reported[seed], expected)
     assert any(
-        sum(map(len, reported[seed].values())) < sum(map(len, plain_loop(stock(), seed).values())) for seed in broken
-    ), "no episode was broken off"
+        sum(map(len, reported[seed].values())) < sum(map(len, plain_loop(create(), seed).values()))
+        for seed in abandoned
+    ), "no episode was abandoned"
 
 
 def assert_states_conform(
-    make: Callable[[int], BatchedEnvironment], stock: Callable[[], Any], seeds: list[int], copies: int
+    make: Callable[[int], BatchedEnvironment], create: Callable[[], Any], seeds: list[int], num_envs: int
 ) -> None:
-    """The global states of each episode, its last one included, are those of a fresh `stock()` that is played alike.
+    """Compare the global states of each episode, including the last one, with those of a new `create()`.
 
-    make: an environment that gives states along. Agents act at once, all from the first step to the last.
+    make: creates an environment with states. All agents act at once, from the first step to the last.
     """
-    env = stock()
-    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    batched, queue = make(copies), list(seeds)
+    example = create()
+    spaces = {agent: action_space(example, agent) for agent in example.possible_agents}
+    batched, queue = make(num_envs), list(seeds)
     playing: dict[int, int] = {}
     starting: dict[int, int] = {}
     found: dict[int, list[np.ndarray]] = defaultdict(list)
 
-    def next_episode(copy: int) -> Episode | None:
+    def next_episode(env: int) -> EpisodeStart | None:
         if not queue:
             return None
-        starting[copy] = queue.pop(0)
-        return Episode(starting[copy], batched.agents)
+        starting[env] = queue.pop(0)
+        return EpisodeStart(starting[env], batched.agents)
 
     turn = batched.start(next_episode)
     while True:
-        for copy, state in turn.last_states.items():
-            found[playing[copy]].append(state)
+        for env, state in turn.last_states.items():
+            found[playing[env]].append(state)
         assert set(turn.last_states) == set(turn.finished)
         playing.update(starting)
         starting.clear()
-        for copy, state in turn.states.items():
-            found[playing[copy]].append(state)
+        for env, state in turn.states.items():
+            found[playing[env]].append(state)
         if not turn.batches:
             break
         turn = batched.step(
             {
                 agent: np.array(
                     [
-                        draw(spaces[agent], playing[copy], index, len(found[playing[copy]]) - 1, None)
-                        for copy, index in zip(batch.copies, batch.agents, strict=True)
+                        draw(spaces[agent], playing[env], index, len(found[playing[env]]) - 1, None)
+                        for env, index in zip(batch.envs, batch.agents, strict=True)
                     ]
                 )
                 for agent, batch in turn.batches.items()
             }
         )
     for seed in seeds:
-        expected = plain_states(stock(), spaces, seed)
+        expected = plain_states(create(), spaces, seed)
         assert len(found[seed]) == len(expected)
         for own, theirs in zip(found[seed], expected, strict=True):
             np.testing.assert_array_equal(own, np.asarray(theirs, dtype=np.float32).ravel())
 
 
 def plain_states(env: Any, spaces: Mapping[str, gymnasium.Space], seed: int) -> list[Any]:
-    """What `state()`, or the info of an agent, tells at the reset and behind each step of an episode."""
+    """The result of `state()`, or the state in the info of an agent, at the reset and after each step of an episode."""
 
-    def told(infos: Mapping[str, Any]) -> Any:
+    def state_of(infos: Mapping[str, Any]) -> Any:
         return np.array(env.state() if isinstance(env, ParallelEnv) else next(iter(infos.values()))["state"])
 
     observations, infos = env.reset(seed=seed)
-    states = [told(infos)]
+    states = [state_of(infos)]
     while True:
         actions = {
             agent: draw(spaces[agent], seed, env.possible_agents.index(agent), len(states) - 1, None)
             for agent in observations
         }
         observations, _, terminated, truncated, infos = env.step(actions)
-        states.append(told(infos))
+        states.append(state_of(infos))
         if any(terminated.values()) or any(truncated.values()):
             return states
 
 
 def assert_same_episode(actual: Reports, expected: Reports) -> None:
-    """Each agent has the same reports, in the same order, down to the dtype."""
+    """Each agent has the same reports, in the same order, with the same dtypes."""
     assert set(actual) == set(expected)
-    for agent, theirs in expected.items():
+    for agent, expected_reports in expected.items():
         own = actual[agent]
-        assert len(own) == len(theirs), f"{agent} has {len(own)} reports, expected {len(theirs)}"
-        for mine, other in zip(own, theirs, strict=True):
+        assert len(own) == len(expected_reports), f"{agent} has {len(own)} reports, expected {len(expected_reports)}"
+        for mine, other in zip(own, expected_reports, strict=True):
             assert mine[2:] == other[2:]
             for name, array in other[1].items():
                 np.testing.assert_array_equal(mine[1][name], array)

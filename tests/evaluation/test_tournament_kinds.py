@@ -1,4 +1,4 @@
-"""Evaluations and nights of leagues that are not two alike sides."""
+"""Evaluations and nightly runs of leagues without two equal sides."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from evaluation.nightly import nightly
-from evaluation.tournament import evaluate
+from evaluation.gating.nightly import nightly
+from evaluation.matches.tournament import evaluate
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.evaluation import examples
+from tests.support import tictactoe
 
 ROLES = {"adversary": ["adversary_*"], "good": ["agent_*"]}
 
@@ -24,22 +24,22 @@ def league(entry_point: str, **parts: Any) -> LeagueConfig:
 
 @pytest.fixture
 def registry(tmp_path: Path) -> Iterator[Registry]:
-    opened = Registry.open(Storage.at(tmp_path / "home"))
-    yield opened
-    opened.close()
+    registered = Registry.open(Storage.at(tmp_path / "home"))
+    yield registered
+    registered.close()
 
 
-def opened(registry: Registry, config: LeagueConfig) -> LeagueConfig:
-    registry.register(config, interface(config))
+def registered(registry: Registry, config: LeagueConfig) -> LeagueConfig:
+    registry.leagues.register(config, interface(config))
     return config
 
 
-def test_a_night_of_a_league_of_one_side(registry: Registry) -> None:
-    """Version 1 acts at random weights, version 2 knows the way: compared by returns on the same seeds."""
-    config = opened(registry, league("mpe2.simple_v3"))
-    spaces = registry.league("kind").interface.of_policy("shared")
-    for graph in (examples.linear(spaces, 3), examples.chasing(spaces)):
-        examples.publish(registry, graph, "kind")
+def test_a_nightly_run_with_one_side(registry: Registry) -> None:
+    """Version 1 has random weights, version 2 reaches the landmark; they are compared by returns on the same seeds."""
+    config = registered(registry, league("mpe2.simple_v3"))
+    spaces = registry.leagues.get("kind").interface.of_policy("shared")
+    for graph in (tictactoe.linear(spaces, 3), tictactoe.chase_landmark(spaces)):
+        tictactoe.publish(registry, graph, "kind")
     report = nightly(config, registry=registry)
     assert report.champion == "kind@2"
     verdict = report.verdicts[-1]
@@ -47,25 +47,25 @@ def test_a_night_of_a_league_of_one_side(registry: Registry) -> None:
     assert verdict.difference is not None
     assert verdict.difference.low is not None
     assert verdict.difference.low > 0
-    row = registry.verdicts("kind")[-1]
+    row = registry.verdicts.all("kind")[-1]
     assert row.evidence is not None
-    assert len(row.evidence["counts"]) == 3, "wins, draws and losses: a block is one comparison"
+    assert len(row.evidence["counts"]) == 3, "a block is one comparison: win, draw or loss"
     assert row.evidence["difference"]["mean"] == verdict.difference.mean
 
 
-def test_who_plays_alone_is_compared_on_common_seeds(registry: Registry) -> None:
-    opened(registry, league("mpe2.simple_v3"))
-    spaces = registry.league("kind").interface.of_policy("shared")
-    for graph in (examples.linear(spaces, 3), examples.chasing(spaces), examples.chasing(spaces)):
-        examples.publish(registry, graph, "kind")
+def test_solo_contestants_are_compared_on_common_seeds(registry: Registry) -> None:
+    registered(registry, league("mpe2.simple_v3"))
+    spaces = registry.leagues.get("kind").interface.of_policy("shared")
+    for graph in (tictactoe.linear(spaces, 3), tictactoe.chase_landmark(spaces), tictactoe.chase_landmark(spaces)):
+        tictactoe.publish(registry, graph, "kind")
     report = evaluate("kind", registry=registry, blocks=12)
-    standings = {standing.ref: standing for standing in report.standings}
+    leaderboard = {standing.ref: standing for standing in report.leaderboard}
     assert (report.scoring, report.by_side, report.games) == ("side", {}, 6 * 12 * 2)
-    assert {standing.games for standing in standings.values()} == {3 * 12}
-    assert all(0 < (s.distinct_games or 0) <= s.games for s in standings.values())
+    assert {standing.games for standing in leaderboard.values()} == {3 * 12}
+    assert all(0 < (s.unique_games or 0) <= s.games for s in leaderboard.values())
     best, twin, random = (report.payoff.contestants.index(ref) for ref in ("kind@2", "kind@3", "script:random"))
-    assert report.payoff.score[best][twin] == 0.5
-    assert report.payoff.score[best][random] == 1.0
+    assert report.payoff.score[best][twin] == pytest.approx(0.5)
+    assert report.payoff.score[best][random] == pytest.approx(1.0)
     level, better = report.payoff.difference[best][twin], report.payoff.difference[best][random]
     assert level is not None
     assert better is not None
@@ -73,21 +73,21 @@ def test_who_plays_alone_is_compared_on_common_seeds(registry: Registry) -> None
     assert better.low is not None
     assert better.low > 0
     assert better.mean == pytest.approx(
-        standings["kind@2"].mean_return - standings["script:random"].mean_return, rel=0.5
+        leaderboard["kind@2"].mean_return - leaderboard["script:random"].mean_return, rel=0.5
     )
 
 
-def test_unlike_sides_are_rated_one_by_one_and_together(registry: Registry) -> None:
-    opened(registry, league("mpe2.simple_adversary_v3", sides=ROLES, policies=ROLES))
+def test_different_sides_are_rated_separately_and_together(registry: Registry) -> None:
+    registered(registry, league("mpe2.simple_adversary_v3", sides=ROLES, policies=ROLES))
     report = evaluate("kind", ["script:random", "script:random", "script:first"], registry=registry, blocks=30)
     assert report.scoring == "side"
     assert set(report.by_side) == {"adversary", "good"}
-    for standings in report.by_side.values():
-        by_ref = {standing.ref: standing for standing in standings}
+    for leaderboard in report.by_side.values():
+        by_ref = {standing.ref: standing for standing in leaderboard}
         assert by_ref["script:random"].rating == 0
-        assert {standing.games for standing in standings} == {30}
-        assert sum(standing.score for standing in standings) == pytest.approx(1)
-    overall = {standing.ref: standing.score for standing in report.standings}
+        assert {standing.games for standing in leaderboard} == {30}
+        assert sum(standing.score for standing in leaderboard) == pytest.approx(1)
+    overall = {standing.ref: standing.score for standing in report.leaderboard}
     for ref, score in overall.items():
         parts = [standing.score for own in report.by_side.values() for standing in own if standing.ref == ref]
         assert sum(parts) / 2 == pytest.approx(score)
@@ -97,10 +97,10 @@ def test_unlike_sides_are_rated_one_by_one_and_together(registry: Registry) -> N
 
 
 def test_a_free_for_all_is_rated(registry: Registry) -> None:
-    config = opened(registry, league("mpe2.simple_spread_v3"))
-    spaces = registry.league("kind").interface.of_policy("shared")
-    examples.publish(registry, examples.linear(spaces, 1), "kind")
+    config = registered(registry, league("mpe2.simple_spread_v3"))
+    spaces = registry.leagues.get("kind").interface.of_policy("shared")
+    tictactoe.publish(registry, tictactoe.linear(spaces, 1), "kind")
     report = nightly(config, registry=registry)
     assert report.faults == ()
-    assert {standing.ref for standing in report.standings} == {"kind@1", "script:random"}
-    assert all(standing.rating is not None for standing in report.standings)
+    assert {standing.ref for standing in report.leaderboard} == {"kind@1", "script:random"}
+    assert all(standing.rating is not None for standing in report.leaderboard)

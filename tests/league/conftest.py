@@ -6,7 +6,7 @@ from uuid import uuid4
 import pytest
 
 from league.settings import Storage
-from tests.league.registry import postgresql
+from tests.support import postgresql
 
 
 @pytest.fixture(scope="session")
@@ -20,7 +20,7 @@ def postgresql_socket() -> Iterator[Path]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
-    """An empty home, on each database."""
+    """An empty home, for each database."""
     storage = Storage.at(tmp_path / "home")
     if request.param == "sqlite":
         return storage

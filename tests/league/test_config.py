@@ -12,7 +12,7 @@ MINIMAL = {"league": "mini", "environment": {"entry_point": "pettingzoo.classic.
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_each_shipped_config_is_valid_and_named_as_its_file(path: Path) -> None:
+def test_each_shipped_config_is_valid_and_named_like_its_file(path: Path) -> None:
     assert LeagueConfig.load(path).league == path.stem
 
 
@@ -27,7 +27,7 @@ def test_only_league_and_environment_are_required() -> None:
     [
         ({"leage": "x"}, "leage: unknown key, did you mean 'league'?"),
         ({"league": "Connect Four"}, "league: league 'Connect Four' must consist of"),
-        ({"environment": {}}, "environment.entry_point: missing, it is required"),
+        ({"environment": {}}, "environment.entry_point: missing, but required"),
         ({"gate": {"alpha": 2}}, "gate.alpha: input should be less than 0.5, got 2"),
         ({"gate": {"elo0": 10, "elo1": 5}}, "gate: elo1 must be greater than elo0 (10)"),
         ({"training": {"algorithm": "dqm"}}, f"training.algorithm: expected one of {', '.join(ALGORITHMS)}, got 'dqm'"),
@@ -47,13 +47,13 @@ def test_only_league_and_environment_are_required() -> None:
         ),
         ({"training": {"minibatch_size": 4096, "train_batch_size": 64}}, "minibatch_size must be at most"),
         ({"training": 3}, "training: "),
-        ({"policies": {}}, "policies: must name at least one"),
+        ({"policies": {}}, "policies: expected at least one entry"),
         ({"policies": {"A": ["*"]}}, "must consist of a-z"),
         ({"play": {"opening_plies": -1}}, "play.opening_plies: "),
         ({"environment": {"entry_point": "x", "wrappers": [{"a": 1, "b": 2}]}}, "environment.wrappers.0"),
     ],
 )
-def test_a_fault_is_named_by_source_key_and_expectation(change: dict, message: str) -> None:
+def test_a_fault_has_source_key_and_expectation(change: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)) as error:
         LeagueConfig.from_mapping(MINIMAL | change, source="mini.yaml")
     assert str(error.value).startswith("mini.yaml: ")
@@ -61,33 +61,33 @@ def test_a_fault_is_named_by_source_key_and_expectation(change: dict, message: s
 
 
 @pytest.mark.parametrize("text", ["", "- 1\n", "a: [", "\x00", "just text"])
-def test_a_file_that_is_no_mapping_is_refused_with_its_name(tmp_path: Path, text: str) -> None:
+def test_a_file_without_a_mapping_is_rejected_with_its_name(tmp_path: Path, text: str) -> None:
     path = tmp_path / "broken.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=re.escape(str(path))):
         LeagueConfig.load(path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere\.yaml: No such file"):
         LeagueConfig.load(tmp_path / "nowhere.yaml")
 
 
-def test_a_config_survives_the_round_trip_through_json() -> None:
+def test_a_config_survives_json() -> None:
     config = LeagueConfig.load("configs/connect_four.yaml")
     assert LeagueConfig.from_mapping(config.model_dump(mode="json", by_alias=True)) == config
 
 
-def test_the_environment_digest_moves_with_the_environment_alone() -> None:
+def test_the_environment_digest_depends_on_the_environment_only() -> None:
     config = LeagueConfig.from_mapping(MINIMAL)
-    trained_otherwise = LeagueConfig.from_mapping(MINIMAL | {"training": {"lr": 1e-5}})
+    other_training = LeagueConfig.from_mapping(MINIMAL | {"training": {"lr": 1e-5}})
     other = MINIMAL["environment"] | {"kwargs": {"screen_height": 500}}
     other_environment = LeagueConfig.from_mapping(MINIMAL | {"environment": other})
-    assert config.environment.digest() == trained_otherwise.environment.digest()
+    assert config.environment.digest() == other_training.environment.digest()
     assert config.environment.digest() != other_environment.environment.digest()
 
 
-def test_wrappers_are_read_by_name_with_and_without_arguments() -> None:
+def test_wrappers_can_have_arguments() -> None:
     environment = MINIMAL["environment"] | {"wrappers": ["flatten_v0", {"frame_stack_v1": {"stack_size": 3}}]}
     wrappers = LeagueConfig.from_mapping(MINIMAL | {"environment": environment}).environment.wrappers
     assert [(wrapper.name, wrapper.kwargs) for wrapper in wrappers] == [
@@ -96,8 +96,14 @@ def test_wrappers_are_read_by_name_with_and_without_arguments() -> None:
     ]
 
 
-def test_replaced_training_settings_are_checked_anew() -> None:
+def test_replaced_training_settings_are_validated() -> None:
     config = LeagueConfig.from_mapping(MINIMAL)
     assert config.with_training(minutes=3).training.minutes == 3
     with pytest.raises(ConfigError, match=r"training\.minutes"):
         config.with_training(minutes=-1)
+
+
+@pytest.mark.parametrize("section", ["play", "training"])
+def test_a_renamed_key_names_its_successor(section: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{section}\.copies: this key has been renamed to 'num_envs'"):
+        LeagueConfig.from_mapping(MINIMAL | {section: {"copies": 4}})

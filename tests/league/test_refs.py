@@ -13,12 +13,12 @@ versions = st.integers(1, 2**31 - 1) | aliases
 
 
 @given(st.builds(CheckpointRef, slugs, versions) | st.builds(ScriptRef, slugs))
-def test_a_contestant_reads_back_from_its_text(ref: CheckpointRef | ScriptRef) -> None:
+def test_a_contestant_survives_parsing_its_text(ref: CheckpointRef | ScriptRef) -> None:
     assert parse_ref(str(ref)) == ref
 
 
 @given(st.builds(PolicyRef, slugs, st.none() | slugs))
-def test_a_model_name_reads_back_from_its_text(ref: PolicyRef) -> None:
+def test_a_model_name_survives_parsing_its_text(ref: PolicyRef) -> None:
     assert PolicyRef.parse(str(ref)) == ref
 
 
@@ -39,19 +39,19 @@ def test_a_model_name_reads_back_from_its_text(ref: PolicyRef) -> None:
         "a/b@1",
     ],
 )
-def test_what_is_no_reference_is_refused(text: str) -> None:
+def test_an_invalid_reference_is_rejected(text: str) -> None:
     with pytest.raises(InvalidReference):
         parse_ref(text)
 
 
 @given(st.text())
-def test_any_text_parses_or_is_refused(text: str) -> None:
+def test_any_text_is_parsed_or_rejected(text: str) -> None:
     with contextlib.suppress(InvalidReference):
         ref = parse_ref(text)
         assert parse_ref(str(ref)) == ref
 
 
-def test_an_alias_is_never_a_number() -> None:
+def test_an_alias_cannot_be_a_number() -> None:
     assert check_alias("candidate") == "candidate"
     with pytest.raises(InvalidReference, match="version number"):
         check_alias("12")

@@ -8,7 +8,7 @@ from league.settings import Storage
 SERVER = "postgresql://db/league"
 
 
-def test_everything_lies_in_the_home_unless_it_is_moved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_defaults_are_inside_the_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("LEAGUE_HOME", "LEAGUE_DATABASE_URL", "LEAGUE_ARTIFACTS"):
         monkeypatch.delenv(name, raising=False)
@@ -20,9 +20,9 @@ def test_everything_lies_in_the_home_unless_it_is_moved(monkeypatch: pytest.Monk
     assert Storage.from_environment() == Storage(tmp_path / "elsewhere", SERVER, tmp_path / "shelf")
 
 
-def test_what_is_exported_is_read_back_from_any_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_exported_settings_are_read_back_from_any_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("LEAGUE_HOME", "LEAGUE_DATABASE_URL", "LEAGUE_ARTIFACTS"):
-        monkeypatch.setenv(name, "")  # restored afterwards
+        monkeypatch.setenv(name, "")  # monkeypatch restores them after export()
     storage = Storage.at(tmp_path / "home")
     storage.export()
     monkeypatch.chdir("/")

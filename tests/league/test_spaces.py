@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from league.errors import EnvironmentMismatch, IllegalMask, ObservationError
-from league.spaces import Box, Space, check, check_mask, from_gymnasium, inputs, tensors, to_gymnasium
+from league.spaces import Box, Space, inputs
+from league.spaces.arrays import check, check_mask, tensors
+from league.spaces.conversion import from_gymnasium, to_gymnasium
 
 MASKED = gym.Dict({"action_mask": gym.Box(0, 1, (7,), np.int8), "observation": gym.Box(0, 1, (6, 7, 2), np.int8)})
 EXAMPLES = [
@@ -24,25 +26,25 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize("space", EXAMPLES, ids=str)
-def test_a_space_survives_the_round_trip_through_json(space: gym.Space) -> None:
+def test_a_space_survives_json(space: gym.Space) -> None:
     adapter: TypeAdapter[Space] = TypeAdapter(Space)
-    described = from_gymnasium(space)
-    assert adapter.validate_json(adapter.dump_json(described)) == described
-    assert to_gymnasium(described) == space
+    converted = from_gymnasium(space)
+    assert adapter.validate_json(adapter.dump_json(converted)) == converted
+    assert to_gymnasium(converted) == space
 
 
 @pytest.mark.parametrize("space", EXAMPLES, ids=str)
-def test_each_sample_of_a_space_passes_its_own_check(space: gym.Space) -> None:
+def test_samples_of_a_space_are_valid(space: gym.Space) -> None:
     space.seed(7)
-    described = from_gymnasium(space)
-    leaves = inputs(described)
-    arrays = tensors(described, space.sample())
+    converted = from_gymnasium(space)
+    leaves = inputs(converted)
+    arrays = tensors(converted, space.sample())
     assert list(arrays) == list(leaves)
     for name, array in arrays.items():
         assert check(name, array[None], leaves[name]).dtype == leaves[name].dtype
 
 
-def test_inputs_are_named_as_the_graph_names_them() -> None:
+def test_inputs_have_the_names_of_the_graph() -> None:
     assert list(inputs(from_gymnasium(MASKED))) == ["observation", "action_mask"]
     assert list(inputs(from_gymnasium(gym.Discrete(3)))) == ["observation"]
     assert list(inputs(from_gymnasium(EXAMPLES[-1]))) == [
@@ -52,7 +54,7 @@ def test_inputs_are_named_as_the_graph_names_them() -> None:
     ]
 
 
-def test_a_space_that_no_policy_can_take_is_refused() -> None:
+def test_an_unsupported_space_is_rejected() -> None:
     with pytest.raises(EnvironmentMismatch, match="Text"):
         from_gymnasium(gym.Text(5))
 
@@ -76,13 +78,13 @@ POSE = inputs(from_gymnasium(gym.Box(-1, 1, (2,))))["observation"]
         (np.array([[2]]), from_gymnasium(gym.MultiBinary(1)), "between 0 and 1"),
     ],
 )
-def test_an_array_that_does_not_fit_is_refused(array: np.ndarray, leaf: Box, message: str) -> None:
+def test_an_array_that_does_not_fit_is_rejected(array: np.ndarray, leaf: Box, message: str) -> None:
     with pytest.raises(ObservationError, match=message):
         check("observation", array, leaf)
 
 
 @given(st.integers(-128, 127))
-def test_whole_numbers_pass_in_any_dtype(value: int) -> None:
+def test_integers_are_accepted_in_any_dtype(value: int) -> None:
     for dtype in (np.int64, np.float64, np.int16):
         checked = check("observation", np.full((3, 6, 7, 2), value, dtype), BOARD)
         assert checked.dtype == np.int8
@@ -92,6 +94,6 @@ def test_whole_numbers_pass_in_any_dtype(value: int) -> None:
 @pytest.mark.parametrize(
     ("mask", "message"), [([[1, 2]], "other than 0 and 1"), ([[1, -1]], "other than"), ([[1, 0], [0, 0]], "no action")]
 )
-def test_an_illegal_mask_is_refused(mask: list[list[int]], message: str) -> None:
+def test_an_illegal_mask_is_rejected(mask: list[list[int]], message: str) -> None:
     with pytest.raises(IllegalMask, match=message):
         check_mask(np.array(mask, np.int8))

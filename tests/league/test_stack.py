@@ -3,7 +3,7 @@ from pathlib import Path
 from league.stack import VERIFIED, installed
 
 
-def test_the_verified_stack_is_what_the_constraints_pin() -> None:
+def test_the_verified_stack_equals_the_constraints() -> None:
     lines = Path("constraints.txt").read_text().splitlines()
     pins = dict(line.lower().split("==") for line in lines if "==" in line)
     assert {package: pins.get(package) for package in VERIFIED} == VERIFIED

@@ -4,17 +4,16 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from league.errors import NoStudio
-from league.games import Order
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.app import Server
-from serve_app.settings import ServeSettings
-from serve_app.studio import Answer
-from tests.serve_app.leagues import everything
-
-QUICK = ServeSettings(poll=0.01, poll_slowest=0.05, retry=0.05, heartbeat=0.2, max_body=64 * 1024, max_batch=8)
-"""A replica's settings for tests: it looks often, gives up early, and refuses soon."""
+from serve_app.runtime import haproxy
+from serve_app.runtime.launch import running
+from tests.support import tictactoe
+from tests.support.protocol_leagues import every_kind
+from tests.support.replicas import READ_ONLY, replica
+from tests.support.served_leagues import everything
+from tests.support.servers import NO_SHEDDING, RayServer, deploy_file, processes, serving
+from tests.support.waiting import until
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +23,7 @@ def anyio_backend() -> str:
 
 @pytest.fixture
 def registry(tmp_path: Path) -> Iterator[Registry]:
-    """Leagues of every kind, for a test that changes them."""
+    """Leagues of each kind, for a test that changes them."""
     registry = everything(Storage.at(tmp_path / "home"))
     yield registry
     registry.close()
@@ -39,30 +38,31 @@ def client(registry: Registry) -> Iterator[TestClient]:
 
 @pytest.fixture(scope="session")
 def storage(tmp_path_factory: pytest.TempPathFactory) -> Storage:
-    """Leagues of every kind, for tests that change nothing."""
+    """Leagues of each kind, for tests that do not change them."""
     storage = Storage.at(tmp_path_factory.mktemp("leagues"))
     everything(storage).close()
     return storage
 
 
 @pytest.fixture(scope="session")
-def unchanging(storage: Storage) -> Iterator[TestClient]:
-    """A replica's application for tests that change nothing."""
-    with replica(storage) as client:
+def read_only_client(storage: Storage) -> Iterator[TestClient]:
+    """A replica's application for tests that do not change its data."""
+    with replica(storage, READ_ONLY) as client:
         yield client
 
 
-def replica(storage: Storage, settings: ServeSettings = QUICK) -> TestClient:
-    """The application of a replica of its own; enter it to start."""
-    return TestClient(Server(Registry.open(storage), settings, "replica-1", studio=Closed()).application())
-
-
-class Closed:
-    """A studio where nobody is at work: what is asked of it waits in the registry."""
-
-    def look(self) -> None:
-        """Do nothing."""
-
-    async def ask(self, order: Order) -> Answer:
-        """Nobody is here."""
-        raise NoStudio("nobody is at work")
+@pytest.fixture(scope="session")
+def ray_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayServer]:
+    """Ray Serve, HAProxy and two replicas. One server for all tests that need a real one; keys are not required."""
+    registry = every_kind(Storage.at(tmp_path_factory.mktemp("served")))
+    tictactoe.playable(registry)
+    deploy = deploy_file(registry.storage.home, NO_SHEDDING)
+    (grpc_port,) = haproxy.free_ports(1, "127.0.0.1")
+    with pytest.MonkeyPatch.context() as environment:
+        # The default keeps a replica that stops open for 30 s.
+        environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
+        with running(registry.storage, replicas=2, grpc_port=grpc_port, insecure=True, deploy=deploy) as url:
+            until(lambda: serving(registry, 1) == 2)
+            yield RayServer(url, f"127.0.0.1:{grpc_port}", registry, deploy)
+    until(lambda: not processes(registry.storage, ""), seconds=10)  # no process outlives the server
+    registry.close()

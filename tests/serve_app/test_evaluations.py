@@ -1,4 +1,4 @@
-"""Evaluations over HTTP, as far as no game is played: what is asked, refused, listed and stopped."""
+"""Evaluations over HTTP, without playing games: submitted, rejected, listed and stopped."""
 
 from typing import Any
 
@@ -6,24 +6,25 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from serve_app.app import Server
-from tests.serve_app.conftest import QUICK, replica
-from tests.serve_app.leagues import promote
+from serve_app.app import Replica
+from tests.support.replicas import QUICK, replica
+from tests.support.served_leagues import promote
+from tests.support.waiting import until
 
 BOARD = "/v1/leagues/board/evaluations"
 
 
 @pytest.fixture
 def evaluator(client: TestClient, registry: Registry) -> TestClient:
-    """The client, with a key that may start evaluations but no night."""
+    """The client with a key that may start evaluations, but not nightly runs."""
     return with_key(client, registry, "bot", ["evaluate", "read"])
 
 
 def with_key(client: TestClient, registry: Registry, name: str, scopes: list[str]) -> TestClient:
-    _, token = registry.create_key(name, scopes)
+    _, token = registry.keys.create(name, scopes)
     client.headers["x-api-key"] = token
-    while client.get("/v1/leagues").status_code == 401 or client.post(BOARD, content=b"x").status_code == 401:
-        pass
+    until(lambda: client.get("/v1/leagues").status_code != 401)
+    until(lambda: client.post(BOARD, content=b"x").status_code != 401)
     return client
 
 
@@ -36,7 +37,7 @@ def start(
     return dict(reply.json())
 
 
-def test_what_is_asked_is_queued_with_references_that_stay(evaluator: TestClient, registry: Registry) -> None:
+def test_a_submitted_evaluation_is_queued_with_pinned_references(evaluator: TestClient, registry: Registry) -> None:
     contestants = ["board@champion", "board@3", "script:random"]
     reply = evaluator.post(
         BOARD,
@@ -46,7 +47,7 @@ def test_what_is_asked_is_queued_with_references_that_stay(evaluator: TestClient
     document = reply.json()
     promote(registry, "board", 2)
     assert (reply.status_code, reply.headers["location"]) == (202, f"{BOARD}/{document['evaluation']}")
-    assert document["asked"] == {
+    assert document["request"] == {
         "kind": "tournament",
         "schedule": "round_robin",
         "contestants": ["board@1", "board@3", "script:random"],
@@ -61,8 +62,8 @@ def test_what_is_asked_is_queued_with_references_that_stay(evaluator: TestClient
     assert evaluator.get(reply.headers["location"]).json() == document
 
 
-def test_by_default_every_version_plays(evaluator: TestClient) -> None:
-    assert start(evaluator, b"")["asked"]["contestants"] == ["board@1", "board@2", "board@3"]
+def test_by_default_all_versions_play(evaluator: TestClient) -> None:
+    assert start(evaluator, b"")["request"]["contestants"] == ["board@1", "board@2", "board@3"]
 
 
 @pytest.mark.parametrize(
@@ -93,33 +94,33 @@ def test_by_default_every_version_plays(evaluator: TestClient) -> None:
         (BOARD, b"nonsense", 400, "invalid_input"),
     ],
 )
-def test_what_cannot_be_played_is_refused_at_once(
+def test_invalid_evaluations_are_rejected_at_once(
     evaluator: TestClient, registry: Registry, path: str, body: Any, status: int, code: str
 ) -> None:
     error = start(evaluator, body, path=path, status=status)
     assert error["code"] == code
-    assert registry.evaluations("board") == []
+    assert registry.evaluations.newest("board") == []
 
 
 @pytest.mark.parametrize(
-    ("body", "words"),
+    ("body", "message"),
     [
         ({"kind": "yearly"}, "kind must be 'tournament' or 'nightly'"),
         ({"blocks": 0}, "blocks: Input should be greater than or equal to 1"),
         ({"contestants": ["memory@1"]}, "memory@1 is not a version of league board"),
     ],
 )
-def test_the_sentence_names_what_is_wrong(evaluator: TestClient, body: Any, words: str) -> None:
-    assert words in start(evaluator, body, status=400)["message"]
+def test_the_message_names_the_invalid_value(evaluator: TestClient, body: Any, message: str) -> None:
+    assert message in start(evaluator, body, status=400)["message"]
 
 
-def test_a_night_takes_a_key_that_may_promote(client: TestClient, registry: Registry) -> None:
+def test_a_nightly_run_requires_a_key_that_may_promote(client: TestClient, registry: Registry) -> None:
     promoter = with_key(client, registry, "owl", ["evaluate", "promote"])
-    assert start(promoter, {"kind": "nightly"})["asked"] == {"kind": "nightly"}
+    assert start(promoter, {"kind": "nightly"})["request"] == {"kind": "nightly"}
 
 
 @pytest.mark.parametrize(("scopes", "status"), [(["read", "act", "promote"], 403), (["read"], 403)])
-def test_other_keys_start_and_stop_nothing(
+def test_other_keys_cannot_start_or_stop_evaluations(
     client: TestClient, registry: Registry, scopes: list[str], status: int
 ) -> None:
     other = with_key(client, registry, "other", scopes)
@@ -127,21 +128,21 @@ def test_other_keys_start_and_stop_nothing(
     assert other.delete(f"{BOARD}/1").status_code == status
 
 
-def test_without_a_key_nothing_is_started_even_where_none_is_asked_for(client: TestClient) -> None:
+def test_evaluations_always_require_a_key(client: TestClient) -> None:
     assert client.get(BOARD).json() == {"league": "board", "evaluations": [], "next": None}
     assert start(client, status=401)["code"] == "unauthenticated"
     assert client.delete(f"{BOARD}/1").status_code == 401
 
 
-def test_a_call_that_comes_again_starts_nothing(evaluator: TestClient, registry: Registry) -> None:
+def test_a_repeated_call_starts_nothing(evaluator: TestClient, registry: Registry) -> None:
     first = start(evaluator, {"blocks": 4})
     assert start(evaluator, b' {"blocks" : 4} ') == first
     assert start(evaluator, {"blocks": 5}, status=409)["code"] == "idempotency_key_reused"
-    assert evaluator.post(BOARD, json={}).status_code == 400, "it takes a key for the call"
-    assert len(registry.evaluations("board")) == 1
+    assert evaluator.post(BOARD, json={}).status_code == 400, "an idempotency key is required"
+    assert len(registry.evaluations.newest("board")) == 1
 
 
-def test_they_are_listed_newest_first_by_pages(evaluator: TestClient) -> None:
+def test_evaluations_are_paginated_newest_first(evaluator: TestClient) -> None:
     numbers = [start(evaluator, call=str(i))["evaluation"] for i in range(5)]
     page = evaluator.get(BOARD, params={"limit": 2}).json()
     assert [each["evaluation"] for each in page["evaluations"]] == numbers[:2:-1]
@@ -151,11 +152,11 @@ def test_they_are_listed_newest_first_by_pages(evaluator: TestClient) -> None:
 
 
 @pytest.mark.parametrize("query", ["limit=0", "limit=101", "limit=x", "before=-1", "before=99999999999"])
-def test_a_page_that_is_none_is_refused(evaluator: TestClient, query: str) -> None:
+def test_an_invalid_page_is_rejected(evaluator: TestClient, query: str) -> None:
     assert evaluator.get(f"{BOARD}?{query}").json()["code"] == "invalid_input"
 
 
-def test_what_waits_is_stopped_at_once_and_twice_is_once(evaluator: TestClient) -> None:
+def test_a_queued_evaluation_is_stopped_at_once_and_once(evaluator: TestClient) -> None:
     number = start(evaluator)["evaluation"]
     stopped = evaluator.delete(f"{BOARD}/{number}")
     assert (stopped.status_code, stopped.json()["state"], stopped.json()["stopped_by"]) == (200, "stopped", "bot")
@@ -163,19 +164,19 @@ def test_what_waits_is_stopped_at_once_and_twice_is_once(evaluator: TestClient) 
 
 
 @pytest.mark.parametrize("number", ["7", "0", "x", "9" * 20, "-1"])
-def test_an_evaluation_that_is_not_there(evaluator: TestClient, number: str) -> None:
+def test_an_unknown_evaluation_is_reported(evaluator: TestClient, number: str) -> None:
     start(evaluator)
     for reply in (evaluator.get(f"{BOARD}/{number}"), evaluator.delete(f"{BOARD}/{number}")):
         assert (reply.status_code, reply.json()["code"]) == (404, "unknown_evaluation")
 
 
-def test_one_of_another_league_is_not_there(evaluator: TestClient) -> None:
+def test_an_evaluation_of_another_league_is_unknown(evaluator: TestClient) -> None:
     number = start(evaluator)["evaluation"]
     reply = evaluator.get(f"/v1/leagues/memory/evaluations/{number}")
     assert reply.json()["code"] == "unknown_evaluation"
 
 
-def test_more_than_a_server_takes_are_refused_until_there_is_room(registry: Registry) -> None:
+def test_the_number_of_active_evaluations_is_limited(registry: Registry) -> None:
     with replica(registry.storage, QUICK.model_copy(update={"max_evaluations": 2})) as client:
         evaluator = with_key(client, registry, "bot", ["evaluate", "read"])
         first = start(evaluator, call="a")["evaluation"]
@@ -185,15 +186,15 @@ def test_more_than_a_server_takes_are_refused_until_there_is_room(registry: Regi
         start(evaluator, call="c")
 
 
-def test_a_server_without_a_studio_says_so(registry: Registry) -> None:
-    server = Server(Registry.open(registry.storage), QUICK, "replica-1")
+def test_a_missing_evaluation_service_is_reported(registry: Registry) -> None:
+    server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
     with TestClient(server.application()) as client:
         evaluator = with_key(client, registry, "bot", ["evaluate", "read"])
         error = start(evaluator, status=503)
-        assert error["code"] == "no_studio"
+        assert error["code"] == "no_evaluation_service"
         assert evaluator.get(BOARD).json()["evaluations"] == []
 
 
-def test_how_many_wait_is_a_metric(evaluator: TestClient) -> None:
+def test_the_number_of_queued_evaluations_is_a_metric(evaluator: TestClient) -> None:
     start(evaluator)
     assert 'league_evaluations{league="board",replica="",state="queued"} 1.0' in evaluator.get("/metrics").text

@@ -1,4 +1,4 @@
-"""The real thing, hurt in every way: what callers see of it, and whether it recovers."""
+"""A real server with injected faults: their effect on clients, and recovery."""
 
 import asyncio
 import os
@@ -11,20 +11,22 @@ from pathlib import Path
 
 import httpx
 import pytest
-import yaml
 
 from benchmarks.load import post
 from benchmarks.slow_clients import slow_clients
 from league.client import Client
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.launch import DEPLOY_YAML, running
-from tests.serve_app.leagues import everything, promote
-from tests.serve_app.test_action import BOARD
-from tests.serve_app.test_server import ACTION, Load, load, processes, serving, until
+from serve_app.runtime.launch import running
+from tests.support.actions import BOARD
+from tests.support.served_leagues import everything, promote
+from tests.support.servers import ACTION, Load, deploy_file, load, processes, serving
+from tests.support.waiting import until
 
-SETTINGS = {"max_waiting": 8, "patience": 0.01}
-"""More than the clients here fill, less than those do who overrun it."""
+pytestmark = pytest.mark.slow
+
+SETTINGS = {"max_waiting": 8, "burst_tolerance": 0.01}
+"""More than these clients use, and less than those that exceed it."""
 
 
 @pytest.fixture(scope="module")
@@ -36,75 +38,72 @@ def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
 
 @pytest.fixture(scope="module")
 def url(registry: Registry) -> Iterator[str]:
-    document = yaml.safe_load(DEPLOY_YAML.read_text())
-    document["applications"][0]["args"] = SETTINGS
-    deploy = registry.storage.home / "deploy.yaml"
-    deploy.write_text(yaml.safe_dump(document))
+    deploy = deploy_file(registry.storage.home, SETTINGS)
     with running(registry.storage, replicas=2, deploy=deploy) as url:
         until(lambda: serving(registry, 1) == 2)
         yield url
 
 
 @contextmanager
-def under_load(url: str) -> Iterator[Load]:
-    """Our client calls without a pause; afterwards not one of its calls has failed."""
+def without_failures(url: str) -> Iterator[Load]:
+    """Call without pause while the context lasts, and assert that no call has failed."""
 
     def caller() -> Callable[[], int]:
         client = Client(url)
         return lambda: client.act("board", BOARD).version
 
-    with load(caller, callers=4) as seen:
-        more(seen)
-        yield seen
-        more(seen)
-    assert seen.failures == []
+    with load(caller, callers=4) as result:
+        wait_for_calls(result)
+        yield result
+        wait_for_calls(result)
+    assert result.failures == []
 
 
-def more(seen: Load, calls: int = 100) -> None:
-    """Wait until so many more calls were answered."""
-    before = seen.versions.total()
-    until(lambda: seen.versions.total() > before + calls)
+def wait_for_calls(result: Load, calls: int = 100) -> None:
+    """Wait for this number of further answers."""
+    previous = result.versions.total()
+    until(lambda: result.versions.total() > previous + calls)
 
 
 def kill(registry: Registry, name: str, count: int | None = None) -> None:
-    """Kill processes of the server; return when as many new ones are there."""
-    before = processes(registry.storage, name)
-    victims = before[:count]
+    """Kill processes of the server; return when they have been replaced."""
+    running_before = processes(registry.storage, name)
+    victims = running_before[:count]
     assert victims
     for pid in victims:
         os.kill(pid, signal.SIGKILL)
-    until(lambda: len(set(processes(registry.storage, name)) - set(victims)) >= len(before))
+    until(lambda: len(set(processes(registry.storage, name)) - set(victims)) >= len(running_before))
 
 
-def follows(registry: Registry, version: int) -> None:
-    """Every replica serves a version that is promoted now."""
+def promote_everywhere(registry: Registry, version: int) -> None:
+    """Promote a version and wait until all replicas serve it."""
     promote(registry, "board", version)
     until(lambda: serving(registry, version) >= 2)
 
 
 def haproxies(registry: Registry) -> list[int]:
-    """HAProxy itself, not Ray's process that starts it."""
+    """The HAProxy processes, without Ray's process that starts them."""
     return processes(registry.storage, "bin/haproxy")
 
 
-def test_a_replica(url: str, registry: Registry) -> None:
-    with under_load(url):
+def test_a_killed_replica_is_replaced(url: str, registry: Registry) -> None:
+    with without_failures(url):
         kill(registry, "PolicyServer", 1)
-        follows(registry, 2)
+        promote_everywhere(registry, 2)
 
 
-def test_the_controller(url: str, registry: Registry) -> None:
-    with under_load(url):
+def test_a_killed_controller_is_replaced(url: str, registry: Registry) -> None:
+    with without_failures(url):
         kill(registry, "ServeController")
 
 
-def test_haproxy_is_stood_in_for_and_replaced(url: str, registry: Registry) -> None:
+def test_a_killed_haproxy_has_a_stand_in_and_is_replaced(url: str, registry: Registry) -> None:
     victims = haproxies(registry)
-    with under_load(url) as seen:
+    with without_failures(url) as result:
         for pid in victims:
             os.kill(pid, signal.SIGKILL)
         until(lambda: set(haproxies(registry)) - set(victims))
-        more(seen)
+        wait_for_calls(result)
         until(lambda: any(b"standin.cfg" not in line for line in lines(haproxies(registry))))
         until(lambda: all(b"standin.cfg" not in line for line in lines(haproxies(registry))))
 
@@ -113,68 +112,68 @@ def lines(pids: list[int]) -> list[bytes]:
     return [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def test_a_database_that_is_moved_away(url: str, registry: Registry) -> None:
+def test_a_moved_database(url: str, registry: Registry) -> None:
     path = registry.storage.home / "league.db"
-    with under_load(url) as seen, httpx.Client(base_url=url) as client:
+    with without_failures(url) as result, httpx.Client(base_url=url) as client:
         path.rename(path.with_name("away"))
         until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")
         assert client.get("/v1/leagues").status_code == 503
         assert client.get("/v1/health/ready").status_code == 200
-        kill(registry, "PolicyServer", 1)  # the one that comes instead must not make a database of its own
-        more(seen, 500)
+        kill(registry, "PolicyServer", 1)  # its replacement must not create a new database
+        wait_for_calls(result, 500)
         assert not path.exists()
         path.with_name("away").rename(path)
-        follows(registry, 3)
+        promote_everywhere(registry, 3)
         until(lambda: client.get("/v1/leagues").status_code == 200)
         assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 3
 
 
-def test_a_database_that_is_locked(url: str, registry: Registry) -> None:
+def test_a_locked_database(url: str, registry: Registry) -> None:
     blocker = sqlite3.connect(registry.storage.home / "league.db", isolation_level=None)
-    with under_load(url) as seen, httpx.Client(base_url=url) as client:
+    with without_failures(url) as result, httpx.Client(base_url=url) as client:
         blocker.execute("BEGIN EXCLUSIVE")
-        more(seen, 500)
-        assert client.get("/v1/leagues").status_code == 200, "who reads waits for nobody"
+        wait_for_calls(result, 500)
+        assert client.get("/v1/leagues").status_code == 200, "readers do not wait"
         assert client.get("/v1/health/ready").status_code == 200
         blocker.execute("ROLLBACK")
-        follows(registry, 1)
+        promote_everywhere(registry, 1)
     blocker.close()
 
 
-def test_the_artefact_of_the_version_that_answers(url: str, registry: Registry) -> None:
-    follows(registry, 1)
+def test_the_artifacts_of_the_served_version(url: str, registry: Registry) -> None:
+    promote_everywhere(registry, 1)
     path = registry.artifacts.path("board", 1)
-    with under_load(url) as seen, httpx.Client(base_url=url) as client:
+    with without_failures(url) as result, httpx.Client(base_url=url) as client:
         shutil.copytree(path, path.with_name("kept"))
         shutil.rmtree(path)
-        more(seen, 500)
+        wait_for_calls(result, 500)
         assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 1
-        follows(registry, 2)
+        promote_everywhere(registry, 2)
         path.with_name("kept").rename(path)
-    assert seen.versions.keys() == {1, 2}
+    assert result.versions.keys() == {1, 2}
 
 
-def test_slow_clients_stop_nobody(url: str) -> None:
+def test_slow_clients_do_not_affect_others(url: str) -> None:
     request = post(f"{url}{ACTION}", httpx.Request("POST", url, json={"observation": BOARD}).content)
-    with under_load(url) as seen, slow_clients(f"{url}{ACTION}", request, 300):
-        more(seen, 1000)
+    with without_failures(url) as result, slow_clients(f"{url}{ACTION}", request, 300):
+        wait_for_calls(result, 1000)
 
 
-def test_who_comes_too_often_is_told_to_come_back(url: str) -> None:
-    """Batches cost the server more than the callers, so that a queue stands."""
-    seen: set[tuple[int, str | None]] = set()
+def test_excess_requests_are_asked_to_retry(url: str) -> None:
+    """Batches cost the server more than the clients, so that a queue persists."""
+    result: set[tuple[int, str | None]] = set()
 
-    async def overrun() -> None:
+    async def exceed() -> None:
         request = httpx.Request("POST", f"{url}{ACTION}", json={"observations": [BOARD] * 200})
         async with httpx.AsyncClient(timeout=30) as client:
 
-            async def insist() -> None:
-                while (429, "1") not in seen:
+            async def call_repeatedly() -> None:
+                while (429, "1") not in result:
                     reply = await client.send(request)
-                    seen.add((reply.status_code, reply.headers.get("retry-after")))
+                    result.add((reply.status_code, reply.headers.get("retry-after")))
 
-            await asyncio.gather(*(insist() for _ in range(48)))
+            await asyncio.gather(*(call_repeatedly() for _ in range(48)))
 
-    with under_load(url):
-        asyncio.run(asyncio.wait_for(overrun(), 60))
-    assert seen == {(200, None), (429, "1")}
+    with without_failures(url):
+        asyncio.run(asyncio.wait_for(exceed(), 60))
+    assert result == {(200, None), (429, "1")}

@@ -1,4 +1,4 @@
-"""Writing of a version, over HTTP."""
+"""Notes on versions, over HTTP."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -7,21 +7,21 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from tests.serve_app.conftest import replica
+from tests.support.replicas import replica
 
 NOTE = "/v1/leagues/board/versions/2/note"
 
 
 @pytest.fixture
 def writer(registry: Registry) -> Iterator[TestClient]:
-    """A client with a key that may write."""
-    _, token = registry.create_key("ada", ["read", "promote"])
+    """A client with a key that may write notes."""
+    _, token = registry.keys.create("ada", ["read", "promote"])
     with replica(registry.storage) as client:
         client.headers["authorization"] = f"Bearer {token}"
         yield client
 
 
-def test_it_is_in_the_versions_with_the_keys_name(writer: TestClient) -> None:
+def test_a_note_is_in_the_versions_with_the_name_of_the_key(writer: TestClient) -> None:
     reply = writer.put(NOTE, json={"note": "<b>bold</b>"})
     assert reply.status_code == 200
     written = reply.json()["note"]
@@ -33,7 +33,7 @@ def test_it_is_in_the_versions_with_the_keys_name(writer: TestClient) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "body", "status", "words"),
+    ("path", "body", "status", "message"),
     [
         (NOTE, {}, 400, "note"),
         (NOTE, {"note": 3}, 400, "note"),
@@ -47,23 +47,23 @@ def test_it_is_in_the_versions_with_the_keys_name(writer: TestClient) -> None:
         ("/v1/leagues/chess/versions/1/note", {"note": "x"}, 404, "chess"),
     ],
 )
-def test_what_cannot_be_written_is_refused(
-    writer: TestClient, registry: Registry, path: str, body: Any, status: int, words: str
+def test_an_invalid_note_is_rejected(
+    writer: TestClient, registry: Registry, path: str, body: Any, status: int, message: str
 ) -> None:
     reply = writer.put(path, json=body)
     assert reply.status_code == status, reply.text
-    assert words in reply.json()["message"]
-    assert [row.note for row in registry.versions("board")] == [None, None, None]
+    assert message in reply.json()["message"]
+    assert [row.note for row in registry.versions.all("board")] == [None, None, None]
 
 
-def test_it_is_signed_where_nothing_else_needs_a_key(client: TestClient, registry: Registry) -> None:
+def test_notes_always_require_a_key(client: TestClient, registry: Registry) -> None:
     assert client.put(NOTE, json={"note": "x"}).status_code == 401
-    assert registry.version("board", 2).note is None
+    assert registry.versions.get("board", 2).note is None
 
 
-def test_a_key_for_something_else_will_not_do(registry: Registry) -> None:
-    _, token = registry.create_key("reader", ["read", "act", "evaluate"])
+def test_a_key_with_other_scopes_is_rejected(registry: Registry) -> None:
+    _, token = registry.keys.create("reader", ["read", "act", "evaluate"])
     with replica(registry.storage) as client:
         reply = client.put(NOTE, json={"note": "x"}, headers={"authorization": f"Bearer {token}"})
     assert (reply.status_code, reply.json()["code"]) == (403, "forbidden")
-    assert registry.version("board", 2).note is None
+    assert registry.versions.get("board", 2).note is None

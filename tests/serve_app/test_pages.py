@@ -1,4 +1,4 @@
-"""The pages' files: open, sent as they are, and unable to load or run anything of others."""
+"""The files of the web pages: public, unmodified, and restricted to their own resources."""
 
 import re
 from pathlib import Path
@@ -8,21 +8,22 @@ from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
 from serve_app.routes.pages import FILES, MEDIA_TYPES
+from tests.support.waiting import until
 
-OURS = [path for path in FILES.iterdir() if path.suffix in MEDIA_TYPES]
-SCRIPTS = [path for path in OURS if path.suffix == ".js"]
+PAGE_FILES = [path for path in FILES.iterdir() if path.suffix in MEDIA_TYPES]
+SCRIPTS = [path for path in PAGE_FILES if path.suffix == ".js"]
 
 
 @pytest.mark.parametrize("path", ["/", "/leagues", "/leagues/board", "/leagues/nowhere/verdicts/%3Cb%3E"])
-def test_every_page_is_the_same_document(unchanging: TestClient, path: str) -> None:
-    reply = unchanging.get(path)
+def test_all_pages_are_the_same_document(read_only_client: TestClient, path: str) -> None:
+    reply = read_only_client.get(path)
     assert (reply.status_code, reply.headers["content-type"]) == (200, "text/html; charset=utf-8")
     assert reply.text == (FILES / "index.html").read_text()
 
 
-def test_its_rules_allow_nothing_from_elsewhere(unchanging: TestClient) -> None:
+def test_the_content_security_policy_allows_own_resources_only(read_only_client: TestClient) -> None:
     for path in ("/", "/pages/app.js"):
-        headers = unchanging.get(path).headers
+        headers = read_only_client.get(path).headers
         rules = dict(rule.split(" ", 1) for rule in headers["content-security-policy"].split("; "))
         assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == rules["frame-ancestors"] == "'none'"
         assert rules["script-src"] == rules["style-src"] == rules["connect-src"] == "'self'"
@@ -30,49 +31,48 @@ def test_its_rules_allow_nothing_from_elsewhere(unchanging: TestClient) -> None:
         assert (headers["x-content-type-options"], headers["referrer-policy"]) == ("nosniff", "no-referrer")
 
 
-@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
-def test_a_file_is_sent_as_it_is(unchanging: TestClient, path: Path) -> None:
+@pytest.mark.parametrize("path", PAGE_FILES, ids=lambda path: path.name)
+def test_a_file_is_sent_unmodified(read_only_client: TestClient, path: Path) -> None:
     for encoding in ("identity", "gzip"):
-        reply = unchanging.get(f"/pages/{path.name}", headers={"accept-encoding": encoding})
+        reply = read_only_client.get(f"/pages/{path.name}", headers={"accept-encoding": encoding})
         assert (reply.status_code, reply.content) == (200, path.read_bytes())
         assert reply.headers["content-type"].startswith(MEDIA_TYPES[path.suffix])
         is_zipped = encoding == "gzip" and path.stat().st_size >= 1024
         assert reply.headers.get("content-encoding") == ("gzip" if is_zipped else None)
 
 
-def test_a_copy_that_is_the_same_is_not_sent_again(unchanging: TestClient) -> None:
-    first = unchanging.get("/pages/app.js")
+def test_an_unmodified_file_is_not_sent_again(read_only_client: TestClient) -> None:
+    first = read_only_client.get("/pages/app.js")
     assert first.headers["cache-control"] == "no-cache"
-    again = unchanging.get("/pages/app.js", headers={"if-none-match": f'W/"other", {first.headers["etag"]}'})
-    assert (again.status_code, again.content) == (304, b"")
-    assert unchanging.get("/pages/app.js", headers={"if-none-match": 'W/"other"'}).status_code == 200
+    second = read_only_client.get("/pages/app.js", headers={"if-none-match": f'W/"other", {first.headers["etag"]}'})
+    assert (second.status_code, second.content) == (304, b"")
+    assert read_only_client.get("/pages/app.js", headers={"if-none-match": 'W/"other"'}).status_code == 200
 
 
 @pytest.mark.parametrize("file", ["nothing.js", "vendor", "vendor/LICENSE.htm", "../app.py", "..%2Fapp.py", ""])
-def test_nothing_else_is_sent(unchanging: TestClient, file: str) -> None:
-    reply = unchanging.get(f"/pages/{file}")
+def test_no_other_files_are_sent(read_only_client: TestClient, file: str) -> None:
+    reply = read_only_client.get(f"/pages/{file}")
     assert (reply.status_code, reply.json()["code"]) == (404, "unknown_path")
 
 
-def test_they_are_open_where_keys_are_needed(client: TestClient, registry: Registry) -> None:
-    registry.create_key("bot", ["read"])
-    while client.get("/v1/leagues").status_code != 401:
-        pass
+def test_pages_need_no_key(client: TestClient, registry: Registry) -> None:
+    registry.keys.create("bot", ["read"])
+    until(lambda: client.get("/v1/leagues").status_code == 401)
     for path in ("/", "/leagues/board", "/pages/app.js"):
         assert client.get(path).status_code == 200
     assert client.post("/leagues/board").status_code == 401
 
 
-def test_the_document_names_files_that_exist_and_runs_nothing_itself() -> None:
+def test_the_document_refers_to_existing_files_and_has_no_inline_code() -> None:
     text = (FILES / "index.html").read_text()
-    named = re.findall(r'(?:href|src)="/pages/([^"]+)"', text)
-    assert named
-    assert all((FILES / name).is_file() for name in named)
+    files = re.findall(r'(?:href|src)="/pages/([^"]+)"', text)
+    assert files
+    assert all((FILES / name).is_file() for name in files)
     assert not re.findall(r"<style|style=|\son\w+=|<script>", text)
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
-def test_scripts_turn_no_text_into_markup_and_import_what_exists(path: Path) -> None:
+def test_scripts_insert_no_html_and_import_existing_files(path: Path) -> None:
     text = path.read_text()
     assert not re.findall(
         r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|https?://", text
@@ -81,7 +81,7 @@ def test_scripts_turn_no_text_into_markup_and_import_what_exists(path: Path) -> 
         assert (path.parent / name).is_file(), name
 
 
-def test_what_is_vendored_has_its_licence() -> None:
-    told = (FILES / "vendor" / "README.md").read_text()
+def test_vendored_files_have_their_licence() -> None:
+    readme = (FILES / "vendor" / "README.md").read_text()
     for path in (FILES / "vendor").iterdir():
-        assert path.name == "README.md" or f"`{path.name}`" in told
+        assert path.name == "README.md" or f"`{path.name}`" in readme

@@ -1,4 +1,4 @@
-"""Changing what is served, over HTTP."""
+"""Promotions and rollbacks over HTTP."""
 
 import json
 from collections.abc import Iterator
@@ -10,8 +10,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from tests.serve_app.conftest import replica
-from tests.serve_app.leagues import promote
+from tests.support.replicas import replica
+from tests.support.served_leagues import promote
 
 CHAMPION = "/v1/leagues/board/aliases/champion"
 ROLLBACK = "/v1/leagues/board/rollback"
@@ -20,7 +20,7 @@ ROLLBACK = "/v1/leagues/board/rollback"
 @pytest.fixture
 def promoter(registry: Registry) -> Iterator[TestClient]:
     """A client with a key that may promote."""
-    _, token = registry.create_key("release-bot", ["promote"])
+    _, token = registry.keys.create("release-bot", ["promote"])
     with replica(registry.storage) as client:
         client.headers["authorization"] = f"Bearer {token}"
         yield client
@@ -33,7 +33,7 @@ def change(client: TestClient, path: str, key: str, body: Any = None, status: in
     return reply.json()
 
 
-def test_a_promotion_is_in_the_history_with_the_keys_name(promoter: TestClient, registry: Registry) -> None:
+def test_a_promotion_is_in_the_history_with_the_name_of_the_key(promoter: TestClient, registry: Registry) -> None:
     event = change(promoter, CHAMPION, "a", {"version": 2, "expected": 1, "reason": "it is stronger"})
     assert event.pop("at")
     assert event.pop("event")
@@ -47,48 +47,48 @@ def test_a_promotion_is_in_the_history_with_the_keys_name(promoter: TestClient, 
         "reason": "it is stronger",
         "verdict": None,
     }
-    newest = registry.history("board")[0]
+    newest = registry.aliases.history("board")[0]
     assert (newest.version, newest.actor, newest.reason) == (2, "release-bot", "it is stronger")
 
 
-def test_a_rollback_returns_to_the_champion_before(promoter: TestClient, registry: Registry) -> None:
+def test_a_rollback_returns_to_the_previous_champion(promoter: TestClient, registry: Registry) -> None:
     promote(registry, "board", 2)
     event = change(promoter, ROLLBACK, "a")
     assert (event["kind"], event["version"], event["previous"]) == ("rollback", 1, 2)
 
 
-def test_a_call_that_comes_again_changes_nothing(promoter: TestClient, registry: Registry) -> None:
+def test_a_repeated_call_changes_nothing(promoter: TestClient, registry: Registry) -> None:
     promote(registry, "board", 2)
     promote(registry, "board", 3)
     first = change(promoter, ROLLBACK, "a", {"reason": "it lost"})
     assert change(promoter, ROLLBACK, "a", b' { "reason" : "it lost" } ') == first
-    assert registry.aliases("board")["champion"] == 2
+    assert registry.aliases.current("board")["champion"] == 2
     error = change(promoter, ROLLBACK, "a", {"reason": "it lost again"}, 409)
     assert error["code"] == "idempotency_key_reused"
     assert change(promoter, CHAMPION, "a", {"version": 3}, 409)["code"] == "idempotency_key_reused"
-    assert registry.aliases("board")["champion"] == 2
+    assert registry.aliases.current("board")["champion"] == 2
 
 
-def test_of_many_at_once_one_is_applied(promoter: TestClient, registry: Registry) -> None:
+def test_concurrent_calls_are_applied_once(promoter: TestClient, registry: Registry) -> None:
     for version in (2, 3):
         promote(registry, "board", version)
     with ThreadPoolExecutor(8) as pool:
         events = list(pool.map(lambda _: change(promoter, ROLLBACK, "a")["event"], range(8)))
     assert len(set(events)) == 1
-    assert registry.aliases("board")["champion"] == 2
+    assert registry.aliases.current("board")["champion"] == 2
 
 
-def test_expectations_are_held(promoter: TestClient, registry: Registry) -> None:
+def test_the_expected_version_is_checked(promoter: TestClient, registry: Registry) -> None:
     assert change(promoter, CHAMPION, "a", {"version": 2, "expected": 3}, 409)["code"] == "alias_moved"
     assert change(promoter, CHAMPION, "b", {"version": 2, "expected": None}, 409)["code"] == "alias_moved"
     path = "/v1/leagues/board/aliases/candidate"
     assert change(promoter, path, "c", {"version": 3, "expected": None})["previous"] is None
-    assert registry.aliases("board") == {"champion": 1, "candidate": 3}
+    assert registry.aliases.current("board") == {"champion": 1, "candidate": 3}
     change(promoter, ROLLBACK, "d", status=409)
 
 
 @pytest.mark.parametrize(
-    ("path", "body", "status", "words"),
+    ("path", "body", "status", "message"),
     [
         (CHAMPION, {}, 400, "version"),
         (CHAMPION, {"version": "2"}, 400, "version"),
@@ -107,29 +107,29 @@ def test_expectations_are_held(promoter: TestClient, registry: Registry) -> None
         ("/v1/leagues/board/aliases/A%00", {"version": 2}, 400, "alias"),
     ],
 )
-def test_what_cannot_be_done_changes_nothing(
-    promoter: TestClient, registry: Registry, path: str, body: Any, status: int, words: str
+def test_invalid_changes_are_rejected(
+    promoter: TestClient, registry: Registry, path: str, body: Any, status: int, message: str
 ) -> None:
-    before = registry.history("board")
-    assert words in change(promoter, path, "a", body, status)["message"]
-    assert registry.history("board") == before
+    history = registry.aliases.history("board")
+    assert message in change(promoter, path, "a", body, status)["message"]
+    assert registry.aliases.history("board") == history
 
 
 @pytest.mark.parametrize("key", [None, "", "x" * 256, "a\tb", "é"])
-def test_a_call_needs_a_key_of_its_own(promoter: TestClient, registry: Registry, key: str | None) -> None:
+def test_a_call_requires_an_idempotency_key(promoter: TestClient, registry: Registry, key: str | None) -> None:
     headers = [] if key is None else [(b"idempotency-key", key.encode())]
     reply = promoter.post(CHAMPION, json={"version": 2}, headers=headers)  # type: ignore[arg-type]
     assert (reply.status_code, reply.json()["code"]) == (400, "invalid_input")
     assert "Idempotency-Key" in reply.json()["message"]
-    assert registry.aliases("board")["champion"] == 1
+    assert registry.aliases.current("board")["champion"] == 1
 
 
-def test_nobody_changes_anything_without_a_key(client: TestClient, registry: Registry) -> None:
+def test_changes_always_require_a_key(client: TestClient, registry: Registry) -> None:
     def attempt(**headers: str) -> httpx.Response:
         return client.post(ROLLBACK, json={}, headers={"idempotency-key": "a"} | headers)
 
-    assert client.get("/v1/leagues").status_code == 200, "the doors are open otherwise"
+    assert client.get("/v1/leagues").status_code == 200, "other routes need no key"
     reply = attempt()
     assert (reply.status_code, reply.json()["code"]) == (401, "unauthenticated")
     assert "league keys create NAME --scope promote" in reply.json()["message"]
-    assert registry.aliases("board")["champion"] == 1
+    assert registry.aliases.current("board")["champion"] == 1

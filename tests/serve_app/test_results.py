@@ -1,4 +1,4 @@
-"""What pages read of a league: standings, verdicts, matches, training runs, the history of its aliases."""
+"""The data for web pages of a league: leaderboard, verdicts, matches, training runs, alias history."""
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -9,18 +9,17 @@ import pytest
 from jsonschema import Draft202012Validator
 from starlette.testclient import TestClient
 
-from evaluation.snapshots import refresh
+from evaluation.service.snapshots import refresh
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.openapi.document import document
-from tests.evaluation import examples
-from tests.evaluation.pages import leagues
-from tests.serve_app.conftest import QUICK, replica
-from tests.serve_app.leagues import everything, promote
-from tests.serve_app.results import LOST, PENDING, RANKED, SCHEDULE, WON, record
+from tests.support import reported_league, tictactoe
+from tests.support.match_results import LOST, PENDING, RANKED, SCHEDULE, WON, record
+from tests.support.replicas import QUICK, replica
+from tests.support.served_leagues import everything, promote
 
 BOARD = "/v1/leagues/board"
-DESCRIBED = document(QUICK, [])
+OPENAPI = document(QUICK, [])
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +38,10 @@ def reader(storage: Storage) -> Iterator[TestClient]:
 
 
 def get(reader: TestClient, path: str, schema: str, **query: Any) -> dict[str, Any]:
-    """What is answered, which is as it is described."""
+    """A response, validated with its schema."""
     reply = reader.get(path, params=query)
     assert reply.status_code == 200, reply.text
-    described = {"$ref": f"#/components/schemas/{schema}", "components": DESCRIBED["components"]}
+    described = {"$ref": f"#/components/schemas/{schema}", "components": OPENAPI["components"]}
     Draft202012Validator(described).validate(reply.json())
     return dict(reply.json())
 
@@ -57,26 +56,26 @@ def pages(reader: TestClient, path: str, schema: str, name: str, **query: Any) -
     return found
 
 
-def test_the_leagues_say_what_goes_on_in_each(reader: TestClient) -> None:
-    leagues = {each["league"]: each for each in get(reader, "/v1/leagues", "Leagues")["leagues"]}
-    board = leagues["board"]
+def test_leagues_have_a_summary_of_their_activity(reader: TestClient) -> None:
+    reported_league = {each["league"]: each for each in get(reader, "/v1/leagues", "Leagues")["leagues"]}
+    board = reported_league["board"]
     assert (board["champion"], board["versions"], board["games"], board["matches"]) == (2, 3, 12, 6)
     verdict = {name: board["last_verdict"][name] for name in ("verdict", "outcome", "promoted", "candidate")}
     assert verdict == {"verdict": WON, "outcome": "promote", "promoted": True, "candidate": "board@2"}
     assert (board["running_evaluations"], board["running_runs"], board["requests"]) == (0, 1, 0)
-    empty = leagues["empty"]
+    empty = reported_league["empty"]
     assert (empty["champion"], empty["versions"], empty["games"], empty["last_verdict"]) == (None, 0, None, None)
 
 
-def test_leagues_are_read_by_pages(reader: TestClient) -> None:
-    every = [each["league"] for each in get(reader, "/v1/leagues", "Leagues")["leagues"]]
-    split = pages(reader, "/v1/leagues", "Leagues", "leagues", limit=3)
-    assert [len(page) for page in split] == [3, 3, 1]
-    assert [each["league"] for page in split for each in page] == every
+def test_leagues_are_paginated(reader: TestClient) -> None:
+    expected = [each["league"] for each in get(reader, "/v1/leagues", "Leagues")["leagues"]]
+    found = pages(reader, "/v1/leagues", "Leagues", "leagues", limit=3)
+    assert [len(page) for page in found] == [3, 3, 1]
+    assert [each["league"] for page in found for each in page] == expected
     assert reader.get("/v1/leagues", params={"limit": 0}).json()["code"] == "invalid_input"
 
 
-def test_a_league_says_when_its_standings_were_computed(reader: TestClient) -> None:
+def test_a_league_has_the_time_of_its_standings(reader: TestClient) -> None:
     board = get(reader, BOARD, "League")
     assert (board["summary"]["games"], board["up_to_date"]) == (12, True)
     assert datetime.fromisoformat(board["computed_at"]) <= datetime.now(UTC)
@@ -85,41 +84,41 @@ def test_a_league_says_when_its_standings_were_computed(reader: TestClient) -> N
     assert (memory["summary"], memory["computed_at"], memory["up_to_date"]) == (None, None, False)
 
 
-def test_what_was_played_since_is_told(client: TestClient, registry: Registry) -> None:
+def test_changes_since_then_are_indicated(client: TestClient, registry: Registry) -> None:
     record(registry)
     assert client.get(BOARD).json()["up_to_date"]
     promote(registry, "board", 3)
     assert not client.get(BOARD).json()["up_to_date"]
 
 
-def test_standings_are_read_by_place(reader: TestClient) -> None:
-    page = get(reader, f"{BOARD}/standings", "Standings", limit=3)
-    assert [(each["rank"], each["ref"]) for each in page["standings"]] == list(enumerate(RANKED[:3], 1))
+def test_standings_are_paginated_by_rank(reader: TestClient) -> None:
+    page = get(reader, f"{BOARD}/leaderboard", "Leaderboard", limit=3)
+    assert [(each["rank"], each["ref"]) for each in page["leaderboard"]] == list(enumerate(RANKED[:3], 1))
     assert (page["total"], page["sides"], page["side"]) == (4, ["player_0", "player_1"], None)
-    rest = get(reader, f"{BOARD}/standings", "Standings", limit=3, offset=3)
-    assert [(each["rank"], each["ref"]) for each in rest["standings"]] == [(4, RANKED[3])]
-    assert get(reader, f"{BOARD}/standings", "Standings", offset=9)["standings"] == []
+    rest = get(reader, f"{BOARD}/leaderboard", "Leaderboard", limit=3, offset=3)
+    assert [(each["rank"], each["ref"]) for each in rest["leaderboard"]] == [(4, RANKED[3])]
+    assert get(reader, f"{BOARD}/leaderboard", "Leaderboard", offset=9)["leaderboard"] == []
 
 
-def test_standings_on_one_side(reader: TestClient) -> None:
-    page = get(reader, f"{BOARD}/standings", "Standings", side="player_0")
-    assert ([each["ref"] for each in page["standings"]], page["total"]) == (list(RANKED[:2]), 2)
-    assert get(reader, f"{BOARD}/standings", "Standings", side="player_1")["total"] == 0
+def test_standings_of_one_side(reader: TestClient) -> None:
+    page = get(reader, f"{BOARD}/leaderboard", "Leaderboard", side="player_0")
+    assert ([each["ref"] for each in page["leaderboard"]], page["total"]) == (list(RANKED[:2]), 2)
+    assert get(reader, f"{BOARD}/leaderboard", "Leaderboard", side="player_1")["total"] == 0
 
 
-def test_where_nothing_was_computed_there_is_nothing(reader: TestClient) -> None:
+def test_without_snapshots_standings_are_empty(reader: TestClient) -> None:
     memory = "/v1/leagues/memory"
-    standings = get(reader, f"{memory}/standings", "Standings")
-    assert (standings["computed_at"], standings["standings"], standings["sides"]) == (None, [], [])
-    refused = reader.get(f"{memory}/standings", params={"side": "agent_shared"})
-    assert "no side of memory has standings of its own" in refused.json()["message"]
+    leaderboard = get(reader, f"{memory}/leaderboard", "Leaderboard")
+    assert (leaderboard["computed_at"], leaderboard["leaderboard"], leaderboard["sides"]) == (None, [], [])
+    rejected = reader.get(f"{memory}/leaderboard", params={"side": "agent_shared"})
+    assert "no side of memory has its own leaderboard" in rejected.json()["message"]
     assert get(reader, f"{memory}/payoff", "PayoffTable")["payoff"] is None
     assert get(reader, f"{memory}/ratings", "Ratings")["versions"] == []
     for name, schema in (("verdicts", "Verdicts"), ("matches", "Matches"), ("runs", "Runs")):
         assert get(reader, f"{memory}/{name}", schema)[name] == []
 
 
-def test_payoff_and_ratings_are_what_was_computed(reader: TestClient) -> None:
+def test_payoff_and_ratings_are_those_of_the_snapshots(reader: TestClient) -> None:
     assert get(reader, f"{BOARD}/payoff", "PayoffTable")["payoff"]["score"] == [[None, 0.75], [0.25, None]]
     assert [each["number"] for each in get(reader, f"{BOARD}/ratings", "Ratings")["versions"]] == [1, 2, 3]
 
@@ -138,7 +137,7 @@ def test_verdicts_are_listed_newest_first(reader: TestClient) -> None:
     assert [[each["verdict"] for each in page] for page in split] == [[PENDING, WON], [LOST]]
 
 
-def test_a_verdict_has_its_curve_once_that_is_computed(reader: TestClient) -> None:
+def test_a_verdict_has_its_curve_once_computed(reader: TestClient) -> None:
     won = get(reader, f"{BOARD}/verdicts/{WON}", "Verdict")
     assert (won["outcome"], won["curve"][-1], won["counts"][-1]) == ("promote", [41, 0.07 * 41], 15)
     assert won["reason"] == "It is the stronger one."
@@ -146,17 +145,17 @@ def test_a_verdict_has_its_curve_once_that_is_computed(reader: TestClient) -> No
     assert (pending["outcome"], pending["computed_at"], pending["reason"]) == ("open", None, None)
 
 
-def test_a_reason_that_was_true_before_the_verdict_fell_is_not_told(reader: TestClient) -> None:
+def test_an_outdated_reason_of_a_verdict_is_omitted(reader: TestClient) -> None:
     lost = get(reader, f"{BOARD}/verdicts/{LOST}", "Verdict")
     assert (lost["outcome"], lost["reason"]) == ("reject", None)
     (verdicts,) = pages(reader, f"{BOARD}/verdicts", "Verdicts", "verdicts")
     assert verdicts[2]["reason"] is None
 
 
-def test_matches_are_listed_as_they_were_played_newest_first(reader: TestClient) -> None:
-    every = pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=3)
-    assert [len(page) for page in every] == [3, 3, 1]
-    matches = [match for page in every for match in page]
+def test_matches_are_listed_newest_first(reader: TestClient) -> None:
+    pages_of_matches = pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=3)
+    assert [len(page) for page in pages_of_matches] == [3, 3, 1]
+    matches = [match for page in pages_of_matches for match in page]
     assert [match["match"] for match in matches[1:]] == [SCHEDULE.match_id(at) for at in reversed(range(6))]
     assert (matches[0]["kind"], matches[0]["counts"]) == ("gauntlet", False)
     newest = matches[1]
@@ -165,9 +164,9 @@ def test_matches_are_listed_as_they_were_played_newest_first(reader: TestClient)
     assert (matches[2]["returns"], matches[2]["counts"]) == ([1.25, -0.75], True)
 
 
-def test_matches_of_two_are_found_whoever_is_named_first(reader: TestClient) -> None:
-    ways = [{"first": "board@1", "second": "board@2"}, {"first": "board@2", "second": "board@1"}]
-    found = [pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=2, **way) for way in ways]
+def test_matches_of_a_pair_are_listed_in_either_order(reader: TestClient) -> None:
+    queries = [{"first": "board@1", "second": "board@2"}, {"first": "board@2", "second": "board@1"}]
+    found = [pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=2, **way) for way in queries]
     assert found[0] == found[1]
     assert [match["contestants"] for page in found[0] for match in page] == [["board@1", "board@2"]] * 3
     assert get(reader, f"{BOARD}/matches", "Matches", first="board@1", second="nobody")["matches"] == []
@@ -185,9 +184,9 @@ def test_a_match_has_its_games(reader: TestClient) -> None:
 
 
 def test_runs_are_listed_newest_first(reader: TestClient) -> None:
-    every = pages(reader, f"{BOARD}/runs", "Runs", "runs", limit=1)
-    assert [[each["run"] for each in page] for page in every] == [["second"], ["first"]]
-    first = every[1][0]
+    pages_of_runs = pages(reader, f"{BOARD}/runs", "Runs", "runs", limit=1)
+    assert [[each["run"] for each in page] for page in pages_of_runs] == [["second"], ["first"]]
+    first = pages_of_runs[1][0]
     assert (first["state"], first["error"], first["steps"]) == ("failed", "the environment raised", 200)
     assert first["curves"] == {"return": 0.2, "shared/entropy": 1.5}
 
@@ -198,7 +197,7 @@ def test_a_run_has_its_curves(reader: TestClient) -> None:
     assert (run["settings"], run["seconds"], run["target"], run["minutes"]) == ({"lr": 0.001}, 20.0, 1000, None)
 
 
-def test_the_history_says_who_was_champion_when(reader: TestClient, storage: Storage) -> None:
+def test_the_history_has_the_champion_at_each_time(reader: TestClient, storage: Storage) -> None:
     path = f"{BOARD}/aliases/champion/history"
     (events,) = pages(reader, path, "History", "history")
     assert [(event["version"], event["verdict"], event["actor"]) for event in events] == [
@@ -218,50 +217,50 @@ def test_the_history_says_who_was_champion_when(reader: TestClient, storage: Sto
     assert get(reader, f"{BOARD}/aliases/candidate/history", "History")["history"] == []
 
 
-def test_versions_are_read_by_pages_newest_first(reader: TestClient) -> None:
-    every = pages(reader, f"{BOARD}/versions", "Versions", "versions", limit=2)
-    assert [[each["version"] for each in page] for page in every] == [[3, 2], [1]]
+def test_versions_are_paginated_newest_first(reader: TestClient) -> None:
+    pages_of_versions = pages(reader, f"{BOARD}/versions", "Versions", "versions", limit=2)
+    assert [[each["version"] for each in page] for page in pages_of_versions] == [[3, 2], [1]]
     assert [each["version"] for each in get(reader, f"{BOARD}/versions", "Versions")["versions"]] == [1, 2, 3]
 
 
-def test_there_are_no_more_rows_than_the_largest_page(reader: TestClient) -> None:
-    for name in ("standings", "verdicts", "matches", "runs", "aliases/champion/history"):
+def test_the_size_of_a_page_is_limited(reader: TestClient) -> None:
+    for name in ("leaderboard", "verdicts", "matches", "runs", "aliases/champion/history"):
         assert reader.get(f"{BOARD}/{name}", params={"limit": 200}).status_code == 200
         assert reader.get(f"{BOARD}/{name}", params={"limit": 201}).json()["code"] == "invalid_input"
 
 
 @pytest.mark.parametrize(
-    ("query", "words"),
+    ("query", "message"),
     [
-        ("standings?limit=0", "limit must be a number from 1 to 200, got '0'"),
-        ("standings?offset=-1", "offset must be a number from 0"),
-        ("standings?side=nobody", "side must be one of player_0, player_1, got 'nobody'"),
-        ("standings?side=", "side must be 1 to 300 printable characters"),
+        ("leaderboard?limit=0", "limit must be an integer from 1 to 200, got '0'"),
+        ("leaderboard?offset=-1", "offset must be an integer from 0"),
+        ("leaderboard?side=nobody", "side must be one of player_0, player_1, got 'nobody'"),
+        ("leaderboard?side=", "side must be 1 to 300 printable characters"),
         ("verdicts?limit=x", "limit"),
         ("verdicts?before=nothing", "before: league board has no verdict 'nothing'"),
         ("matches?before=nothing", "before: league board has no match 'nothing'"),
         ("matches?before=%00", "before must be 1 to 300 printable characters"),
-        ("matches?first=board@1", "first and second go together"),
+        ("matches?first=board@1", "first and second must be given together"),
         ("runs?before=nothing", "before: league board has no training run 'nothing'"),
-        ("versions?before=x", "before must be a number from 1"),
-        ("aliases/champion/history?before=0", "before must be a number from 1"),
-        ("aliases/champion/history?at=yesterday", "at must be an instant with its time zone"),
-        ("aliases/champion/history?at=2026-03-03T14:00:00", "at must be an instant with its time zone"),
-        ("aliases/champion/history?at=0001-01-01T00:00:00%2B05:00", "at must be an instant"),
-        ("aliases/champion/history?at=2026-03-03T14:00:00Z&before=3", "contradict"),
+        ("versions?before=x", "before must be an integer from 1"),
+        ("aliases/champion/history?before=0", "before must be an integer from 1"),
+        ("aliases/champion/history?at=yesterday", "at must be a time with a time zone"),
+        ("aliases/champion/history?at=2026-03-03T14:00:00", "at must be a time with a time zone"),
+        ("aliases/champion/history?at=0001-01-01T00:00:00%2B05:00", "at must be a time"),
+        ("aliases/champion/history?at=2026-03-03T14:00:00Z&before=3", "mutually exclusive"),
         ("aliases/7/history", "7"),
     ],
 )
-def test_what_cannot_be_asked_for_is_refused_in_a_sentence(reader: TestClient, query: str, words: str) -> None:
+def test_invalid_queries_are_rejected(reader: TestClient, query: str, message: str) -> None:
     reply = reader.get(f"{BOARD}/{query}")
     assert reply.status_code == 400, reply.text
-    assert words in reply.json()["message"]
+    assert message in reply.json()["message"]
 
 
 @pytest.mark.parametrize(
     ("path", "code"),
     [
-        ("/v1/leagues/nobody/standings", "unknown_league"),
+        ("/v1/leagues/nobody/leaderboard", "unknown_league"),
         ("/v1/leagues/nobody/payoff", "unknown_league"),
         ("/v1/leagues/nobody/ratings", "unknown_league"),
         ("/v1/leagues/nobody/verdicts", "unknown_league"),
@@ -281,7 +280,7 @@ def test_what_cannot_be_asked_for_is_refused_in_a_sentence(reader: TestClient, q
         (f"{BOARD}/runs/%00", "unknown_run"),
     ],
 )
-def test_what_is_not_there(reader: TestClient, path: str, code: str) -> None:
+def test_unknown_resources_are_reported(reader: TestClient, path: str, code: str) -> None:
     reply = reader.get(path)
     assert (reply.status_code, reply.json()["code"]) == (404, code)
 
@@ -289,21 +288,21 @@ def test_what_is_not_there(reader: TestClient, path: str, code: str) -> None:
 @pytest.mark.parametrize(
     "path", [f"verdicts/{WON}", f"matches/{SCHEDULE.id}/0", "runs/first"], ids=["verdict", "match", "run"]
 )
-def test_what_is_another_leagues_is_not_shown(reader: TestClient, path: str) -> None:
-    """A key may be for one league alone."""
+def test_resources_of_another_league_are_not_shown(reader: TestClient, path: str) -> None:
+    """A key may be limited to one league."""
     reply = reader.get(f"/v1/leagues/memory/{path}")
     assert reply.status_code == 404, reply.text
 
 
-def test_what_a_night_brings_and_the_studio_computes_of_it_is_as_described(tmp_path: Path) -> None:
-    with leagues.of_a_night(tmp_path / "home") as registry:
-        refresh(registry, examples.LEAGUE)
-        verdicts = [row.id for row in registry.verdicts(examples.LEAGUE)]
+def test_responses_after_a_nightly_run_follow_the_document(tmp_path: Path) -> None:
+    with reported_league.league_after_nightly(tmp_path / "home") as registry:
+        refresh(registry, tictactoe.LEAGUE)
+        verdicts = [row.id for row in registry.verdicts.all(tictactoe.LEAGUE)]
         storage = registry.storage
-    league = f"/v1/leagues/{examples.LEAGUE}"
+    league = f"/v1/leagues/{tictactoe.LEAGUE}"
     with replica(storage) as night:
         assert get(night, league, "League")["up_to_date"]
-        assert get(night, f"{league}/standings", "Standings")["total"] > 2
+        assert get(night, f"{league}/leaderboard", "Leaderboard")["total"] > 2
         assert get(night, f"{league}/payoff", "PayoffTable")["payoff"]["contestants"]
         assert get(night, f"{league}/ratings", "Ratings")["versions"]
         assert any(event["verdict"] for event in get(night, f"{league}/aliases/champion/history", "History")["history"])

@@ -1,7 +1,7 @@
-"""Nothing that comes from a checkpoint or a request is run: traps of every kind are served and asked, none goes off.
+"""Content of checkpoints and requests is never executed: traps of each kind are served and sent, and none is triggered.
 
-CPython announces what an unpickler looks up, and each process that is started, to an audit hook (PEP 578). Nothing else
-of this test's process unpickles meanwhile.
+CPython reports lookups of unpicklers and new processes to an audit hook (PEP 578). Nothing else in this process
+unpickles in the meantime.
 """
 
 import base64
@@ -18,7 +18,6 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic
 
 import numpy as np
 import onnx
@@ -27,14 +26,15 @@ from onnx import TensorProto, helper
 from sqlalchemy import update
 from starlette.testclient import TestClient
 
-from league.registry.manifest import MANIFEST, Manifest
 from league.registry.registry import Registry
-from league.registry.tables import Version
-from serve_app.stream_framing import FRAMING, REQUEST
-from tests.league.policies.graphs import masked_mlp
-from tests.league.policies.test_probes import probes
-from tests.serve_app.leagues import promote, publish
-from tests.serve_app.test_action import BOARD, act
+from league.registry.storage.manifest import MANIFEST, Manifest
+from league.registry.storage.tables import VersionTable
+from serve_app.inference.stream_codec import FRAMING, REQUEST
+from tests.support.actions import BOARD, act
+from tests.support.graphs import masked_mlp
+from tests.support.probes import probes
+from tests.support.served_leagues import promote, publish
+from tests.support.waiting import until
 
 SUSPICIOUS = frozenset(("pickle.find_class", "os.system", "os.exec", "subprocess.Popen", "os.posix_spawn"))
 _watched: list[str] | None = None
@@ -49,7 +49,7 @@ sys.addaudithook(_hook)
 
 
 @contextmanager
-def nothing_runs() -> Iterator[None]:
+def nothing_executed() -> Iterator[None]:
     """Fail if anything is unpickled, or any process is started, while the context lasts."""
     global _watched
     _watched = []
@@ -61,7 +61,7 @@ def nothing_runs() -> Iterator[None]:
 
 
 class Trap:
-    """Unpickling it writes a file."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -77,18 +77,18 @@ def mark(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def trap(mark: Path) -> bytes:
-    """A pickle that goes off when it is loaded."""
+    """A pickle that triggers the trap when it is loaded."""
     return pickle.dumps(Trap(mark))
 
 
-def test_the_trap_would_go_off(trap: bytes, mark: Path) -> None:
-    with pytest.raises(AssertionError, match=r"pickle\.find_class"), nothing_runs():
+def test_loading_the_pickle_triggers_the_trap(trap: bytes, mark: Path) -> None:
+    with pytest.raises(AssertionError, match=r"pickle\.find_class"), nothing_executed():
         pickle.loads(trap)
     assert mark.exists()
 
 
 def torch_checkpoint(trap: bytes) -> bytes:
-    """What `torch.load` takes: a ZIP file with a pickle inside."""
+    """The format of `torch.load`: a ZIP file with a pickle."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("archive/data.pkl", trap)
@@ -97,7 +97,7 @@ def torch_checkpoint(trap: bytes) -> bytes:
 
 
 def tar_bomb(trap: bytes) -> bytes:
-    """A small file that unpacks to a large one beside paths that lead out of the directory."""
+    """A small file that unpacks to a large one, with paths outside the directory."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
         for name, content in (("../../outside", trap), ("zeros", bytes(50 * 2**20))):
@@ -108,7 +108,7 @@ def tar_bomb(trap: bytes) -> bytes:
 
 
 def outside_weights(path: Path) -> bytes:
-    """A graph whose weights lie in a file elsewhere."""
+    """A graph with external weights."""
     model = onnx.load_from_string(masked_mlp(seed=0))
     for tensor in model.graph.initializer:
         tensor.ClearField("raw_data")
@@ -119,7 +119,7 @@ def outside_weights(path: Path) -> bytes:
 
 
 def foreign_operator(path: Path) -> bytes:
-    """A graph with an operator that a Python library would have to bring."""
+    """A graph with an operator of a Python library."""
     model = onnx.load_from_string(masked_mlp(seed=0))
     model.graph.node.append(
         helper.make_node("PyOp", [model.graph.output[0].name], ["more"], domain="ai.onnx.contrib", code=str(path))
@@ -141,14 +141,14 @@ GRAPHS: dict[str, Callable[[bytes, Path], bytes]] = {
 
 
 @pytest.mark.parametrize("kind", GRAPHS)
-def test_a_booby_trapped_version_is_refused_and_the_champion_stays(
+def test_a_malicious_graph_is_rejected_and_the_champion_remains(
     client: TestClient, registry: Registry, trap: bytes, mark: Path, kind: str
 ) -> None:
-    """Published with digests that are right, as somebody could who may publish."""
+    """Published with correct digests, as by an attacker who may publish."""
     graph = masked_mlp(seed=0)
     version = publish(registry, "board", {"shared": graph}, "run/trap")
-    swap(registry, version.number, version.manifest, {"shared.onnx": GRAPHS[kind](trap, mark)})
-    with nothing_runs():
+    replace_version(registry, version.number, version.manifest, {"shared.onnx": GRAPHS[kind](trap, mark)})
+    with nothing_executed():
         promote(registry, "board", version.number)
         until(lambda: faults(client))
         assert act(client, observation=BOARD)["version"] == 1
@@ -158,14 +158,14 @@ def test_a_booby_trapped_version_is_refused_and_the_champion_stays(
 
 
 def pickled_array(trap: bytes) -> bytes:
-    """An array of objects as NumPy writes it: a head, and a pickle."""
+    """An array of objects in NumPy's format: a header and a pickle."""
     buffer = io.BytesIO()
     np.lib.format.write_array_header_1_0(buffer, {"descr": "|O", "fortran_order": False, "shape": (1,)})
     return buffer.getvalue() + trap
 
 
 def archive(content: bytes, name: str = "action.npy") -> bytes:
-    """An archive of arrays as NumPy writes it."""
+    """An archive of arrays in NumPy's format."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as entries:
         entries.writestr(name, content)
@@ -173,7 +173,7 @@ def archive(content: bytes, name: str = "action.npy") -> bytes:
 
 
 def damaged(content: bytes) -> bytes:
-    """Bytes that a decompressor stumbles over."""
+    """Bytes that a decompressor rejects."""
     return content[:60] + b"\xff" * 20 + content[80:]
 
 
@@ -190,33 +190,33 @@ RECORDED: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("kind", RECORDED)
-def test_booby_trapped_probes_are_refused_and_the_champion_stays(
+def test_malicious_probes_are_rejected_and_the_champion_remains(
     client: TestClient, registry: Registry, trap: bytes, mark: Path, kind: str
 ) -> None:
     version = publish(registry, "board", {"shared": masked_mlp(seed=0)}, "run/trap", {"shared": probes()})
-    swap(registry, version.number, version.manifest, {"shared.probes.npz": RECORDED[kind](trap)})
-    with nothing_runs():
+    replace_version(registry, version.number, version.manifest, {"shared.probes.npz": RECORDED[kind](trap)})
+    with nothing_executed():
         promote(registry, "board", version.number)
-        until(lambda: "holds no probes" in (faults(client) or [""])[0])
+        until(lambda: "contains no probes" in (faults(client) or [""])[0])
         assert act(client, observation=BOARD)["version"] == 1
     assert not mark.exists()
 
 
-def test_a_pickle_beside_the_files_of_the_manifest_is_refused(
+def test_a_pickle_beside_the_files_of_the_manifest_is_rejected(
     client: TestClient, registry: Registry, trap: bytes, mark: Path
 ) -> None:
     (registry.artifacts.path("board", 2) / "weights.pkl").write_bytes(trap)
-    with nothing_runs():
+    with nothing_executed():
         promote(registry, "board", 2)
         until(lambda: "does not belong to board@2" in (faults(client) or [""])[0])
     assert not mark.exists()
 
 
 @pytest.mark.parametrize("name", ["../2/shared.onnx", "/etc/passwd", "missing.onnx", ".", "", "shared.onnx/x"])
-def test_a_manifest_that_names_other_files_is_refused(client: TestClient, registry: Registry, name: str) -> None:
+def test_a_manifest_with_other_paths_is_rejected(client: TestClient, registry: Registry, name: str) -> None:
     version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
     policy = version.manifest.policies["shared"].model_copy(update={"file": name})
-    swap(registry, version.number, version.manifest.model_copy(update={"policies": {"shared": policy}}), {})
+    replace_version(registry, version.number, version.manifest.model_copy(update={"policies": {"shared": policy}}), {})
     promote(registry, "board", version.number)
     until(lambda: faults(client))
     assert act(client, observation=BOARD)["version"] == 1
@@ -225,11 +225,11 @@ def test_a_manifest_that_names_other_files_is_refused(client: TestClient, regist
 
 
 @pytest.mark.parametrize("name", ["../../outside", "/etc/passwd"])
-def test_a_digest_of_a_file_elsewhere_is_refused(client: TestClient, registry: Registry, name: str) -> None:
+def test_a_digest_of_an_external_file_is_rejected(client: TestClient, registry: Registry, name: str) -> None:
     version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
     (registry.artifacts.root / "outside").write_bytes(b"not this league's")
     files = version.manifest.files | {name: "0" * 64}
-    swap(registry, version.number, version.manifest.model_copy(update={"files": files}), {})
+    replace_version(registry, version.number, version.manifest.model_copy(update={"files": files}), {})
     promote(registry, "board", version.number)
     until(lambda: "is missing" in (faults(client) or [""])[0])
     assert act(client, observation=BOARD)["version"] == 1
@@ -257,13 +257,13 @@ def as_device(path: Path) -> None:
     path.symlink_to("/dev/zero")
 
 
-def as_nothing(path: Path) -> None:
+def remove_directory(path: Path) -> None:
     shutil.rmtree(path.parent)
 
 
 @pytest.mark.parametrize("file", ["shared.onnx", MANIFEST])
-@pytest.mark.parametrize("replace", [as_symbolic_link, as_pipe, as_directory, as_device, as_nothing])
-def test_a_file_that_is_none_is_refused_and_nobody_waits(
+@pytest.mark.parametrize("replace", [as_symbolic_link, as_pipe, as_directory, as_device, remove_directory])
+def test_a_special_file_is_rejected_without_blocking(
     client: TestClient, registry: Registry, replace: Callable[[Path], None], file: str
 ) -> None:
     replace(registry.artifacts.path("board", 3) / file)
@@ -279,10 +279,10 @@ PATHS = ("/v1/policies/board/action", "/v2/models/board/infer", "/v2/repository/
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_a_booby_trapped_request_is_refused(
+def test_a_malicious_request_is_rejected(
     client: TestClient, registry: Registry, trap: bytes, mark: Path, path: str
 ) -> None:
-    _, token = registry.create_key("all", ["act", "read", "promote"])
+    _, token = registry.keys.create("all", ["act", "read", "promote"])
     text = base64.b64encode(trap).decode()
     bodies: list[bytes] = [
         trap,
@@ -302,7 +302,7 @@ def test_a_booby_trapped_request_is_refused(
         b'{"observation": [1], "state": {"state_in_0": "%s"}}' % text.encode(),
         b"!!python/object/apply:os.system ['touch %s']" % str(mark).encode(),
     ]
-    with nothing_runs():
+    with nothing_executed():
         for body in bodies:
             for media_type in TYPES:
                 headers = {"x-api-key": token, "idempotency-key": "a"}
@@ -311,15 +311,15 @@ def test_a_booby_trapped_request_is_refused(
                 assert 400 <= reply.status_code < 500, reply.text
         body = zlib.compress(bytes(60 * 2**20), 9)
         reply = client.post(path, content=body, headers={"x-api-key": token, "content-encoding": "deflate"})
-        assert 400 <= reply.status_code < 500, "and a body that is much larger than it looks"
+        assert 400 <= reply.status_code < 500, "a decompression bomb"
     assert not mark.exists()
     reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers={"x-api-key": token})
     assert reply.json()["version"] == 1
 
 
-def test_a_booby_trapped_message_of_a_stream_is_refused(client: TestClient, trap: bytes, mark: Path) -> None:
+def test_a_malicious_message_of_a_stream_is_rejected(client: TestClient, trap: bytes, mark: Path) -> None:
     text = base64.b64encode(trap).decode()
-    with nothing_runs(), client.websocket_connect("/v1/policies/memory/stream") as stream:
+    with nothing_executed(), client.websocket_connect("/v1/policies/memory/stream") as stream:
         for data in (trap, REQUEST.pack(FRAMING, 0, 0, 1, 0) + trap, pickled_array(trap), archive(pickled_array(trap))):
             stream.send_bytes(data)
             assert stream.receive_json()["status"] == 400
@@ -329,8 +329,8 @@ def test_a_booby_trapped_message_of_a_stream_is_refused(client: TestClient, trap
     assert not mark.exists()
 
 
-def swap(registry: Registry, number: int, manifest: Manifest, files: dict[str, bytes]) -> None:
-    """Replace what was published, with digests that are right, in the store and in the database."""
+def replace_version(registry: Registry, number: int, manifest: Manifest, files: dict[str, bytes]) -> None:
+    """Replace published files with correct digests, in the store and in the database."""
     directory = registry.artifacts.path(manifest.league, number)
     for name, content in files.items():
         (directory / name).write_bytes(content)
@@ -339,14 +339,8 @@ def swap(registry: Registry, number: int, manifest: Manifest, files: dict[str, b
     (directory / MANIFEST).write_text(text)
     with registry.database.write() as session:
         values = {"manifest": text, "sha256": hashlib.sha256(text.encode()).hexdigest()}
-        session.execute(update(Version).filter_by(league=manifest.league, number=number).values(values))
+        session.execute(update(VersionTable).filter_by(league=manifest.league, number=number).values(values))
 
 
 def faults(client: TestClient) -> list[str]:
     return client.get("/v1/leagues/board").json()["faults"]
-
-
-def until(condition: Callable[[], object], seconds: float = 20) -> None:
-    deadline = monotonic() + seconds
-    while not condition():
-        assert monotonic() < deadline

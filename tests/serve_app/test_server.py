@@ -1,14 +1,11 @@
-"""The real thing: Ray Serve, HAProxy and two replicas, under load, promotions and blows."""
+"""A real server with Ray Serve, HAProxy and two replicas, under load, promotions and faults."""
 
 import os
 import signal
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from time import monotonic, sleep
 from typing import Any
 
 import httpx
@@ -17,122 +14,45 @@ import pytest
 from filelock import FileLock
 from websockets.exceptions import ConnectionClosed
 
-from evaluation.report import EvaluationReport
-from evaluation.tournament import evaluate
-from league.client import Client
-from league.client.conversation import Conversation
-from league.client.stream import Stream
-from league.environments.building import interface
+from evaluation.matches.tournament import evaluate
+from evaluation.results import EvaluationReport
+from league.client import Client, Stream
+from league.client.stream_protocol import StreamProtocol
 from league.errors import UnknownLeague
 from league.policies.onnx import OnnxPolicy
 from league.policies.remote import RemotePolicy
-from league.registry.following import await_traffic
 from league.registry.registry import Registry
-from league.registry.rows import Portion
+from league.registry.storage.rows import Portion
 from league.results.ledger import Ledger
 from league.results.records import Match
 from league.settings import Storage
-from serve_app import haproxy
-from serve_app.launch import running
-from tests.evaluation import examples
-from tests.league.policies.graphs import masked_mlp
-from tests.serve_app.leagues import everything, promote, publish
-from tests.serve_app.scaling import scale
-from tests.serve_app.test_action import BOARD
-from tests.serve_app.test_events import listener
+from serve_app.runtime import haproxy
+from serve_app.runtime.launch import running
+from tests.support import tictactoe
+from tests.support.actions import BOARD
+from tests.support.event_streams import listen
+from tests.support.graphs import masked_mlp
+from tests.support.scaling import scale
+from tests.support.served_leagues import promote, publish
+from tests.support.servers import ACTION, RayServer, load, processes, serving
+from tests.support.waiting import until
 
-ACTION = "/v1/policies/board/action"
 EVALUATIONS = "/v1/leagues/tictactoe/evaluations"
 BATCH = {"observation": np.zeros((1, 6, 7, 2), np.int8), "action_mask": np.ones((1, 7), np.int8)}
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
-    registry = everything(Storage.at(tmp_path_factory.mktemp("served")))
-    tictactoe(registry)
-    yield registry
-    registry.close()
-
-
-def tictactoe(registry: Registry) -> None:
-    """A league that can be played, with two versions."""
-    league = examples.config(play={"opening_plies": 2, "copies": 2})
-    registry.register(league, interface(league))
-    for graph in (examples.graph(), examples.graph(wins=True)):
-        examples.publish(registry, graph)
+def served(ray_server: RayServer) -> Registry:
+    return ray_server.registry
 
 
 @pytest.fixture(scope="module")
-def url(served: Registry) -> Iterator[str]:
-    with pytest.MonkeyPatch.context() as environment:
-        # A replica that is to stop stays open for 30 s else.
-        environment.setenv("RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S", "2")
-        # There is a key, for evaluations. The others do without.
-        with running(served.storage, replicas=2, insecure=True) as url:
-            yield url
-    until(lambda: not processes(served.storage, ""), seconds=10)  # a server that stopped leaves no process
+def url(ray_server: RayServer) -> str:
+    return ray_server.url
 
 
-def processes(storage: Storage, name: str) -> list[int]:
-    """Processes of that name that serve `storage`, which they have in their environment."""
-    home = f"LEAGUE_HOME={storage.home}\0".encode()
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            with suppress(OSError):
-                if home in (entry / "environ").read_bytes() and name.encode() in (entry / "cmdline").read_bytes():
-                    found.append(int(entry.name))
-    return found
-
-
-def until(condition: Callable[[], object], seconds: float = 60) -> None:
-    deadline = monotonic() + seconds
-    while not condition():
-        assert monotonic() < deadline
-        sleep(0.01)
-
-
-def serving(registry: Registry, version: int) -> int:
-    """How many replicas say that they serve a version of `board`."""
-    return sum(said.version == version for said in registry.acknowledgements("board"))
-
-
-@dataclass
-class Load:
-    """What callers saw."""
-
-    versions: Counter[int] = field(default_factory=Counter)
-    failures: list[str] = field(default_factory=list)
-
-
-@contextmanager
-def load(caller: Callable[[], Callable[[], int]], callers: int) -> Iterator[Load]:
-    """Call without pause from several threads while the context lasts.
-
-    `caller` makes what one of them calls, which returns the version that answered.
-    """
-    seen, stop = Load(), threading.Event()
-
-    def run() -> None:
-        call = caller()
-        while not stop.is_set():
-            try:
-                seen.versions[call()] += 1
-            except Exception as error:
-                seen.failures.append(repr(error))
-
-    threads = [threading.Thread(target=run) for _ in range(callers)]
-    for thread in threads:
-        thread.start()
-    try:
-        yield seen
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-
-
-def test_every_replica_answers_and_says_so(url: str, served: Registry) -> None:
+def test_all_replicas_answer_with_their_name(url: str, served: Registry) -> None:
+    promote(served, "board", 1)
     until(lambda: serving(served, 1) == 2)
     with httpx.Client(base_url=url) as client:
         found: set[str] = set()
@@ -146,7 +66,7 @@ def test_every_replica_answers_and_says_so(url: str, served: Registry) -> None:
         assert client.get("/v1/health/ready").status_code == 200
 
 
-def test_one_scrape_tells_of_all_replicas(url: str, served: Registry) -> None:
+def test_one_scrape_covers_all_replicas(url: str, served: Registry) -> None:
     with httpx.Client(base_url=url) as client:
         for _ in range(50):
             client.post(ACTION, json={"observation": BOARD})
@@ -159,7 +79,7 @@ def test_one_scrape_tells_of_all_replicas(url: str, served: Registry) -> None:
         until(lambda: len(replicas()) == 2)
 
 
-def test_traffic_is_moved_while_requests_go_on(url: str, served: Registry) -> None:
+def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
     def caller() -> Callable[[], int]:
         client = httpx.Client(base_url=url, headers={"x-league-key": f"caller-{threading.get_ident()}"})
 
@@ -174,17 +94,17 @@ def test_traffic_is_moved_while_requests_go_on(url: str, served: Registry) -> No
     with load(caller, callers=4) as seen:
         for share in (1.0, 0.0, 1.0):
             canary, shadow = Portion(2, share), Portion(3, 1.0)
-            setting = served.set_traffic("board", canary=canary, shadow=shadow, actor="test", reason="test")
-            await_traffic(served, setting, 30)
+            setting = served.traffic.set("board", canary=canary, shadow=shadow, actor="test", reason="test")
+            served.changes.wait_for_traffic(setting, 30)
             assert caller()() == (2 if share else 1)
-        off = served.set_traffic("board", canary=None, shadow=None, actor="test", reason="test")
-        await_traffic(served, off, 30)
+        off = served.traffic.set("board", canary=None, shadow=None, actor="test", reason="test")
+        served.changes.wait_for_traffic(off, 30)
     assert seen.failures == []
     assert seen.versions.keys() == {1, 2}
-    until(lambda: [(one.candidate, one.failed) for one in served.shadowings("board")] == [(3, 0)])
+    until(lambda: [(one.candidate, one.failed) for one in served.traffic.shadow_counts("board")] == [(3, 0)])
 
 
-def test_the_client_acts_as_the_graph_does(url: str) -> None:
+def test_the_client_gets_the_actions_of_the_graph(url: str) -> None:
     random = np.random.default_rng(0)
     mask = random.integers(0, 2, (50, 7), dtype=np.int8)
     mask[:, 0] = 1
@@ -202,7 +122,7 @@ def test_the_client_acts_as_the_graph_does(url: str) -> None:
         policy.act(BATCH)
 
 
-def test_promotions_under_load_cost_no_request(url: str, served: Registry) -> None:
+def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> None:
     def caller() -> Callable[[], int]:
         client = httpx.Client(base_url=url)
 
@@ -213,21 +133,21 @@ def test_promotions_under_load_cost_no_request(url: str, served: Registry) -> No
 
         return call
 
-    ask = caller()
+    send_request = caller()
     with load(caller, callers=8) as seen:
         for version in (2, 3, 1) * 4:
             promote(served, "board", version)
             until(lambda version=version: serving(served, version) == 2)
-            assert {ask() for _ in range(4)} == {version}, "nobody answers with the old one any more"
+            assert {send_request() for _ in range(4)} == {version}, "a replica answers with the previous version"
     assert seen.failures == []
     assert seen.versions.keys() == {1, 2, 3}
 
 
-@pytest.mark.parametrize("has_length", [True, False], ids=["of a stated length", "in parts"])
-def test_a_hundred_megabytes_are_refused(url: str, served: Registry, has_length: bool) -> None:
+@pytest.mark.parametrize("has_length", [True, False], ids=["content length", "chunked"])
+def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry, has_length: bool) -> None:
     size, part = 100 * 2**20, b" " * 2**16
     headers = {"content-type": "application/json"} | ({"content-length": str(size)} if has_length else {})
-    before = memory(served.storage)
+    memory_before = memory(served.storage)
     with httpx.Client(base_url=url) as client:
         try:
             reply = client.post(ACTION, content=(part for _ in range(size // len(part))), headers=headers)
@@ -235,11 +155,11 @@ def test_a_hundred_megabytes_are_refused(url: str, served: Registry, has_length:
             pytest.fail("the connection was cut before the answer could be read")
         assert (reply.status_code, reply.json()["code"]) == (413, "body_too_large")
         assert client.post(ACTION, json={"observation": BOARD}).status_code == 200
-    assert memory(served.storage) - before < 20 * 2**20
+    assert memory(served.storage) - memory_before < 20 * 2**20
 
 
 def memory(storage: Storage) -> int:
-    """The largest resident size that a replica ever had, in bytes."""
+    """The largest peak resident size of a replica, in bytes."""
     peaks = []
     for pid in processes(storage, "PolicyServer"):
         status = Path(f"/proc/{pid}/status").read_text()
@@ -247,19 +167,20 @@ def memory(storage: Storage) -> int:
     return max(peaks)
 
 
-def test_the_death_of_a_replica_costs_our_client_no_request(url: str, served: Registry) -> None:
+@pytest.mark.slow
+def test_our_client_survives_the_death_of_a_replica(url: str, served: Registry) -> None:
     victim = processes(served.storage, "PolicyServer")[0]
 
     def caller() -> Callable[[], int]:
         client = Client(url)
         return lambda: client.act("board", BOARD).version
 
-    with load(caller, callers=8) as seen:
-        until(lambda: seen.versions.total() > 200)
+    with load(caller, callers=8) as result:
+        until(lambda: result.versions.total() > 200)
         os.kill(victim, signal.SIGKILL)
-        after = seen.versions.total()
-        until(lambda: seen.versions.total() > after + 2000)
-    assert seen.failures == []
+        after = result.versions.total()
+        until(lambda: result.versions.total() > after + 2000)
+    assert result.failures == []
     until(lambda: len(set(processes(served.storage, "PolicyServer")) - {victim}) == 2)
 
 
@@ -276,38 +197,40 @@ def test_promotions_end_no_stream(url: str, served: Registry) -> None:
             assert (pinned.version, following.version) == (1, version)
 
 
-def test_streams_of_events_come_through_and_outlast_every_limit(url: str, served: Registry) -> None:
-    """HAProxy cuts a reply on which nothing comes for 5 s."""
-    with listener(url) as heard:
-        until(lambda: heard.lines.count(": nothing new") >= 4)
+@pytest.mark.slow
+def test_event_streams_outlast_the_timeouts_of_the_server(url: str, served: Registry) -> None:
+    """HAProxy cuts a response without data for 5 s."""
+    with listen(url) as stream:
+        until(lambda: stream.lines.count(": keep-alive") >= 4)
         promote(served, "board", 2)
-        until(lambda: heard.last["aliases"] == {"champion": 2})
-        until(lambda: heard.last["serving"] == {"2": 2})
-        assert not heard.is_over
+        until(lambda: stream.last["aliases"] == {"champion": 2})
+        until(lambda: stream.last["serving"] == {"2": 2})
+        assert not stream.is_over
     promote(served, "board", 1)
     until(lambda: serving(served, 1) >= 2)
 
 
-def test_episodes_outlive_a_replica_that_drains(url: str, served: Registry) -> None:
-    """The observations are ones, and the third action is 1: whoever forgot what was before would answer 0.
+@pytest.mark.slow
+def test_episodes_survive_a_draining_replica(ray_server: RayServer, served: Registry) -> None:
+    """The observations are ones, and the third action is 1: without its state, a policy would answer 0.
 
-    Streams of events at that replica end, the others go on.
+    Event streams of that replica end, the others continue.
     """
-    with Client(url) as client, ExitStack() as until_done:
-        listeners = [until_done.enter_context(listener(url)) for _ in range(6)]
-        streams = [until_done.enter_context(client.stream("memory")) for _ in range(6)]
+    with Client(ray_server.url) as client, ExitStack() as stack:
+        listeners = [stack.enter_context(listen(ray_server.url)) for _ in range(6)]
+        streams = [stack.enter_context(client.stream("memory")) for _ in range(6)]
         for _ in range(2):
             assert [stream.act([1.0]) for stream in streams] == [0] * 6
         assert len(replicas(streams)) == 2
-        with ended_streams() as codes:
-            scale(processes(served.storage, "PolicyServer"), processes(served.storage, "raylet")[0], 1)
+        with close_codes() as codes:
+            scale(ray_server, 1)
             until(lambda: [stream.act([0.0]) for stream in streams] and len(replicas(streams)) == 1)
         assert codes
         assert set(codes) == {1012}
         assert [stream.act([1.0]) for stream in streams] == [1] * 6
         until(lambda: any(each.is_over for each in listeners))
         assert not all(each.is_over for each in listeners)
-        scale(processes(served.storage, "PolicyServer"), processes(served.storage, "raylet")[0], 2)
+        scale(ray_server, 2)
     until(lambda: serving(served, 1) >= 2)
 
 
@@ -316,18 +239,18 @@ def replicas(streams: list[Stream]) -> set[str]:
 
 
 @contextmanager
-def ended_streams() -> Iterator[list[int]]:
-    """The codes by which servers close streams of our client while the context lasts."""
+def close_codes() -> Iterator[list[int]]:
+    """The codes with which servers close streams of our client while the context lasts."""
     codes: list[int] = []
-    lost = Conversation.lost
+    lost = StreamProtocol.connection_lost
 
-    def noted(self: Conversation, error: Exception) -> Any:
+    def record(self: StreamProtocol, error: Exception) -> Any:
         assert isinstance(error, ConnectionClosed), error
         codes.append(error.rcvd.code if error.rcvd is not None else 1006)
         return lost(self, error)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Conversation, "lost", noted)
+        patch.setattr(StreamProtocol, "connection_lost", record)
         yield codes
 
 
@@ -336,147 +259,157 @@ def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
     until(lambda: serving(served, 1) >= 2)
     new = publish(served, "board", {"shared": masked_mlp(seed=8)}, "run/new").number
     graph = served.artifacts.path("board", new) / "shared.onnx"
-    whole = graph.read_bytes()
+    content = graph.read_bytes()
     graph.write_bytes(masked_mlp(seed=9))
     promote(served, "board", new)
     with httpx.Client(base_url=url) as client:
         until(lambda: client.get("/v1/leagues/board").json()["faults"])
         for _ in range(20):
             assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 1
-        graph.write_bytes(whole)
+        graph.write_bytes(content)
         until(lambda: serving(served, new) >= 2)
 
 
 @pytest.fixture(scope="module")
 def evaluator(url: str, served: Registry) -> Iterator[httpx.Client]:
-    """Has a key that may start evaluations and nights, and play."""
-    _, token = served.create_key("night-owl", ["act", "read", "evaluate", "promote"])
+    """A client with a key that may play and start evaluations and nightly runs."""
+    _, token = served.keys.create("night-owl", ["act", "read", "evaluate", "promote"])
     with httpx.Client(base_url=url, headers={"x-api-key": token}, timeout=30) as client:
-        until(lambda: client.delete(f"{EVALUATIONS}/99").status_code == 404)  # both replicas know it soon
+        until(lambda: client.delete(f"{EVALUATIONS}/99").status_code == 404)  # both replicas know the key
         yield client
 
 
 def start(client: httpx.Client, **body: Any) -> str:
-    """Where the evaluation can be followed."""
+    """Start an evaluation; returns its path."""
+    replies: list[httpx.Response] = []
     headers = {"idempotency-key": str(body)}
-    until(lambda: client.post(EVALUATIONS, json=body, headers=headers).status_code == 202)
-    return client.post(EVALUATIONS, json=body, headers=headers).headers["location"]
+
+    def is_accepted() -> bool:
+        replies.append(client.post(EVALUATIONS, json=body, headers=headers))
+        return replies[-1].status_code == 202
+
+    until(is_accepted)
+    return replies[-1].headers["location"]
 
 
-def ended(client: httpx.Client, place: str) -> dict[str, Any]:
-    until(lambda: client.get(place).json()["state"] not in ("queued", "running"))
-    return dict(client.get(place).json())
+def wait_for_end(client: httpx.Client, path: str) -> dict[str, Any]:
+    until(lambda: client.get(path).json()["state"] not in ("queued", "running"))
+    return dict(client.get(path).json())
 
 
-def at_home(directory: Path, blocks: int) -> tuple[EvaluationReport, list[Match]]:
-    """What `league evaluate` plays of the same versions."""
+def evaluate_locally(directory: Path, blocks: int) -> tuple[EvaluationReport, list[Match]]:
+    """The report and the matches of `league evaluate` for the same versions."""
     registry = Registry.open(Storage.at(directory))
-    tictactoe(registry)
-    report = evaluate(examples.LEAGUE, registry=registry, blocks=blocks)
-    matches = Ledger(registry).matches(league=examples.LEAGUE)
+    tictactoe.playable(registry)
+    report = evaluate(tictactoe.LEAGUE, registry=registry, blocks=blocks)
+    matches = Ledger(registry).matches(league=tictactoe.LEAGUE)
     registry.close()
     return report, matches
 
 
-def test_an_evaluation_that_is_killed_goes_on_and_is_what_league_evaluate_plays(
+@pytest.mark.slow
+def test_a_killed_evaluation_continues_and_equals_league_evaluate(
     evaluator: httpx.Client, served: Registry, tmp_path: Path
 ) -> None:
-    report, matches = at_home(tmp_path, blocks=150)
+    report, matches = evaluate_locally(tmp_path, blocks=150)
 
-    def played() -> list[Match]:
-        return Ledger(served).matches(league=examples.LEAGUE, schedule=report.schedule)
+    def stored_matches() -> list[Match]:
+        return Ledger(served).matches(league=tictactoe.LEAGUE, schedule=report.schedule)
 
-    place = start(evaluator, blocks=150)
-    until(lambda: Ledger(served).positions(report.schedule) if known(served, report.schedule) else False)
-    (first,) = processes(served.storage, "evaluation.job")
+    path = start(evaluator, blocks=150)
+    until(lambda: Ledger(served).positions(report.schedule) if is_stored(served, report.schedule) else False)
+    (first,) = processes(served.storage, "evaluation.service.evaluation_job")
     os.kill(first, signal.SIGKILL)
-    left = played()
+    left = stored_matches()
     assert 0 < len(left) < len(matches)
     assert left == matches[: len(left)]
-    until(lambda: set(processes(served.storage, "evaluation.job")) - {first})
-    document = ended(evaluator, place)
+    until(lambda: set(processes(served.storage, "evaluation.service.evaluation_job")) - {first})
+    document = wait_for_end(evaluator, path)
     assert (document["state"], document["error"]) == ("done", None)
     assert document["result"] == report.to_json()
     assert (document["progress"]["played"], document["progress"]["of"]) == (len(matches), len(matches))
-    assert played() == matches
+    assert stored_matches() == matches
 
 
-def known(registry: Registry, schedule: str) -> bool:
-    return schedule in [each.id for each in Ledger(registry).schedules(examples.LEAGUE)]
+def is_stored(registry: Registry, schedule: str) -> bool:
+    return schedule in [each.id for each in Ledger(registry).schedules(tictactoe.LEAGUE)]
 
 
 def test_an_evaluation_is_stopped_between_chunks(evaluator: httpx.Client, served: Registry) -> None:
-    place = start(evaluator, blocks=20_000)
-    until(lambda: evaluator.get(place).json()["progress"])
-    assert evaluator.delete(place).json()["stopped_by"] == "night-owl"
-    document = ended(evaluator, place)
+    path = start(evaluator, blocks=20_000)
+    until(lambda: evaluator.get(path).json()["progress"])
+    assert evaluator.delete(path).json()["stopped_by"] == "night-owl"
+    document = wait_for_end(evaluator, path)
     assert (document["state"], document["result"]) == ("stopped", None)
     assert 0 < document["progress"]["played"] < document["progress"]["of"]
-    until(lambda: not processes(served.storage, "evaluation.job"))
+    until(lambda: not processes(served.storage, "evaluation.service.evaluation_job"))
 
 
-def test_a_night_that_finds_another_at_work_says_so_and_the_next_one_promotes(
-    evaluator: httpx.Client, served: Registry
-) -> None:
+@pytest.mark.slow
+def test_a_concurrent_nightly_run_fails_and_the_next_one_promotes(evaluator: httpx.Client, served: Registry) -> None:
     locks = served.storage.home / "locks"
     locks.mkdir(exist_ok=True)
     with FileLock(locks / "nightly-tictactoe.lock"):
-        refused = ended(evaluator, start(evaluator, kind="nightly", reason="first"))
-    assert (refused["state"], refused["error"]["code"]) == ("failed", "already_running")
-    assert "nightly-tictactoe.lock" in refused["error"]["message"]
-    night = ended(evaluator, start(evaluator, kind="nightly", reason="second"))
+        rejected = wait_for_end(evaluator, start(evaluator, kind="nightly", reason="first"))
+    assert (rejected["state"], rejected["error"]["code"]) == ("failed", "already_running")
+    assert "nightly-tictactoe.lock" in rejected["error"]["message"]
+    night = wait_for_end(evaluator, start(evaluator, kind="nightly", reason="second"))
     assert (night["state"], night["result"]["champion"]) == ("done", "tictactoe@2")
-    assert served.aliases("tictactoe")["champion"] == 2
+    assert served.aliases.current("tictactoe")["champion"] == 2
 
 
-def patiently(ask: Callable[[], httpx.Response]) -> httpx.Response:
-    """What is answered in the end to a request that may take longer than one waits."""
+def retry_until_ready(send_request: Callable[[], httpx.Response]) -> httpx.Response:
+    """The response of a request that may first time out."""
     replies: list[httpx.Response] = []
-    until(lambda: replies.append(ask()) or replies[-1].status_code != 503)
-    assert all(reply.json()["code"] in ("not_ready", "no_studio") for reply in replies[:-1])
+    until(lambda: replies.append(send_request()) or replies[-1].status_code != 503)
+    assert all(reply.json()["code"] in ("not_ready", "no_evaluation_service") for reply in replies[:-1])
     assert all("retry-after" in reply.headers for reply in replies[:-1])
     assert replies[-1].status_code == 200, replies[-1].text
     return replies[-1]
 
 
-def test_a_recorded_game_is_shown_and_filmed_by_the_studio(evaluator: httpx.Client, served: Registry) -> None:
-    evaluate(examples.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
-    match = Ledger(served).matches(league=examples.LEAGUE)[-1]
+def test_a_recorded_game_is_shown_and_rendered_as_video(evaluator: httpx.Client, served: Registry) -> None:
+    evaluate(tictactoe.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
+    match = Ledger(served).matches(league=tictactoe.LEAGUE)[-1]
     game = f"/v1/leagues/tictactoe/matches/{match.id}/games/1"
-    document = patiently(lambda: evaluator.get(game)).json()
+    document = retry_until_ready(lambda: evaluator.get(game)).json()
     actions = [move["action"] for step in document["steps"] for move in step["moves"]]
     assert actions == [*match.games[1].opening, *match.games[1].actions]
-    assert patiently(lambda: evaluator.get(f"{game}/film.gif")).content[:6] == b"GIF89a"
+    assert retry_until_ready(lambda: evaluator.get(f"{game}/video.gif")).content[:6] == b"GIF89a"
 
 
-def test_a_game_goes_on_whatever_dies_in_its_midst(evaluator: httpx.Client, served: Registry) -> None:
+@pytest.mark.slow
+def test_a_game_survives_the_death_of_any_process(evaluator: httpx.Client, served: Registry) -> None:
     body: dict[str, Any] = {"opponent": "tictactoe@2", "agent": "player_1", "chances": True, "actions": []}
 
     def move() -> dict[str, Any]:
-        return dict(patiently(lambda: evaluator.post("/v1/leagues/tictactoe/play", json=body)).json())
+        return dict(retry_until_ready(lambda: evaluator.post("/v1/leagues/tictactoe/play", json=body)).json())
 
     body["actions"].append(move()["legal"][0])
-    (stage,) = processes(served.storage, "evaluation.stage")
-    os.kill(stage, signal.SIGKILL)
-    until(lambda: stage not in processes(served.storage, "evaluation.stage"))
+    (worker,) = processes(served.storage, "evaluation.service.game_worker")
+    os.kill(worker, signal.SIGKILL)
+    until(lambda: worker not in processes(served.storage, "evaluation.service.game_worker"))
     body["actions"].append(move()["legal"][0])
-    (studio,) = processes(served.storage, ":Studio")
-    os.kill(studio, signal.SIGKILL)
+    (service,) = processes(served.storage, ":EvaluationService")
+    os.kill(service, signal.SIGKILL)
     document = move()
     assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
-    until(lambda: studio not in processes(served.storage, ":Studio"))
-    assert len(processes(served.storage, "evaluation.stage")) == 1, "the one of the studio that died is gone"
-    refused = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
-    assert (refused.status_code, refused.json()["code"]) == (422, "illegal_action")
-    assert "Traceback" not in refused.text
+    until(lambda: service not in processes(served.storage, ":EvaluationService"))
+    assert len(processes(served.storage, "evaluation.service.game_worker")) == 1, (
+        "the worker of the killed evaluation service has ended"
+    )
+    rejected = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
+    assert (rejected.status_code, rejected.json()["code"]) == (422, "illegal_action")
+    assert "Traceback" not in rejected.text
 
 
-def test_a_server_that_was_killed_can_be_started_again(storage: Storage) -> None:
+@pytest.mark.slow
+def test_a_killed_server_can_be_restarted(storage: Storage) -> None:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
     with running(storage, port=port, replicas=1) as url:
         os.kill(launcher(port), signal.SIGKILL)
-        with running(storage, port=port, replicas=1) as again:
-            assert again == url
+        with running(storage, port=port, replicas=1) as restarted:
+            assert restarted == url
             reply = httpx.post(f"{url}{ACTION}", json={"observation": BOARD})
             assert reply.json()["version"] == 1
     assert haproxy.is_free("127.0.0.1", port)

@@ -1,4 +1,4 @@
-"""Limits keep their proportions, and deploy.yaml is one that Serve takes."""
+"""Limits are consistent, and Ray Serve accepts deploy.yaml."""
 
 from typing import Any
 
@@ -6,12 +6,13 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from serve_app.launch import DEPLOY_YAML
-from serve_app.settings import ACKNOWLEDGED_WITHIN, ServeSettings
+from league.registry.replicas import LIVENESS_TIMEOUT
+from serve_app.runtime.launch import DEPLOY_YAML
+from serve_app.settings import ServeSettings
 
 
 @pytest.mark.parametrize(
-    ("setting", "words"),
+    ("setting", "message"),
     [
         ({"heartbeat": 6}, "heartbeat must be at most 5"),
         ({"poll": 10}, "poll_slowest must be at least poll"),
@@ -19,16 +20,16 @@ from serve_app.settings import ACKNOWLEDGED_WITHIN, ServeSettings
         ({"max_bodies": 1}, "max_bodies"),
     ],
 )
-def test_settings_out_of_proportion_are_refused(setting: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
+def test_inconsistent_settings_are_rejected(setting: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         ServeSettings.model_validate(setting)
 
 
-def test_two_heartbeats_may_get_lost() -> None:
-    assert 3 * ServeSettings().heartbeat <= ACKNOWLEDGED_WITHIN.total_seconds()
+def test_two_heartbeats_may_be_lost() -> None:
+    assert 3 * ServeSettings().heartbeat <= LIVENESS_TIMEOUT.total_seconds()
 
 
-def test_deploy_yaml_updates_without_a_lost_request() -> None:
+def test_deploy_yaml_updates_without_lost_requests() -> None:
     from ray.serve.schema import ServeDeploySchema
 
     schema = ServeDeploySchema.model_validate(yaml.safe_load(DEPLOY_YAML.read_text()))
@@ -37,9 +38,9 @@ def test_deploy_yaml_updates_without_a_lost_request() -> None:
     assert application.import_path == "serve_app.app:build_app"
     ServeSettings.model_validate(application.args)
     assert schema.http_options.host == "127.0.0.1"
-    assert deployment.num_replicas >= 2, "one may die"
-    assert deployment.max_surge_percent == 100, "new ones start before old ones stop"
-    assert deployment.graceful_shutdown_timeout_s >= 40, "the drain of an ingress holds 30 s"
+    assert deployment.num_replicas >= 2, "one replica may fail"
+    assert deployment.max_surge_percent == 100, "new replicas start before old ones stop"
+    assert deployment.graceful_shutdown_timeout_s >= 40, "draining takes 30 s"
     assert deployment.backpressure_config.status_code == 429
     both = 2 * deployment.num_replicas * deployment.ray_actor_options.num_cpus
-    assert both <= 2, "old and new replicas fit on two cores"
+    assert both <= 2, "old and new replicas must fit on two cores"

@@ -6,7 +6,7 @@ import torch
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> Iterator[None]:
-    """On a busy machine, several threads wait for one another longer than networks of a few units take."""
+    """With networks this small, several threads cost more than they save, in particular on a busy machine."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -1,6 +1,7 @@
-"""What is wrong in RLlib 2.60, and right here: one test per fault.
+"""Known faults of RLlib 2.60, and the correct behaviour here: one test per fault.
 
-What follows the word UPSTREAM shows that RLlib still has it: if that part fails after an upgrade, it was mended.
+The code after a comment with UPSTREAM demonstrates the fault in RLlib: if it fails after an upgrade, the fault was
+fixed.
 """
 
 from collections import Counter
@@ -27,22 +28,21 @@ from ray.tune.registry import register_env
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from tests.league.environments.counting import Counting
-from tests.league.environments.simultaneous import Meeting
-from tests.training.leagues import counting, solvable, tictactoe
+from tests.support.counting import Counting
+from tests.support.simultaneous import Simultaneous
+from tests.support.training_leagues import counting, solvable, tictactoe
 from training.algorithms.ppo import algorithm_config
-from training.learners.minibatches import minibatches
-from training.learners.train_batch import train_batch
+from training.learners.train_batch import minibatches, train_batch
 from training.modules.actor_critic import ActorCritic
-from training.rllib_env import LeagueEnv
-from training.sampling import transitions
+from training.rllib_compat import EpisodeChunk
+from training.runs.trial import build_algorithm
 from training.sampling.env_runner import LockstepEnvRunner
-from training.trial import build
+from training.sampling.rllib_env import LeagueEnv
 
 pytestmark = pytest.mark.usefixtures("ray_session")
 
 CYCLES = 5
-MEETING = "tests.league.environments.simultaneous:meeting"
+MEETING = "tests.support.simultaneous:meeting"
 
 
 def spread() -> LeagueConfig:
@@ -50,7 +50,7 @@ def spread() -> LeagueConfig:
         {
             "league": "spread",
             "environment": {"entry_point": "mpe2.simple_spread_v3", "kwargs": {"max_cycles": CYCLES}},
-            "training": {"runners": 0, "copies": 2, "hidden": [8]},
+            "training": {"runners": 0, "num_envs": 2, "hidden": [8]},
         }
     )
 
@@ -61,17 +61,17 @@ def meeting(**kwargs: Any) -> LeagueConfig:
             "league": "meeting",
             "environment": {"entry_point": MEETING, "kwargs": kwargs},
             "policies": {"policy_0": ["agent_0"], "policy_1": ["agent_1"]},
-            "training": {"runners": 0, "copies": 2, "hidden": [8]},
+            "training": {"runners": 0, "num_envs": 2, "hidden": [8]},
         }
     )
 
 
-def ours(league: LeagueConfig, index: int = 0) -> LockstepEnvRunner:
+def our_runner(league: LeagueConfig, index: int = 0) -> LockstepEnvRunner:
     return LockstepEnvRunner(algorithm_config(league, interface(league)), worker_index=index)
 
 
-def theirs(make: Any, agents: list[str], **env_runners: Any) -> MultiAgentEnvRunner:
-    """RLlib's runner on one of its wrappers, a policy per agent."""
+def rllib_runner(make: Any, agents: list[str], **env_runners: Any) -> MultiAgentEnvRunner:
+    """RLlib's runner on one of its wrappers, with a policy per agent."""
     register_env("upstream", lambda _: make())
     config = PPOConfig().environment("upstream").debugging(seed=1)
     config.env_runners(num_env_runners=0, **env_runners)
@@ -79,8 +79,8 @@ def theirs(make: Any, agents: list[str], **env_runners: Any) -> MultiAgentEnvRun
     return MultiAgentEnvRunner(config=config, worker_index=0)
 
 
-def test_1_truncated_agents_are_not_terminated_and_have_a_bootstrap() -> None:
-    runner = ours(spread())
+def test_1_truncated_agents_are_not_terminated_and_are_bootstrapped() -> None:
+    runner = our_runner(spread())
     chunks = [chunk for chunk in runner.sample(num_episodes=4) if chunk.is_done]
     assert len(chunks) == 12
     assert all(chunk.is_truncated and not chunk.is_terminated for chunk in chunks)
@@ -92,14 +92,14 @@ def test_1_truncated_agents_are_not_terminated_and_have_a_bootstrap() -> None:
     assert value != 0
     assert target == pytest.approx(last.rewards.data[-1] + 0.5 * value, rel=1e-4)
 
-    # UPSTREAM env/multi_agent_episode.py, "Case 2": the bootstrap is taken for 0.
+    # UPSTREAM env/multi_agent_episode.py, "Case 2": the bootstrap is 0.
     env = simple_spread_v3.parallel_env(max_cycles=CYCLES)
-    upstream = theirs(lambda: ParallelPettingZooEnv(env), env.possible_agents).sample(num_episodes=1)
+    upstream = rllib_runner(lambda: ParallelPettingZooEnv(env), env.possible_agents).sample(num_episodes=1)
     assert all(agent.is_terminated for agent in upstream[0].agent_episodes.values())
 
 
-def test_2_an_episode_ends_where_some_terminate_as_the_others_are_truncated() -> None:
-    chunks = ours(meeting(truncated=[1])).sample(num_episodes=2)
+def test_2_an_episode_with_terminated_and_truncated_agents_ends() -> None:
+    chunks = our_runner(meeting(truncated=[1])).sample(num_episodes=2)
     ends = Counter((chunk.agent_id, chunk.is_terminated, chunk.is_truncated) for chunk in chunks if chunk.is_done)
     assert ends == {("agent_0", True, False): 2, ("agent_1", False, True): 2}
     wrapper = LeagueEnv(meeting(truncated=[1]))
@@ -109,8 +109,8 @@ def test_2_an_episode_ends_where_some_terminate_as_the_others_are_truncated() ->
     assert truncated["__all__"]
     assert not terminated["__all__"]
 
-    # UPSTREAM env/wrappers/pettingzoo_env.py: neither of the two, and the episode never ends.
-    env = ParallelPettingZooEnv(Meeting(truncated=[1]))
+    # UPSTREAM env/wrappers/pettingzoo_env.py: neither flag is set, and the episode never ends.
+    env = ParallelPettingZooEnv(Simultaneous(truncated=[1]))
     env.reset(seed=0)
     for _ in range(3):
         _, _, terminated, truncated, _ = env.step({"agent_0": 0, "agent_1": 0})
@@ -131,14 +131,14 @@ def recorded_resets(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_3_no_seed_is_used_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By runner, copy, episode, sample, or after beginning anew."""
-    league = counting([2, 2], [], runners=2, copies=3)
-    runners = [ours(league, index) for index in (1, 2)]
+    """Across runners, environments, episodes, samples and restarts."""
+    league = counting([2, 2], [], runners=2, num_envs=3)
+    runners = [our_runner(league, index) for index in (1, 2)]
     seeds = recorded_resets(monkeypatch)
     steps = 0
     for _ in range(3):
         for runner in runners:
-            runner.begin_anew(steps)
+            runner.reset_episodes(steps)
         for _ in range(2):
             for runner in runners:
                 runner.sample(num_episodes=5)
@@ -147,8 +147,8 @@ def test_3_no_seed_is_used_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(set(seeds)) == len(seeds)
     assert -1 not in seeds
 
-    # UPSTREAM env/multi_agent_env_runner.py: whole episodes always begin with the seed of the runner.
-    upstream = theirs(lambda: PettingZooEnv(Counting()), ["player_0", "player_1"], batch_mode="complete_episodes")
+    # UPSTREAM env/multi_agent_env_runner.py: complete episodes always start with the seed of the runner.
+    upstream = rllib_runner(lambda: PettingZooEnv(Counting()), ["player_0", "player_1"], batch_mode="complete_episodes")
     seeds.clear()
     for _ in range(3):
         upstream.sample(num_episodes=1)
@@ -160,7 +160,7 @@ def test_4_the_environment_renders() -> None:
     wrapper.reset(seed=0)
     assert wrapper.render().shape[2] == 3
 
-    # UPSTREAM env/wrappers/pettingzoo_env.py: an argument that PettingZoo does not take.
+    # UPSTREAM env/wrappers/pettingzoo_env.py: passes an argument that PettingZoo does not accept.
     for env in (
         ParallelPettingZooEnv(simple_spread_v3.parallel_env(render_mode="rgb_array")),
         PettingZooEnv(simple_spread_v3.env(render_mode="rgb_array")),
@@ -170,11 +170,11 @@ def test_4_the_environment_renders() -> None:
             env.render()
 
 
-def test_5_each_step_is_learned_from_once_per_epoch_however_few_a_policy_has() -> None:
-    """A policy with 1 step in 15 of the other's, as in a league of learners and rarely chosen ones."""
+def test_5_each_step_is_learned_from_once_per_epoch() -> None:
+    """One policy has 1 step for 15 of the other, as in a league with rarely chosen opponents."""
     few, many, epochs = 10, 150, 3
     league = meeting(leaves=[few, many])
-    runner = ours(league.with_training(copies=1))
+    runner = our_runner(league.with_training(num_envs=1))
     chunks = [chunk for chunk in runner.sample(num_episodes=1) if chunk.is_done]
     batches = {
         policy: train_batch(
@@ -190,15 +190,16 @@ def test_5_each_step_is_learned_from_once_per_epoch_however_few_a_policy_has() -
         seen.update({policy: len(steps.actions) for policy, steps in minibatch.items()})
     assert seen == {"policy_0": epochs * few, "policy_1": epochs * many}
 
-    # UPSTREAM utils/minibatch_utils.py: minibatches of one size for all, and so 15 times the epochs for the small one.
+    # UPSTREAM utils/minibatch_utils.py: minibatches have one size for all policies, hence 15 times the epochs for the
+    # small one.
     columns = {"policy_0": few, "policy_1": many}
     batch = MultiAgentBatch({policy: SampleBatch({"obs": np.zeros(rows)}) for policy, rows in columns.items()}, many)
     iterator = MiniBatchCyclicIterator(batch, num_epochs=epochs, minibatch_size=10)
     assert sum(len(part.policy_batches["policy_0"]) for part in iterator) == 15 * epochs * few
 
 
-def test_6_weights_of_a_module_that_is_added_later_arrive_at_once() -> None:
-    """With the same WEIGHTS_SEQ_NO that the runner has had the others' weights by (ray#61960)."""
+def test_6_weights_of_a_module_that_is_added_later_are_applied() -> None:
+    """With the WEIGHTS_SEQ_NO of the weights that the runner already has (ray#61960)."""
 
     def arrives(runner: Any, spec: RLModuleSpec, name: str) -> bool:
         weights = runner.get_state(COMPONENT_RL_MODULE)[COMPONENT_RL_MODULE]
@@ -209,14 +210,14 @@ def test_6_weights_of_a_module_that_is_added_later_arrive_at_once() -> None:
         assert name in snapshot
         return np.array_equal(runner.module["snapshot"].get_state()[name], snapshot[name])
 
-    runner = ours(tictactoe())
+    runner = our_runner(tictactoe())
     observation, action = runner.get_spaces()["shared"]
     spec = RLModuleSpec(
         module_class=ActorCritic, observation_space=observation, action_space=action, model_config={"hidden": [4]}
     )
     assert arrives(runner, spec, "policy_head.weight")
 
-    # UPSTREAM env/multi_agent_env_runner.py: one number for all modules, and it is not smaller.
+    # UPSTREAM env/multi_agent_env_runner.py: one number for all modules, which has not increased.
     register_env("upstream", lambda _: PettingZooEnv(tictactoe_v3.env()))
     config = PPOConfig().environment("upstream").env_runners(num_env_runners=0)
     config.multi_agent(policies={"shared"}, policy_mapping_fn=lambda *_, **__: "shared")
@@ -225,7 +226,7 @@ def test_6_weights_of_a_module_that_is_added_later_arrive_at_once() -> None:
 
 
 class Reporting(Counting):
-    """Player 1 is not there at the reset, which has something to say."""
+    """Player 1 is absent at the reset, which returns infos."""
 
     def reset(self, seed: int | None = None, options: Any = None) -> None:
         super().reset(seed, options)
@@ -237,7 +238,7 @@ def reporting() -> Reporting:
     return Reporting()
 
 
-def test_7_infos_of_a_reset_all_agents_and_their_order_are_there() -> None:
+def test_7_infos_of_resets_agents_and_their_order_are_kept() -> None:
     league = LeagueConfig.from_mapping(
         {
             "league": "reporting",
@@ -256,33 +257,33 @@ def test_7_infos_of_a_reset_all_agents_and_their_order_are_there() -> None:
     assert env.reset(seed=4)[1] == {}
 
 
-# 8 is about DQN's exploration, which leagues do not train with.
+# Fault 8 concerns RLlib's exploration in DQN, which is not used here.
 
 
-def test_9_what_is_restored_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
-    """Weights, optimiser and every random choice: three more updates give the same bits."""
+def test_9_a_restored_algorithm_continues_identically(tmp_path: Path) -> None:
+    """Weights, optimizer and random states: three more updates give the same bits."""
     league = solvable("discrete", {"agents": 2, "opposed": True}, train_batch_size=64, minibatch_size=32, epochs=2)
 
     def weights(algorithm: Any) -> dict[str, np.ndarray]:
         return algorithm.learner_group._learner.module["shared"].get_state()
 
-    algorithm = build(league, interface(league))
+    algorithm = build_algorithm(league, interface(league))
     try:
         steps = 64 * 2
-        algorithm.begin_anew(0)
+        algorithm.reset_episodes(0)
         for _ in range(2):
             algorithm.train()
         algorithm.save_to_path(str(tmp_path / "state"))
-        algorithm.begin_anew(steps)
+        algorithm.reset_episodes(steps)
         for _ in range(3):
             algorithm.train()
         expected = weights(algorithm)
     finally:
         algorithm.stop()
     torch.manual_seed(12345)
-    restored = build(league, interface(league), tmp_path / "state")
+    restored = build_algorithm(league, interface(league), tmp_path / "state")
     try:
-        restored.begin_anew(steps)
+        restored.reset_episodes(steps)
         for _ in range(3):
             restored.train()
         found = weights(restored)
@@ -292,7 +293,7 @@ def test_9_what_is_restored_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -
     for name, array in expected.items():
         np.testing.assert_array_equal(found[name], array)
 
-    # UPSTREAM algorithms/ppo/ppo_learner.py: the coefficient of the KL term, which training adapts, is in no state.
+    # UPSTREAM algorithms/ppo/ppo_learner.py: the adaptive coefficient of the KL term is in no state.
     spaces = {"default_policy": (gymnasium.spaces.Box(-1, 1, (2,)), gymnasium.spaces.Discrete(2))}
     learned, fresh = (PPOConfig().build_learner(spaces=spaces) for _ in range(2))
     learned.curr_kl_coeffs_per_module["default_policy"].data.fill_(7.0)
@@ -300,19 +301,19 @@ def test_9_what_is_restored_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -
     assert float(fresh.curr_kl_coeffs_per_module["default_policy"]) == pytest.approx(0.2)
 
 
-def test_10_each_chunk_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = 0
-    construct = transitions.Chunk.__init__
+def test_10_each_chunk_is_created_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    created = 0
+    construct = EpisodeChunk.__init__
 
-    def counting_chunks(self: transitions.Chunk, *args: Any, **kwargs: Any) -> None:
-        nonlocal made
-        made += 1
+    def counting_chunks(self: EpisodeChunk, *args: Any, **kwargs: Any) -> None:
+        nonlocal created
+        created += 1
         construct(self, *args, **kwargs)
 
-    monkeypatch.setattr(transitions.Chunk, "__init__", counting_chunks)
-    assert len(ours(counting([3, 3], [])).sample(num_timesteps=600)) == made > 150
+    monkeypatch.setattr(EpisodeChunk, "__init__", counting_chunks)
+    assert len(our_runner(counting([3, 3], [])).sample(num_timesteps=600)) == created > 150
 
-    # UPSTREAM env/multi_agent_env_runner.py: at every step, all episodes that are finished are converted again.
+    # UPSTREAM env/multi_agent_env_runner.py: at each step, all finished episodes are converted again.
     converted = 0
     to_numpy = MultiAgentEpisode.to_numpy
 
@@ -321,7 +322,7 @@ def test_10_each_chunk_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
         converted += 1
         return to_numpy(self)
 
-    upstream = theirs(lambda: PettingZooEnv(Counting((3, 3))), ["player_0", "player_1"])
+    upstream = rllib_runner(lambda: PettingZooEnv(Counting((3, 3))), ["player_0", "player_1"])
     monkeypatch.setattr(MultiAgentEpisode, "to_numpy", counting_conversions)
     episodes = upstream.sample(num_timesteps=120)
     assert converted > 5 * len(episodes)

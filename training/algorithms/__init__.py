@@ -1,1 +1,1 @@
-"""One file per algorithm: a league's settings → RLlib's AlgorithmConfig."""
+"""One module per algorithm: maps a league's settings to RLlib's AlgorithmConfig."""

@@ -1,7 +1,7 @@
 """Deep Q-learning with action masks: Mnih et al., 2015, "Human-level control through deep reinforcement learning".
 
-Agents of a policy share one network and one buffer, and each policy learns from its own transitions, in turn-based
-games from one of an agent's own turns to its next. Illegal actions are neither explored, nor chosen, nor bootstrapped
+Agents of a policy share one network and one buffer. Each policy learns from its own transitions; in turn-based games,
+a transition spans from one of an agent's turns to its next. Illegal actions are never explored, chosen or bootstrapped
 from.
 """
 
@@ -15,24 +15,20 @@ from league.settings import Storage
 from league.spaces import Discrete
 from league.training_config import DQNConfig
 from training.algorithms.off_policy import off_policy_config
-from training.algorithms.setup import specs
+from training.algorithms.setup import rl_module_specs
 from training.learners.dqn import DQNLearner
 from training.modules.q_network import QNetwork
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """RLlib's configuration of a league's training.
-
-    storage: where the versions are that play as opponents; not needed without. Raises ConfigError where settings name
-    policies that there are not, or spaces do not fit the module.
-    """
+    """See `training.algorithms.setup.algorithm_config`."""
     assert isinstance(league.training, DQNConfig)
     modules = module_spec(league.training, interface)
     return off_policy_config(league, interface, storage, modules=modules, learner=DQNLearner)
 
 
 def module_spec(settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
-    """The modules of all policies. Raises ConfigError for spaces that they cannot have."""
+    """Return the modules of all policies. Raises ConfigError for actions that are not Discrete."""
     for policy in interface.policy_ids:
         action = interface.of_policy(policy).action
         if not isinstance(action, Discrete):
@@ -48,4 +44,4 @@ def module_spec(settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
         "noisy": settings.noisy,
         "atoms": atoms and (atoms.atoms, atoms.low, atoms.high),
     }
-    return MultiRLModuleSpec(rl_module_specs=specs(interface, QNetwork, model_config))
+    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, QNetwork, model_config))

@@ -1,10 +1,9 @@
-"""MADDPG: Lowe et al., 2017, "Multi-agent actor-critic for mixed cooperative-competitive environments",
-arXiv 1706.02275. Each policy has an actor, which sees its agent's observation, and a critic, which sees the
-observations and actions of all agents; only actors are played and exported. Actions of a Box are deterministic, with
-exploration noise while learning; choices are made by Gumbel-softmax.
+"""MADDPG: decentralised actors with centralised critics (Lowe et al., 2017, arXiv 1706.02275).
 
-With `critic: own`, a critic sees its own agent alone, and the policies are independent learners of DDPG (Lillicrap et
-al., 2016, arXiv 1509.02971). Nothing else differs: it is what the centralised critics are compared with.
+Each policy has an actor, which takes its agent's observation, and a critic, which takes the observations and actions of
+all agents. Only actors act and are exported. Actions of a Box are deterministic plus exploration noise; discrete
+actions use Gumbel-softmax. With `critic: own`, a critic takes its own agent only, and the policies are independent DDPG
+learners (Lillicrap et al., 2016, arXiv 1509.02971): the baseline for centralised critics.
 """
 
 from collections.abc import Collection
@@ -18,20 +17,20 @@ from league.interface import Interface
 from league.settings import Storage
 from league.training_config import MADDPGConfig
 from training.algorithms.off_policy import OffPolicy, off_policy_config
-from training.algorithms.setup import specs
+from training.algorithms.setup import rl_module_specs
 from training.learners.maddpg import MADDPGLearner
-from training.modules.actor import Actor
-from training.sampling.actor_runner import ActorRunner
-from training.sampling.closed import JOINT
+from training.modules.maddpg import Actor
+from training.sampling.closed_transitions import JOINT
+from training.sampling.replay_runner import ActorRunner
 
 
 class MADDPG(OffPolicy):
-    """Around one buffer of joint transitions, from which each policy draws its own samples."""
+    """One buffer of joint transitions, from which each policy draws its own samples."""
 
     def _learn(self, learning: Collection[str]) -> None:
         settings, replay, learner = self.settings, self.replays[JOINT], self._learner
         assert isinstance(learner, MADDPGLearner)
-        learner.explore(self.exploration)
+        learner.set_exploration(self.exploration)
         if len(replay) < settings.learning_starts:
             return
         for _ in range(settings.updates):
@@ -46,13 +45,13 @@ class MADDPG(OffPolicy):
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """RLlib's configuration of a league's training. Raises ConfigError for settings that do not fit the league."""
+    """See `training.algorithms.setup.algorithm_config`."""
     settings = league.training
     assert isinstance(settings, MADDPGConfig)
     if settings.opponents:
         raise ConfigError(
-            "training.opponents: the critics of maddpg learn from what all agents saw and did, which opponents do not"
-            " tell: leave it out"
+            "training.opponents: maddpg does not support opponents: its critics need the observations and actions"
+            " of all agents; remove it"
         )
     return off_policy_config(
         league,
@@ -66,10 +65,10 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
 
 
 def module_spec(settings: MADDPGConfig, interface: Interface) -> MultiRLModuleSpec:
-    """The actors of all policies. Raises ConfigError for spaces that they cannot have."""
+    """Return the actors of all policies. Raises ConfigError for unsupported spaces."""
     model_config = {
         "hidden": settings.hidden,
         "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
         "normalize": settings.normalize_observations,
     }
-    return MultiRLModuleSpec(rl_module_specs=specs(interface, Actor, model_config))
+    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, Actor, model_config))

@@ -1,9 +1,9 @@
-"""QMIX: Rashid et al., 2018, arXiv 1803.11485; VDN: Sunehag et al., 2017, arXiv 1706.05296; and neither, to compare.
+"""QMIX, VDN, and independent Q-learning as their baseline.
 
-Agents of a team act by values of their own actions, each by what it observes itself, and learn from the team's reward
-through a mixer that reads the global state. Only the agents' networks are played, exported and served; mixers and
-targets are training state. Deviations from the paper: Adam instead of RMSprop, and feed-forward networks learn from
-single transitions instead of whole episodes.
+QMIX: Rashid et al., 2018, arXiv 1803.11485; VDN: Sunehag et al., 2017, arXiv 1706.05296. Each agent of a team acts by
+its own action values and observation; a mixer that takes the global state learns from the team's reward. Only the
+agents' networks act and are exported; mixers and targets belong to the training state. Differences from the paper:
+Adam instead of RMSprop, and feed-forward networks learn from single transitions instead of whole episodes.
 """
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -14,32 +14,27 @@ from league.interface import Interface
 from league.settings import Storage
 from league.training_config import QMIXConfig
 from training.algorithms.off_policy import OffPolicy, off_policy_config
-from training.algorithms.setup import specs
-from training.learners.qmix import QMIXLearner
-from training.modules.agent_network import AgentNetwork
-from training.replay import Replay, Sample
+from training.algorithms.setup import rl_module_specs
+from training.learners.qmix import QMIXLearner, teams
+from training.modules.qmix import AgentNetwork
+from training.replay_buffer import ReplayBuffer, Sample
 from training.sampling.replay_runner import JointRunner
-from training.teams import teams
 
 
 class QMIX(OffPolicy):
-    """Agents with a memory learn from sequences."""
+    """Samples sequences for agents with recurrent networks."""
 
-    def draw(self, replay: Replay) -> Sample:
-        """What a gradient step learns from."""
+    def draw_sample(self, replay: ReplayBuffer) -> Sample:
+        """Return the sample of one gradient step."""
         settings = self.settings
         assert isinstance(settings, QMIXConfig)
         if settings.recurrence is None:
-            return super().draw(replay)
+            return super().draw_sample(replay)
         return replay.sample_sequences(settings.batch_size, settings.recurrence.sequence, gamma=settings.gamma)
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """RLlib's configuration of a league's training.
-
-    storage: where the versions are that play as opponents; not needed without. Raises ConfigError where settings name
-    policies or agents that there are not, or spaces do not fit.
-    """
+    """See `training.algorithms.setup.algorithm_config`."""
     assert isinstance(league.training, QMIXConfig)
     return off_policy_config(
         league,
@@ -53,7 +48,7 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
 
 
 def module_spec(settings: QMIXConfig, interface: Interface) -> MultiRLModuleSpec:
-    """The modules of all policies. Raises ConfigError for agents that cannot be mixed."""
+    """Return the modules of all policies. Raises ConfigError for agents that cannot be mixed."""
     teams(settings.groups, interface)
     model_config = {
         "hidden": settings.hidden,
@@ -61,4 +56,4 @@ def module_spec(settings: QMIXConfig, interface: Interface) -> MultiRLModuleSpec
         "normalize": settings.normalize_observations,
         "recurrence": settings.recurrence and settings.recurrence.width,
     }
-    return MultiRLModuleSpec(rl_module_specs=specs(interface, AgentNetwork, model_config))
+    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, AgentNetwork, model_config))

@@ -1,6 +1,8 @@
-"""What RLlib is told of any league, whatever the algorithm: its environment, policies, runners and learner."""
+"""The RLlib configuration that all algorithms share, and the choice of an algorithm by name."""
 
+from collections.abc import Sequence
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -17,9 +19,50 @@ from league.interface import Interface
 from league.policies.actions import dist_inputs_size
 from league.seeds import derive
 from league.settings import Storage
-from training.algorithms import phases
-from training.modules.acting import Acting
+from league.training_config import AnyTraining, PhaseConfig, PPOConfig, TrainingSettings
+from training.modules.policy_module import PolicyModule
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, LockstepEnvRunner, module_spaces
+
+
+def learning_policies(settings: TrainingSettings, policies: tuple[str, ...], iteration: int) -> tuple[str, ...]:
+    """Return the policies to update after `iteration` earlier updates; phases repeat cyclically."""
+    planned = settings.policies_to_train
+    if planned is None:
+        return policies
+    phases = [phase for phase in planned if isinstance(phase, PhaseConfig)]
+    if not phases:
+        return tuple(policy for policy in policies if policy in planned)
+    place = iteration % sum(phase.iterations for phase in phases)
+    for phase in phases:
+        if place < phase.iterations:
+            return tuple(policy for policy in policies if policy in phase.policies)
+        place -= phase.iterations
+    raise AssertionError("unreachable: the position lies in one of the phases")
+
+
+def check_policies_to_train(settings: TrainingSettings, policies: tuple[str, ...]) -> None:
+    """Raise ConfigError if `policies_to_train` names an unknown policy, or excludes one that shares its encoder."""
+    planned = settings.policies_to_train
+    if planned is None:
+        return
+    shared_encoder = isinstance(settings, PPOConfig) and settings.shared_encoder
+    for part in planned:
+        named: Sequence[str] = part.policies if isinstance(part, PhaseConfig) else (part,)
+        for policy in named:
+            if policy not in policies:
+                known = ", ".join(policies)
+                raise ConfigError(f"training.policies_to_train: unknown policy {policy!r}; the league has {known}")
+        if shared_encoder and isinstance(part, PhaseConfig) and set(named) != set(policies):
+            raise _shared_encoder_error()
+    if shared_encoder and not isinstance(planned[0], PhaseConfig) and set(planned) != set(policies):
+        raise _shared_encoder_error()
+
+
+def _shared_encoder_error() -> ConfigError:
+    return ConfigError(
+        "training.policies_to_train: with shared_encoder, all policies must learn together: training the encoder would"
+        " change the others, too"
+    )
 
 
 def configure(
@@ -32,13 +75,12 @@ def configure(
     runner: type[LockstepEnvRunner],
     learner: type[Learner],
 ) -> None:
-    """Tell `config` all but how is learned.
+    """Set everything in `config` except the algorithm's own hyperparameters.
 
-    storage: where the versions are that play as opponents; not needed without. Raises ConfigError where
-    `policies_to_train` names a policy that there is not.
+    Raises ConfigError if `policies_to_train` does not fit the league.
     """
     settings = league.training
-    phases.check(settings, interface.policy_ids)
+    check_policies_to_train(settings, interface.policy_ids)
     config.environment(
         env_config={
             LEAGUE: league.model_dump(mode="json", by_alias=True),
@@ -47,33 +89,35 @@ def configure(
         }
     )
     config.multi_agent(
-        policies=interface.policy_ids,  # in this order, by which seeded weights and minibatches are drawn
+        policies=interface.policy_ids,  # the order determines seeded weights and minibatches
         policy_mapping_fn=lambda agent, *_, **__: interface.policies[agent],
     )
     config.rl_module(rl_module_spec=modules)
     config.env_runners(
         env_runner_cls=runner,
         num_env_runners=settings.runners,
-        num_envs_per_env_runner=settings.copies,
+        num_envs_per_env_runner=settings.num_envs,
         num_gpus_per_env_runner=settings.runner_gpus,
         # The runners have no connector state that could be merged.
         merge_env_runner_states=False,
     )
-    # The learner works in the process of the algorithm.
+    # The learner runs in the algorithm's process.
     config.learners(
         learner_class=learner,
         num_learners=0,
         num_gpus_per_learner=settings.gpus,
         add_default_connectors_to_learner_pipeline=False,
     )
-    # An environment's fault shall be seen, not tried again for ever; a run that broke off can be resumed.
+    # Report faults of an environment instead of retrying forever; a failed run can be resumed.
     config.fault_tolerance(restart_failed_env_runners=False, ignore_env_runner_failures=False)
     config.debugging(seed=settings.seed, log_level="ERROR")
     config.reporting(min_time_s_per_iteration=0)
 
 
-def specs(interface: Interface, module: type[Acting], model_config: dict[str, Any]) -> dict[str, RLModuleSpec]:
-    """Policy id → its module. Raises ConfigError for actions that no policy can have."""
+def rl_module_specs(
+    interface: Interface, module: type[PolicyModule], model_config: dict[str, Any]
+) -> dict[str, RLModuleSpec]:
+    """Return policy id → module specification. Raises ConfigError for unsupported action spaces."""
     found = {}
     for policy in interface.policy_ids:
         try:
@@ -87,16 +131,40 @@ def specs(interface: Interface, module: type[Acting], model_config: dict[str, An
     return found
 
 
-def begin_anew(algorithm: Algorithm, steps: int) -> None:
-    """Leave all episodes under way, and derive every random choice from here on from the seed and `steps`.
+def reset_episodes(algorithm: Algorithm, steps: int) -> None:
+    """Drop all open episodes, and derive all further randomness from the seed and `steps`.
 
-    Called at each checkpoint, and where training goes on from one: both then go on alike.
+    Called at each checkpoint, and when training resumes from one, so that both continue identically.
     """
-    # A runner beside remote ones only keeps weights.
+    # With remote runners, the local one only holds weights.
     is_local = algorithm.env_runner_group.num_remote_env_runners() == 0
-    algorithm.env_runner_group.foreach_env_runner(partial(_begin_anew, steps=steps), local_env_runner=is_local)
+    algorithm.env_runner_group.foreach_env_runner(partial(_reset_episodes, steps=steps), local_env_runner=is_local)
     torch.manual_seed(derive(algorithm.config.seed or 0, "learner", steps))
 
 
-def _begin_anew(runner: EnvRunner, steps: int) -> None:
-    runner.begin_anew(steps)
+def _reset_episodes(runner: EnvRunner, steps: int) -> None:
+    runner.reset_episodes(steps)
+
+
+def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
+    """Return RLlib's configuration of a league's training.
+
+    Args:
+        league: The league and its training settings.
+        interface: The spaces and policies of the league's environment.
+        storage: Where to load opponents' versions from; required only with such opponents.
+
+    Raises:
+        ConfigError: The settings do not fit the league.
+    """
+    return _module(league.training).algorithm_config(league, interface, storage)
+
+
+def module_spec(settings: AnyTraining, interface: Interface) -> MultiRLModuleSpec:
+    """Return the PolicyModules of all policies. Raises ConfigError for spaces that the algorithm does not support."""
+    return _module(settings).module_spec(settings, interface)
+
+
+def _module(settings: AnyTraining) -> Any:
+    """Import `training/algorithms/<name>.py`, and no other algorithm."""
+    return import_module(f"training.algorithms.{settings.algorithm}")

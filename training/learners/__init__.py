@@ -1,1 +1,1 @@
-"""What happens to a batch of episodes in the learner: advantages, minibatches, losses."""
+"""Learners: advantages, minibatches, targets, losses and gradient steps."""

@@ -1,7 +1,7 @@
-"""MADDPG's learner: for each policy a critic step and an actor step, then all targets follow.
+"""The MADDPG learner: centralised critics and decentralised actors.
 
-Lowe et al., 2017, arXiv 1706.02275, algorithm 1. Each network has an optimiser of its own: a critic's loss moves the
-critic alone, and an actor's loss, which runs through the critic, the actor alone.
+Lowe et al., 2017, arXiv 1706.02275, algorithm 1. Each network has its own optimiser: a critic's loss updates the critic
+only, and an actor's loss, computed through the critic, the actor only.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -12,119 +12,147 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from league.training_config import MADDPGConfig
-from training.learners.maddpg_loss import actor_loss, critic_loss, td_target
-from training.learners.off_policy import Batch, OffPolicyLearner
-from training.modules.actor import Actor
-from training.modules.critic import Critic
-from training.replay import DISCOUNTS, NEXT, Sample, names
-from training.sampling.closed import ACTIONS, OBSERVATIONS, PRESENT, REWARDS, TERMINATED
+from training.learners.off_policy import OffPolicyLearner, ReplayBatch, bootstrapped_returns
+from training.modules.maddpg import Actor, Critic
+from training.replay_buffer import DISCOUNTS, NEXT, Sample, subcolumns
+from training.sampling.closed_transitions import ACTIONS, OBSERVATIONS, PRESENT, REWARDS, TERMINATED
 from training.sampling.env_runner import module_spaces
 
-Observed = dict[str, Tensor]
+
+def critic_loss(values: Tensor, targets: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return mean((Q(x, a_1 … a_N) − y)²), equation 6. weights: (B,), importance of each row."""
+    assert values.shape == targets.shape
+    errors = (values - targets).square()
+    return (errors if weights is None else weights * errors).mean()
+
+
+def actor_loss(values: Tensor, answers: Tensor, regularization: float, weights: Tensor | None = None) -> Tensor:
+    """Return −mean(Q(x, a_1 … μ_i(o_i) … a_N)) + λ mean(outputs²), whose gradient is that of equation 5.
+
+    Args:
+        values: (B,), differentiable in the agent's own action only.
+        answers: (B, d), the actor's outputs before masks and bounds. The second term keeps them small, as in the
+            authors' implementation (openai/maddpg, λ = 0.001).
+        regularization: λ.
+        weights: (B,), importance of each row.
+    """
+    value = values if weights is None else weights * values
+    return regularization * answers.square().mean() - value.mean()
+
+
+Observations = dict[str, Tensor]
 """ONNX input name → (B, …)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """An agent: its policy, and its number among that policy's agents."""
+class AgentSlot:
+    """An agent: its policy, and its index among that policy's agents."""
 
     policy: str
     number: int
 
 
-Order = list[list[Place]]
-"""For each agent of a policy, whom its critic sees, itself first."""
+CriticAgents = list[list[AgentSlot]]
+"""For each agent of a policy: the agents that its critic takes, itself first."""
 
 
-def critic_of(policy: str) -> str:
-    """The name of a policy's critic among the learner's networks; no policy has a dot in its id."""
+def critic_name(policy: str) -> str:
+    """Return the name of a policy's critic among the learner's networks; policy ids contain no dot."""
     return f"{policy}.critic"
 
 
 class MADDPGLearner(OffPolicyLearner):
-    """Is given samples of joint transitions, one for each policy that learns."""
+    """Learns from samples of joint transitions, one for each learning policy."""
 
     settings: MADDPGConfig
 
     def extra_networks(self) -> dict[str, nn.Module]:
-        """The critics. Each serves all agents of its policy, which take the first place in turn; as the others of one
-        policy stand side by side behind it, a place is always of the same spaces."""
+        """Return the critics, one per policy.
+
+        The agents of a policy share its critic and take the first position in turn. All positions have fixed spaces,
+        since the other agents of one policy are adjacent.
+        """
         by_policy = list(self.interface.policies.values())
         self._agents = [
-            Place(policy, i) for policy in self.interface.policy_ids for i in range(by_policy.count(policy))
+            AgentSlot(policy, i) for policy in self.interface.policy_ids for i in range(by_policy.count(policy))
         ]
-        return {critic_of(policy): self._critic(Place(policy, 0)) for policy in self.interface.policy_ids}
+        return {critic_name(policy): self._critic(AgentSlot(policy, 0)) for policy in self.interface.policy_ids}
 
     def learn(self, samples: Mapping[str, Sample], learning: Collection[str]) -> dict[str, NDArray]:
-        """A step of the critics and actors of `learning`. samples: policy id → its own draw of joint transitions."""
+        """Update the critics and actors of `learning`. samples: policy id → its own sample of joint transitions."""
         errors = {
             policy: self._learn(policy, self.batch(samples[policy])).cpu().numpy()
             for policy in self.interface.policy_ids
             if policy in learning
         }
-        self.follow()
+        self.update_targets()
         return errors
 
-    def explore(self, deviation: float) -> None:
-        """Let the policies' graphs explore as much as the runners do now."""
+    def set_exploration(self, deviation: float) -> None:
+        """Store the runners' current noise deviation in the actors, from where it is exported."""
         for actor in self.module.values():
             actor.exploration = deviation
 
-    def _learn(self, policy: str, batch: Batch) -> Tensor:
-        """Returns |TD error| of each transition, the largest of the policy's agents, (k,)."""
+    def _learn(self, policy: str, batch: ReplayBatch) -> Tensor:
+        """Update one policy; return |TD error| of each transition, the maximum over the policy's agents, (k,)."""
         rows = batch.rows
-        order = [self._seen(place) for place in self._agents if place.policy == policy]
+        order = [self._critic_agents(place) for place in self._agents if place.policy == policy]
         present = rows[f"{PRESENT}/{policy}"].T.float()
-        # Agents that are not there count nothing, the others accordingly more.
+        # Absent agents have weight 0, and the others correspondingly more.
         share = (present / present.mean().clamp_min(1e-8)).flatten()
         weights = share * batch.weights.repeat(len(order))
         targets = self._targets(policy, batch, order)
-        seen, done = self._situation(rows, order)
+        seen, done = self._critic_inputs(rows, order)
         critic = self._critic_of(policy)
         if self.settings.normalize_observations:
             self._actor_of(policy).encoder.update_statistics(seen[0])
             critic.update_statistics(seen)
         values = critic(seen, done)
         loss = critic_loss(values, targets, weights)
-        critic_norm = self.descend(loss, [critic_of(policy)])[critic_of(policy)]
+        critic_norm = self.gradient_step(loss, [critic_name(policy)])[critic_name(policy)]
         policy_loss = self._policy_loss(policy, seen, done, share)
-        norm = self.descend(policy_loss, [policy])[policy]
+        norm = self.gradient_step(policy_loss, [policy])[policy]
         errors = (values.detach() - targets).abs() * present.flatten()
-        self.note(policy, loss=loss, value=values.mean(), error=errors.mean(), critic_gradient_norm=critic_norm)
-        self.note(policy, policy_loss=policy_loss, gradient_norm=norm)
+        self.log_statistics(
+            policy, loss=loss, value=values.mean(), error=errors.mean(), critic_gradient_norm=critic_norm
+        )
+        self.log_statistics(policy, policy_loss=policy_loss, gradient_norm=norm)
         return errors.reshape(len(order), -1).amax(0)
 
-    def _policy_loss(self, policy: str, seen: list[Observed], done: list[Tensor], share: Tensor) -> Tensor:
-        """Of actions that the actor takes now in the first place; those of the other agents are as they were."""
+    def _policy_loss(self, policy: str, seen: list[Observations], done: list[Tensor], share: Tensor) -> Tensor:
+        """Evaluate the actor's current actions in the first position; the other agents' actions are those of the
+        sample."""
         action, answers = self._actor_of(policy).act(seen[0], self.settings.temperature)
         values = self._critic_of(policy)(seen, [action, *done[1:]])
         return actor_loss(values, answers, self.settings.regularization, share)
 
     @torch.no_grad()
-    def _targets(self, policy: str, batch: Batch, order: Order) -> Tensor:
+    def _targets(self, policy: str, batch: ReplayBatch, order: CriticAgents) -> Tensor:
         rows = batch.rows
-        seen = {place: _observed(rows, NEXT + OBSERVATIONS, place) for place in _all(order)}
+        seen = {place: _agent_observations(rows, NEXT + OBSERVATIONS, place) for place in _distinct(order)}
         actions = {}
         for place, observed in seen.items():
             actor = self.targets[place.policy]
             assert isinstance(actor, Actor)
-            goes_on = _of(rows, PRESENT, place) & ~_of(rows, TERMINATED, place)
+            goes_on = _agent_column(rows, PRESENT, place) & ~_agent_column(rows, TERMINATED, place)
             actions[place] = actor.act(observed, self.settings.temperature)[0] * goes_on.unsqueeze(-1)
-        values = self.targets[critic_of(policy)](*_arranged(order, seen, actions))
+        values = self.targets[critic_name(policy)](*_stack_by_position(order, seen, actions))
         rewards, terminated = (rows[f"{head}/{policy}"].T.flatten() for head in (REWARDS, TERMINATED))
-        return td_target(rewards, values, terminated, rows[DISCOUNTS].repeat(len(order)))
+        return bootstrapped_returns(rewards, rows[DISCOUNTS].repeat(len(order)), terminated, values)
 
-    def _situation(self, rows: Mapping[str, Tensor], order: Order) -> tuple[list[Observed], list[Tensor]]:
-        """What a critic takes: observations and actions of each place of `order`, the policy's agents one behind
-        another. Agents that are not there have done nothing."""
-        places = _all(order)
-        seen = {place: _observed(rows, OBSERVATIONS, place) for place in places}
+    def _critic_inputs(
+        self, rows: Mapping[str, Tensor], order: CriticAgents
+    ) -> tuple[list[Observations], list[Tensor]]:
+        """Return observations and actions of each position, concatenated over the policy's agents; absent agents act
+        0."""
+        places = _distinct(order)
+        seen = {place: _agent_observations(rows, OBSERVATIONS, place) for place in places}
         done = {
-            place: self._actor_of(place.policy).relaxed.encode(_of(rows, ACTIONS, place))
-            * _of(rows, PRESENT, place).unsqueeze(-1)
+            place: self._actor_of(place.policy).relaxed.encode(_agent_column(rows, ACTIONS, place))
+            * _agent_column(rows, PRESENT, place).unsqueeze(-1)
             for place in places
         }
-        return _arranged(order, seen, done)
+        return _stack_by_position(order, seen, done)
 
     def _actor_of(self, policy: str) -> Actor:
         actor = self.networks[policy]
@@ -132,17 +160,17 @@ class MADDPGLearner(OffPolicyLearner):
         return actor
 
     def _critic_of(self, policy: str) -> Critic:
-        critic = self.networks[critic_of(policy)]
+        critic = self.networks[critic_name(policy)]
         assert isinstance(critic, Critic)
         return critic
 
-    def _seen(self, own: Place) -> list[Place]:
+    def _critic_agents(self, own: AgentSlot) -> list[AgentSlot]:
         if self.settings.critic == "own":
             return [own]
         return [own, *(place for place in self._agents if place != own)]
 
-    def _critic(self, own: Place) -> Critic:
-        spaces = [module_spaces(self.interface, place.policy) for place in self._seen(own)]
+    def _critic(self, own: AgentSlot) -> Critic:
+        spaces = [module_spaces(self.interface, place.policy) for place in self._critic_agents(own)]
         layers = [(layer.filters, layer.kernel, layer.stride) for layer in self.settings.convolutions]
         return Critic(
             [seen for seen, _ in spaces],
@@ -153,28 +181,28 @@ class MADDPGLearner(OffPolicyLearner):
         )
 
 
-def _all(order: Order) -> Iterable[Place]:
+def _distinct(order: CriticAgents) -> Iterable[AgentSlot]:
     return dict.fromkeys(place for seen in order for place in seen)
 
 
-def _of(rows: Mapping[str, Tensor], head: str, place: Place) -> Tensor:
+def _agent_column(rows: Mapping[str, Tensor], head: str, place: AgentSlot) -> Tensor:
     return rows[f"{head}/{place.policy}"][:, place.number]
 
 
-def _observed(rows: Mapping[str, Tensor], head: str, place: Place) -> Observed:
-    return {name: column[:, place.number] for name, column in names(rows, f"{head}/{place.policy}").items()}
+def _agent_observations(rows: Mapping[str, Tensor], head: str, place: AgentSlot) -> Observations:
+    return {name: column[:, place.number] for name, column in subcolumns(rows, f"{head}/{place.policy}").items()}
 
 
-def _arranged(
-    order: Order, seen: Mapping[Place, Observed], done: Mapping[Place, Tensor]
-) -> tuple[list[Observed], list[Tensor]]:
-    """What a critic takes, a place at a time: of k rows and n agents of its policy (n k, …) each."""
+def _stack_by_position(
+    order: CriticAgents, seen: Mapping[AgentSlot, Observations], done: Mapping[AgentSlot, Tensor]
+) -> tuple[list[Observations], list[Tensor]]:
+    """Return the critic's inputs by position; for k rows and n agents of the policy, (n k, …) each."""
     observations, actions = [], []
     for places in zip(*order, strict=True):
-        observations.append({name: _stacked([seen[place][name] for place in places]) for name in seen[places[0]]})
-        actions.append(_stacked([done[place] for place in places]))
+        observations.append({name: _concatenated([seen[place][name] for place in places]) for name in seen[places[0]]})
+        actions.append(_concatenated([done[place] for place in places]))
     return observations, actions
 
 
-def _stacked(parts: list[Tensor]) -> Tensor:
+def _concatenated(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts)

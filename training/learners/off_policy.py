@@ -1,22 +1,18 @@
-"""What learners share that are given samples of replay buffers: networks, their targets, gradient steps, metrics.
+"""Base of the learners that sample from replay buffers: targets of Q-learning, and target networks.
 
-A subclass says which losses samples have (`losses`), and, where there are mixers or critics, which networks there are
-besides the policies' (`extra_networks`). What takes several backward passes overrides `learn`, by `descend`, `follow`
-and `note`.
+A subclass implements `losses`, and `extra_networks` if it has mixers or critics. One with several backward passes
+overrides `learn`, using `gradient_step`, `update_targets` and `log_statistics`.
 """
 
 import copy
 import logging
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from numpy.typing import NDArray
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.core.learner.learner import DEFAULT_OPTIMIZER
-from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from ray.rllib.utils.metrics import WEIGHTS_SEQ_NO
 from torch import Tensor, nn
 
@@ -24,29 +20,94 @@ from league.config import LeagueConfig
 from league.errors import ConfigError
 from league.interface import Interface
 from league.training_config import OffPolicyConfig
-from training.replay import Sample
+from training.modules.policy_module import MASKED_LOGIT
+from training.replay_buffer import Sample
+from training.rllib_compat import FixedPoliciesLearner, includes_component
 from training.sampling.env_runner import INTERFACE, LEAGUE
+
+
+def best_legal_action(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the action (B,) with the highest of the values (B, n) that the mask (B, n) allows.
+
+    If the mask allows no action, as in the last observations of some environments, all actions count.
+    """
+    if mask is None:
+        return values.argmax(-1)
+    allowed = mask.bool()
+    allowed = allowed | ~allowed.any(-1, keepdim=True)
+    return torch.where(allowed, values, MASKED_LOGIT).argmax(-1)
+
+
+def next_actions(online: Tensor | None, target: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the actions (B,) whose target values are bootstrapped from.
+
+    In double Q-learning, the online network selects them (van Hasselt, Guez and Silver, 2016, arXiv 1509.06461,
+    equation 4), otherwise the target network does (online: None).
+    """
+    return best_legal_action(target if online is None else online, mask)
+
+
+def bootstrapped_returns(rewards: Tensor, discounts: Tensor, terminated: Tensor, next_values: Tensor) -> Tensor:
+    """Return R + γ^m V(s_{t+m}), without bootstrap after termination, with it after truncation.
+
+    All arguments are (B,): sums of the m discounted rewards, γ^m, termination of the last step, values after it.
+    """
+    return rewards + discounts * torch.where(terminated, 0.0, next_values)
+
+
+def project_distribution(
+    probabilities: Tensor, atoms: Tensor, rewards: Tensor, discounts: Tensor, terminated: Tensor
+) -> Tensor:
+    """Project the distribution of R + γ^m Z onto the atoms of Z.
+
+    Bellemare, Dabney and Munos, 2017, arXiv 1707.06887, algorithm 1. The mass of a return between two atoms is divided
+    between them in proportion to proximity; beyond the outermost atoms, it goes to them.
+
+    Args:
+        probabilities: (B, atoms), of the selected next actions.
+        atoms: (atoms,), evenly spaced.
+        rewards: (B,), sums of the m discounted rewards.
+        discounts: (B,), γ^m.
+        terminated: (B,), of the last step.
+
+    Returns:
+        (B, atoms).
+    """
+    count = len(atoms)
+    low, high = atoms[0], atoms[-1]
+    moved = bootstrapped_returns(
+        rewards.unsqueeze(1), discounts.unsqueeze(1), terminated.unsqueeze(1), atoms.unsqueeze(0)
+    )
+    places = (moved.clamp(low, high) - low) / (high - low) * (count - 1)
+    # Share of an atom's mass that another one gets: 1 at its own place, falling to 0 at its neighbours'.
+    numbers = torch.arange(count, device=atoms.device, dtype=places.dtype)
+    shares = (1 - (places.unsqueeze(1) - numbers.view(1, -1, 1)).abs()).clamp(min=0)
+    return (shares * probabilities.unsqueeze(1)).sum(-1)
+
 
 logger = logging.getLogger(__name__)
 
 OFF_POLICY = "off_policy"
-"""The learner's own part of its state: a component's name for RLlib."""
+"""The component of the learner's state that RLlib does not know."""
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
-    """A sample on the learner's device. rows: column → (k, …), as training/sampling/closed.py and Replay name them."""
+class ReplayBatch:
+    """A sample on the learner's device.
+
+    rows: column → (k, …), named as in training/sampling/closed_transitions.py and ReplayBuffer. weights: (k,) float32.
+    """
 
     rows: dict[str, Tensor]
     weights: Tensor
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
-    """What a buffer's sample comes to.
+class ReplayLoss:
+    """The loss on a buffer's sample.
 
-    total: a scalar, whose gradient the optimisers of `networks` take. errors: (k,) |TD error|, or what else priorities
-    are made of. statistics: curve → scalar; see training/curves.py.
+    total: a scalar, whose gradient updates `networks`. errors: (k,), |TD error| or another measure for priorities.
+    statistics: metric → scalar; see training/algorithms/metrics.py.
     """
 
     total: Tensor
@@ -55,30 +116,28 @@ class Loss:
     statistics: dict[str, Tensor] = field(default_factory=dict)
 
 
-class OffPolicyLearner(TorchLearner):
-    """`networks`: policy id → its module, and the extra ones by their names; Adam for each. `targets`: as they are,
-    some gradient steps ago, without gradients."""
+class OffPolicyLearner(FixedPoliciesLearner):
+    """A learner with target networks and one Adam optimiser per network.
+
+    `networks`: policy id → its module, and extra networks by name. `targets`: delayed copies without gradients.
+    """
 
     settings: OffPolicyConfig
     interface: Interface
 
-    def losses(self, batches: Mapping[str, Batch], learning: Collection[str]) -> dict[str, Loss]:
-        """Buffer's key → the loss of its sample. learning: the policies that learn now."""
+    def losses(self, batches: Mapping[str, ReplayBatch], learning: Collection[str]) -> dict[str, ReplayLoss]:
+        """Return buffer key → loss of its sample. learning: the policies that currently learn."""
         raise NotImplementedError
 
     def extra_networks(self) -> dict[str, nn.Module]:
-        """Mixers or critics, by names that are no policy ids. Called once, when the policies' modules are built."""
+        """Return mixers or critics by name, different from all policy ids. Called once, after the modules are built."""
         return {}
 
-    def followed(self) -> Iterable[str]:
-        """The networks that have a target; by default all."""
-        return self.networks
-
     def build(self) -> None:
-        """Raises ConfigError where a GPU is asked for and there is none."""
+        """Raises ConfigError if a GPU is requested and none is available."""
         if self.config.num_gpus_per_learner and not torch.cuda.is_available():
             raise ConfigError(
-                f"training.gpus: {self.config.num_gpus_per_learner:g} asked for the learner, but torch sees no GPU here"
+                f"training.gpus: {self.config.num_gpus_per_learner:g} requested for the learner, but torch finds no GPU"
             )
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         assert isinstance(settings, OffPolicyConfig)
@@ -89,47 +148,41 @@ class OffPolicyLearner(TorchLearner):
         super().build()
 
     def configure_optimizers(self) -> None:
-        """Make the extra networks and the targets, and Adam for each network."""
+        """Create the extra networks, the targets, and the optimisers."""
         self.networks: dict[str, nn.Module] = dict(self.module.items())
-        self.networks |= {name: network.to(self._device) for name, network in self.extra_networks().items()}
-        self.targets = {name: copy.deepcopy(self.networks[name]).requires_grad_(False) for name in self.followed()}
+        self.networks |= {name: network.to(self.device) for name, network in self.extra_networks().items()}
+        self.targets = {name: copy.deepcopy(net).requires_grad_(False) for name, net in self.networks.items()}
         self._parameters: dict[str, list[nn.Parameter]] = {}
         for name, network in self.networks.items():
             parameters = list(network.parameters())
-            optimizer = torch.optim.Adam(parameters, lr=self.learning_rate(name), fused=True)
+            optimizer = torch.optim.Adam(parameters, lr=self.settings.lr, fused=True)
             self.register_optimizer(module_id=name, optimizer=optimizer, params=parameters)
             self._parameters[name] = parameters
 
-    def configure_optimizers_for_module(self, module_id: str, config: AlgorithmConfig | None = None) -> None:
-        """Only RLlib's `add_module` would call it."""
-        raise NotImplementedError(f"the policies of a league are fixed: {module_id} cannot be added")
-
     def compute_loss_for_module(self, **_: Any) -> Tensor:
-        """Only RLlib's own `update` would call it, which knows of no samples: see `learn`."""
-        raise NotImplementedError("an off-policy learner learns from samples of its buffers")
-
-    def learning_rate(self, name: str) -> float:  # noqa: ARG002  # of a subclass, critics may have another one
-        """Of a network's optimiser."""
-        return self.settings.lr
+        """Raise NotImplementedError. RLlib calls this from its own `update` only; see `learn`."""
+        raise NotImplementedError("off-policy learners learn from samples of replay buffers")
 
     def learn(self, samples: Mapping[str, Sample], learning: Collection[str]) -> dict[str, NDArray]:
-        """One gradient step on the samples. Returns buffer's key → errors (k,), for its priorities."""
+        """Take one gradient step on the samples. Returns buffer key → errors (k,), for its priorities."""
         losses = self.losses({key: self.batch(sample) for key, sample in samples.items()}, learning)
         networks = {name for loss in losses.values() for name in loss.networks}
-        norms = self.descend(torch.stack([loss.total for loss in losses.values()]).sum(), networks)
+        norms = self.gradient_step(torch.stack([loss.total for loss in losses.values()]).sum(), networks)
         for key, loss in losses.items():
-            self.note(key, loss=loss.total, gradient_norm=norms[loss.networks[0]], **loss.statistics)
-        self.follow()
+            self.log_statistics(key, loss=loss.total, gradient_norm=norms[loss.networks[0]], **loss.statistics)
+        self.update_targets()
         return {key: loss.errors.detach().cpu().numpy() for key, loss in losses.items()}
 
-    def batch(self, sample: Sample) -> Batch:
-        """A sample on the learner's device."""
-        rows = {name: torch.from_numpy(column).to(self._device) for name, column in sample.rows.items()}
-        return Batch(rows, torch.from_numpy(sample.weights).to(self._device))
+    def batch(self, sample: Sample) -> ReplayBatch:
+        """Move a sample to the learner's device."""
+        rows = {name: torch.from_numpy(column).to(self.device) for name, column in sample.rows.items()}
+        return ReplayBatch(rows, torch.from_numpy(sample.weights).to(self.device))
 
-    def descend(self, loss: Tensor, networks: Collection[str]) -> dict[str, Tensor]:
-        """One step of these networks' optimisers, each gradient clipped by its global norm; a gradient that is not
-        finite is dropped. Returns network → the norm."""
+    def gradient_step(self, loss: Tensor, networks: Collection[str]) -> dict[str, Tensor]:
+        """Step the optimisers of `networks`, with each gradient clipped by its global norm.
+
+        Gradients that are not finite are dropped. Returns network → gradient norm.
+        """
         names = [name for name in self.networks if name in networks]
         parameters = [parameter for name in names for parameter in self._parameters[name]]
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
@@ -139,16 +192,16 @@ class OffPolicyLearner(TorchLearner):
         for name in names:
             norms[name] = nn.utils.clip_grad_norm_(self._parameters[name], self.settings.grad_clip)
             if torch.isfinite(norms[name]):
-                self._named_optimizers[f"{name}_{DEFAULT_OPTIMIZER}"].step()
+                self.get_optimizer(module_id=name).step()
             else:
-                logger.warning("Dropped a gradient of %s that is not finite.", name)
+                logger.warning("Dropped a non-finite gradient of %s.", name)
         return norms
 
     @torch.no_grad()
-    def follow(self) -> None:
-        """Count a gradient step, and move the targets where it is time: θ' ← θ' + rate (θ − θ')."""
+    def update_targets(self) -> None:
+        """Count a gradient step, and update the targets when due: θ' ← θ' + rate (θ − θ')."""
         self.updates += 1
-        self._weights_seq_no = self.updates
+        self.weights_version = self.updates
         if self.updates % self.settings.target_every:
             return
         for name, target in self.targets.items():
@@ -158,13 +211,13 @@ class OffPolicyLearner(TorchLearner):
             for kept, known in zip(target.buffers(), network.buffers(), strict=True):
                 kept.copy_(known)
 
-    def note(self, key: str, **statistics: Tensor) -> None:
-        """Take scalars of a gradient step into the means that are reported. key: a policy id, or a buffer's key."""
+    def log_statistics(self, key: str, **statistics: Tensor) -> None:
+        """Add scalars of a gradient step to the reported means. key: a policy id or a buffer key."""
         for name, value in statistics.items():
             self._statistics[key][name].append(value.detach())
 
     def results(self) -> dict[str, Any]:
-        """Buffer's key → means over the gradient steps since the last call; those that did not learn are left out."""
+        """Return buffer key → means over the gradient steps since the last call, for those that learned."""
         noted, self._statistics = self._statistics, defaultdict(lambda: defaultdict(list))
         for key, statistics in noted.items():
             means = {name: float(torch.stack(values).mean()) for name, values in statistics.items()}
@@ -179,9 +232,9 @@ class OffPolicyLearner(TorchLearner):
         not_components: str | Collection[str] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """As RLlib's, with the targets, the extra networks, and the count of gradient steps."""
+        """Return RLlib's state with the targets, the extra networks, and the number of gradient steps."""
         state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
-        if self._check_component(OFF_POLICY, components, not_components):
+        if includes_component(self, OFF_POLICY, components, not_components):
             state[OFF_POLICY] = {
                 "updates": self.updates,
                 "targets": {name: target.state_dict() for name, target in self.targets.items()},
@@ -197,8 +250,5 @@ class OffPolicyLearner(TorchLearner):
                 self.targets[name].load_state_dict(weights)
             for name, weights in own["extra"].items():
                 self.networks[name].load_state_dict(weights)
-        # What is handed out must be newer than what runners have, also right after a restore.
-        self._weights_seq_no = max(self._weights_seq_no, state.get(WEIGHTS_SEQ_NO, 0))
-
-    def _log_trainable_parameters(self) -> None:
-        """RLlib logs the numbers once, and NaN at every later update, also for policies that rest."""
+        # The next weights must be newer than those of the runners, even right after a restore.
+        self.weights_version = max(self.weights_version, state.get(WEIGHTS_SEQ_NO, 0))

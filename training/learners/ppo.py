@@ -1,16 +1,13 @@
-"""PPO's learner: one update of those policies that learn now, from the episodes of one sample."""
+"""The PPO learner: the clipped surrogate loss and the update loop that minimises it."""
 
 import logging
 from collections import defaultdict
 from collections.abc import Collection, Iterable
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import torch
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.columns import Columns
-from ray.rllib.core.learner.learner import DEFAULT_OPTIMIZER
-from ray.rllib.core.learner.torch.torch_learner import TorchLearner
-from ray.rllib.core.learner.training_data import TrainingData
 from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ALL_MODULES, NUM_MODULE_STEPS_TRAINED
@@ -19,12 +16,92 @@ from torch import Tensor
 from league.config import LeagueConfig
 from league.errors import ConfigError
 from league.training_config import PPOConfig
-from training.learners.hyperparameters import hyperparameters
-from training.learners.minibatches import minibatches
-from training.learners.ppo_loss import PPOLoss, ppo_loss
-from training.learners.train_batch import Bootstraps, Minibatch, TrainBatch, train_batch, unless_terminated
-from training.modules.shared_encoder import SharedEncoder
+from training.learners.train_batch import (
+    Bootstraps,
+    Minibatch,
+    TrainBatch,
+    bootstrap_unless_terminated,
+    minibatches,
+    train_batch,
+)
+from training.modules.actor_critic import SharedEncoder
+from training.modules.distributions import TorchDistribution
+from training.rllib_compat import FixedPoliciesLearner, TrainingData
 from training.sampling.env_runner import LEAGUE
+
+
+@dataclass(frozen=True, slots=True)
+class Hyperparameters:
+    """The hyperparameters that each policy may override. See PPOConfig."""
+
+    lr: float
+    gamma: float
+    lambda_: float
+    clip: float
+    entropy: float
+
+
+def hyperparameters(settings: PPOConfig, policies: tuple[str, ...]) -> dict[str, Hyperparameters]:
+    """Return policy id → its hyperparameters. Raises ConfigError if `per_policy` names an unknown policy."""
+    for policy in settings.per_policy:
+        if policy not in policies:
+            raise ConfigError(f"training.per_policy.{policy}: unknown policy; the league has {', '.join(policies)}")
+    return {policy: _policy_hyperparameters(settings, policy) for policy in policies}
+
+
+def _policy_hyperparameters(settings: PPOConfig, policy: str) -> Hyperparameters:
+    own = settings.per_policy.get(policy)
+    values = {field.name: getattr(settings, field.name) for field in fields(Hyperparameters)}
+    if own is not None:
+        values |= own.model_dump(exclude_none=True)
+    return Hyperparameters(**values)
+
+
+class PPOLoss(NamedTuple):
+    """Scalar parts of the loss; only `total` is meant for gradients."""
+
+    total: Tensor
+    policy: Tensor
+    value: Tensor
+    entropy: Tensor
+    clip_fraction: Tensor
+    """Fraction of the steps whose probability ratio is outside the clip range."""
+
+
+def ppo_loss(
+    minibatch: Minibatch,
+    dist_inputs: Tensor,
+    values: Tensor,
+    distribution: TorchDistribution,
+    *,
+    clip: float,
+    entropy: float,
+    value_loss: float,
+) -> PPOLoss:
+    """Return the clipped surrogate loss. With r = π(a|s) / π_old(a|s) and the advantage A:
+
+        L = −mean(min(r A, clip(r, 1 − ε, 1 + ε) A)) + c_v mean((V − V_target)²) − c_e mean(H(π))
+
+    Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347, equations 7 and 9.
+
+    Args:
+        minibatch: k steps.
+        dist_inputs: (k, d), the module's current outputs.
+        values: (k,), the module's current values V.
+        distribution: Of the policy's raw actions.
+        clip: ε.
+        entropy: c_e.
+        value_loss: c_v.
+    """
+    log_p, entropies = distribution.evaluate(dist_inputs, minibatch.actions)
+    ratio = torch.exp(log_p - minibatch.log_p)
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    policy = -torch.minimum(ratio * minibatch.advantages, clipped * minibatch.advantages).mean()
+    value = (values - minibatch.targets).square().mean()
+    mean_entropy = entropies.mean()
+    total = policy + value_loss * value - entropy * mean_entropy
+    return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean())
+
 
 logger = logging.getLogger(__name__)
 
@@ -32,29 +109,29 @@ STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", "gradient_no
 """Logged per policy: means over the minibatches of an update."""
 EXPLAINED_VARIANCE = "vf_explained_var"
 KL = "kl"
-"""Mean Kullback–Leibler divergence of the policy after an update from that before."""
+"""Mean Kullback–Leibler divergence between the policies before and after an update."""
 KL_STEPS = 1024
-"""Steps that the divergence is estimated on."""
-ENCODER = "encoder"
+"""Number of steps for estimating the divergence."""
 ADAM_EPSILON = 1e-5
 """As in the reference implementation of PPO (openai/baselines)."""
 
 
-class PPOLearner(TorchLearner):
-    """Works on whole columns: RLlib's loop handles each minibatch in several layers of dictionaries, counters and logs,
-    which for networks of a few hundred units costs more than the arithmetic.
+class PPOLearner(FixedPoliciesLearner):
+    """Updates on whole columns of arrays.
 
-    A policy without steps in the episodes, or that does not learn now, keeps weights and optimiser as they are.
+    RLlib's loop passes each minibatch through several layers of dictionaries, counters and logs, which costs more than
+    the arithmetic of small networks. A policy without steps in the episodes, or that does not currently learn, keeps
+    its weights and optimiser state.
     """
 
-    bootstraps: Bootstraps = staticmethod(unless_terminated)
-    """Which chunks end on an observation whose value counts."""
+    bootstraps: Bootstraps = staticmethod(bootstrap_unless_terminated)
+    """Selects the chunks whose last observation is bootstrapped from."""
 
     def build(self) -> None:
-        """Raises ConfigError where a GPU is asked for and there is none."""
+        """Raises ConfigError if a GPU is requested and none is available."""
         if self.config.num_gpus_per_learner and not torch.cuda.is_available():
             raise ConfigError(
-                f"training.gpus: {self.config.num_gpus_per_learner:g} asked for the learner, but torch sees no GPU here"
+                f"training.gpus: {self.config.num_gpus_per_learner:g} requested for the learner, but torch finds no GPU"
             )
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         assert isinstance(settings, PPOConfig)
@@ -67,7 +144,7 @@ class PPOLearner(TorchLearner):
         return [ValueFunctionAPI]
 
     def configure_optimizers(self) -> None:
-        """Adam for each policy's own parameters, and one for a shared encoder's."""
+        """Create an Adam optimiser for each policy's own parameters, and one for a shared encoder."""
         shared = self.module.encoder if isinstance(self.module, SharedEncoder) else None
         common = list(shared.parameters()) if shared is not None else []
         self._parameters: dict[str, list[torch.nn.Parameter]] = {}
@@ -76,10 +153,6 @@ class PPOLearner(TorchLearner):
             self._add_optimizer(policy, own, self.hyperparameters[policy].lr)
         if common:
             self._add_optimizer(ALL_MODULES, common, self.settings.lr)
-
-    def configure_optimizers_for_module(self, module_id: str, config: AlgorithmConfig | None = None) -> None:
-        """Only RLlib's `add_module` would call it: optimisers are made all at once, as modules may share an encoder."""
-        raise NotImplementedError(f"the policies of a league are fixed: {module_id} cannot be added")
 
     def update(
         self,
@@ -90,21 +163,28 @@ class PPOLearner(TorchLearner):
         minibatch_size: int | None = None,
         **_: Any,
     ) -> dict[str, Any]:
-        """Learn from the episodes of a sample. policies: those that learn, by default all.
+        """Update the policies on sampled episodes.
 
-        Returns policy id → metrics, for the policies that have learned.
+        Args:
+            training_data: Contains the episode chunks of a sample.
+            policies: The policies to update; by default all.
+            num_epochs: Passes over the data.
+            minibatch_size: Steps per minibatch of the policy with the most steps.
+
+        Returns:
+            Policy id → metrics, for the policies that were updated.
         """
-        self._weights_seq_no += 1
+        self.weights_version += 1
         batches = self._batches(training_data.episodes, self.module.keys() if policies is None else policies)
         if batches:
             size = minibatch_size or max(len(batch) for batch in batches.values())
             statistics: dict[str, list[Tensor]] = defaultdict(list)
             for minibatch in minibatches(batches, size=size, epochs=num_epochs):
-                for policy, row in self._descend(minibatch).items():
+                for policy, row in self._gradient_step(minibatch).items():
                     statistics[policy].append(row)
             self._log(batches, statistics)
         metrics = self.metrics.reduce()
-        # What was once logged stays in the logger's answer, as NaN.
+        # RLlib reports NaN for policies that were logged earlier but not in this update.
         return {policy: metrics[policy] for policy in batches}
 
     def _batches(self, episodes: Iterable[SingleAgentEpisode], policies: Collection[str]) -> dict[str, TrainBatch]:
@@ -126,8 +206,8 @@ class PPOLearner(TorchLearner):
             if policy in chunks
         }
 
-    def _descend(self, minibatch: dict[str, Minibatch]) -> dict[str, Tensor]:
-        """One step of gradient descent on the sum of the policies' losses; policy id → STATISTICS."""
+    def _gradient_step(self, minibatch: dict[str, Minibatch]) -> dict[str, Tensor]:
+        """Take a gradient step on the sum of the policies' losses; return policy id → STATISTICS."""
         for parameters in self._parameters.values():
             for parameter in parameters:
                 parameter.grad = None
@@ -137,13 +217,15 @@ class PPOLearner(TorchLearner):
             for policy, steps in minibatch.items()
         }
         torch.autograd.backward([loss.total for loss in losses.values()])
-        norms = {name: self._apply(name) for name in self._parameters if name in minibatch or name == ALL_MODULES}
+        norms = {
+            name: self._clip_and_step(name) for name in self._parameters if name in minibatch or name == ALL_MODULES
+        }
         return {policy: torch.stack([*loss[1:], norms[policy]]).detach() for policy, loss in losses.items()}
 
     def compute_loss_for_module(
         self, *, module_id: str, batch: Minibatch, fwd_out: dict[str, Tensor], **_: Any
     ) -> PPOLoss:
-        """The loss of one policy on some steps, from what its module answers to them."""
+        """Return the loss of one policy on some steps."""
         return ppo_loss(
             batch,
             fwd_out[Columns.ACTION_DIST_INPUTS],
@@ -154,13 +236,13 @@ class PPOLearner(TorchLearner):
             value_loss=self.settings.value_loss,
         )
 
-    def _apply(self, name: str) -> Tensor:
-        """Clip the gradients of one optimiser by their global norm, and take its step unless they are not finite."""
+    def _clip_and_step(self, name: str) -> Tensor:
+        """Clip the gradients of one optimiser by their global norm, and step unless they are not finite."""
         norm = torch.nn.utils.clip_grad_norm_(self._parameters[name], self.settings.grad_clip)
         if torch.isfinite(norm):
-            self._named_optimizers[f"{name}_{DEFAULT_OPTIMIZER}"].step()
+            self.get_optimizer(module_id=name).step()
         else:
-            logger.warning("Dropped a gradient of %s that is not finite.", name)
+            logger.warning("Dropped a non-finite gradient of %s.", name)
         return norm
 
     def _add_optimizer(self, name: str, parameters: list[torch.nn.Parameter], lr: float) -> None:
@@ -177,12 +259,9 @@ class PPOLearner(TorchLearner):
             self.metrics.log_dict(logged, key=policy, window=1)
             self.metrics.log_value((policy, NUM_MODULE_STEPS_TRAINED), len(batch), reduce="sum")
 
-    def _log_trainable_parameters(self) -> None:
-        """RLlib logs the numbers once, and NaN at every later update, also for policies that rest."""
-
     @torch.no_grad()
     def _divergences(self, batches: dict[str, TrainBatch]) -> dict[str, float]:
-        """From the distributions that the steps were drawn by to those of now; on about KL_STEPS of each policy."""
+        """Estimate each policy's divergence from before the update, on about KL_STEPS steps."""
         samples = {}
         for policy, batch in batches.items():
             stride = -(-len(batch) // KL_STEPS)

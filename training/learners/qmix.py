@@ -1,7 +1,7 @@
-"""QMIX's loss: the temporal difference of each team's value, from joint transitions.
+"""The QMIX and VDN learner: team values mixed from agent values, and team targets.
 
-Columns of the buffer stand by policy (training/sampling/closed.py). Here the agents of all policies stand beside one
-another, policy by policy, (k, N), and a team is some of these columns.
+Columns of the buffer are grouped by policy (training/sampling/closed_transitions.py). Here, the agents of all policies
+are adjacent columns in the order of the policies, (k, N), and a team is a subset of them. Rashid et al., 2018.
 """
 
 from collections.abc import Collection, Mapping
@@ -11,66 +11,156 @@ import torch
 from torch import Tensor, nn
 
 from league.config import LeagueConfig
+from league.environments.building import divide
+from league.errors import ConfigError
 from league.interface import Interface
-from league.spaces import ACTION_MASK
+from league.spaces import ACTION_MASK, Discrete
 from league.training_config import QMIXConfig
-from training.learners.off_policy import Batch, Loss, OffPolicyLearner
-from training.learners.q_targets import next_actions
-from training.learners.team_targets import TeamSteps
-from training.modules.agent_network import AgentNetwork, Observations, flat
-from training.modules.mixer import Mixer, MonotonicMixer, summed, unmixed
-from training.replay import DISCOUNTS, NEXT, names
-from training.sampling.closed import (
+from training.learners.off_policy import OffPolicyLearner, ReplayBatch, ReplayLoss, bootstrapped_returns, next_actions
+from training.modules.qmix import (
+    AgentNetwork,
+    Mixer,
+    MonotonicMixer,
+    Observations,
+    flatten_leading,
+    independent_mixer,
+    vdn_mixer,
+)
+from training.replay_buffer import DISCOUNTS, NEXT, subcolumns
+from training.sampling.closed_transitions import (
     ACTIONS,
     JOINT,
-    MEMORY,
     OBSERVATIONS,
     PRESENT,
+    RECURRENT_STATE,
     REWARDS,
     STATE,
     TERMINATED,
     state_size,
 )
 from training.sampling.env_runner import LEAGUE
-from training.teams import Teams, teams
+
+Teams = dict[str, tuple[str, ...]]
+"""group → its agents, in the order of `possible_agents`."""
+
+
+def teams(groups: Mapping[str, tuple[str, ...]] | None, interface: Interface) -> Teams:
+    """Return the agents of each group, or of each side if no groups are given.
+
+    Raises ConfigError if a pattern matches no agent, or an agent matches no group, has other than Discrete actions,
+    or has other spaces than the rest of its group.
+    """
+    if groups is None:
+        found = {
+            group: tuple(agent for agent in interface.agents if agent in own) for group, own in interface.sides.items()
+        }
+        key = "sides"
+    else:
+        group_of = divide("training.groups", dict(groups), list(interface.agents))
+        found = {group: tuple(agent for agent in interface.agents if group_of[agent] == group) for group in groups}
+        key = "training.groups"
+    for group, members in found.items():
+        for agent in members:
+            _check(f"{key}.{group}", members[0], agent, interface)
+    return found
+
+
+def _check(where: str, first: str, agent: str, interface: Interface) -> None:
+    own, others = interface.agents[agent], interface.agents[first]
+    if not isinstance(own.action, Discrete):
+        raise ConfigError(
+            f"{where}: qmix needs Discrete actions, but {agent} has {own.action!r}: use algorithm: ppo, or"
+            " maddpg for continuous actions"
+        )
+    if own.action != others.action:
+        raise ConfigError(
+            f"{where}: {first} and {agent} have different action spaces: pad them with SuperSuit's pad_action_space_v0"
+        )
+    if own.observation != others.observation:
+        raise ConfigError(
+            f"{where}: {first} and {agent} have different observation spaces: pad them with SuperSuit's"
+            " pad_observations_v0"
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class _Play:
-    """k rows of the n agents of a policy: what they saw, what they saw next, both input name → (k, n, …); what they
-    remembered, key → (k, n, width); what they did (k, n), and whether they were there."""
+class TeamSteps:
+    """k joint transitions of a team of n agents.
 
-    seen: Observations
-    coming: Observations
-    memory: dict[str, Tensor]
+    together: the team has one value, learned from its mean reward; otherwise each agent has its own value.
+    rewards, present, terminated: (k, n). discounts: (k,), γ^m for m steps. states, next_states: (k, s).
+    """
+
+    rewards: Tensor
+    present: Tensor
+    terminated: Tensor
+    discounts: Tensor
+    states: Tensor
+    next_states: Tensor
+    together: bool
+
+    def mixed(self, mixer: Mixer, values: Tensor) -> Tensor:
+        """Mix the values (k, n) of the taken actions to (k, m); absent agents count 0."""
+        return mixer(torch.where(self.present, values, 0.0), self.states)
+
+    def counted(self) -> Tensor:
+        """Return (k, m) bool: whether an agent was present."""
+        return self.present.any(-1, keepdim=True) if self.together else self.present
+
+    def targets(self, mixer: Mixer, following: Tensor) -> Tensor:
+        """Return R + γ^m Q_tot(s', u'), (k, m), from the values (k, n) of the best next actions.
+
+        Terminated agents count 0 in the mixture, and without remaining agents there is no bootstrap. Truncated agents
+        are bootstrapped from their last observations.
+        """
+        goes_on = self.present & ~self.terminated
+        paid, ended = self.rewards, ~goes_on
+        if self.together:
+            paid, ended = paid.mean(-1, keepdim=True), ended.all(-1, keepdim=True)
+        later = mixer(torch.where(goes_on, following, 0.0), self.next_states)
+        return bootstrapped_returns(paid, self.discounts.unsqueeze(-1), ended, later)
+
+
+@dataclass(frozen=True, slots=True)
+class _AgentRows:
+    """k rows of the n agents of a policy.
+
+    observations, next_observations: input name → (k, n, …). recurrent_state: key → (k, n, width). actions: (k, n).
+    present: (k, n) bool.
+    """
+
+    observations: Observations
+    next_observations: Observations
+    recurrent_state: dict[str, Tensor]
     actions: Tensor
     present: Tensor
 
 
 class QMIXLearner(OffPolicyLearner):
-    """`networks`: the policies' AgentNetworks, and for QMIX a MonotonicMixer `mixer/<team>` for each team."""
+    """`networks`: the policies' AgentNetworks and, for QMIX, a MonotonicMixer `mixer/<team>` for each team."""
 
     settings: QMIXConfig
 
     def extra_networks(self) -> dict[str, nn.Module]:
         self.teams = teams(self.settings.groups, self.interface)
-        self.columns = columns(self.teams, self.interface)
+        self.columns = team_columns(self.teams, self.interface)
         if self.settings.mixer != "qmix":
             return {}
         environment = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).environment
         size = state_size(environment, self.interface)
         width, normalize = self.settings.mixing_width, self.settings.normalize_observations
         return {
-            _mixer(team): MonotonicMixer(len(members), size, width, normalize) for team, members in self.teams.items()
+            _mixer_name(team): MonotonicMixer(len(members), size, width, normalize)
+            for team, members in self.teams.items()
         }
 
-    def losses(self, batches: Mapping[str, Batch], learning: Collection[str]) -> dict[str, Loss]:
+    def losses(self, batches: Mapping[str, ReplayBatch], learning: Collection[str]) -> dict[str, ReplayLoss]:
         rows, weights = batches[JOINT].rows, batches[JOINT].weights
         chosen, following = self._values(rows, learning)
         networks = [policy for policy in self.interface.policy_ids if policy in learning]
         totals, errors, values = [], [], []
         for team, steps in self._steps(rows, learning).items():
-            networks += [name for name in (_mixer(team),) if name in self.networks]
+            networks += [name for name in (_mixer_name(team),) if name in self.networks]
             own = self.columns[team]
             self._update_statistics(team, steps.states[weights > 0])
             mixed = steps.mixed(self.mixer(self.networks, team), chosen[:, own])
@@ -82,7 +172,7 @@ class QMIXLearner(OffPolicyLearner):
             errors.append(differences.abs().amax(-1))
             values.append(mixed[counted])
         largest = torch.stack(errors).amax(0)
-        loss = Loss(
+        loss = ReplayLoss(
             total=torch.stack(totals).sum(),
             errors=largest,
             networks=tuple(networks),
@@ -91,7 +181,7 @@ class QMIXLearner(OffPolicyLearner):
         return {JOINT: loss}
 
     def _steps(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> dict[str, TeamSteps]:
-        """Of the teams in which somebody learns."""
+        """Return the steps of the teams with at least one learning policy."""
         rewards, present, terminated = (self._by_agent(rows, head) for head in (REWARDS, PRESENT, TERMINATED))
         policies, together = self.interface.policies, self.settings.mixer != "none"
         discounts, states, next_states = rows[DISCOUNTS], rows[STATE], rows[NEXT + STATE]
@@ -104,16 +194,16 @@ class QMIXLearner(OffPolicyLearner):
         }
 
     def mixer(self, networks: Mapping[str, nn.Module], team: str) -> Mixer:
-        """That of a team among `networks`, or `targets`."""
+        """Return a team's mixer, from `networks` or from `targets`."""
         match self.settings.mixer:
             case "qmix":
-                return networks[_mixer(team)]
+                return networks[_mixer_name(team)]
             case "vdn":
-                return summed
-        return unmixed
+                return vdn_mixer
+        return independent_mixer
 
     def _update_statistics(self, team: str, states: Tensor) -> None:
-        if isinstance(mixer := self.networks.get(_mixer(team)), MonotonicMixer):
+        if isinstance(mixer := self.networks.get(_mixer_name(team)), MonotonicMixer):
             mixer.update_statistics(states)
 
     def _by_agent(self, rows: Mapping[str, Tensor], head: str) -> Tensor:
@@ -121,44 +211,46 @@ class QMIXLearner(OffPolicyLearner):
         return torch.cat([rows[f"{head}/{policy}"] for policy in self.interface.policy_ids], dim=1)
 
     def _values(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> tuple[Tensor, Tensor]:
-        """(k, N) values of the actions that were taken, with gradients, and of those that are best next, without."""
+        """Return the values (k, N) of the taken actions, with gradients, and of the best next actions, without."""
         taken, best = [], []
         for policy in self.interface.policy_ids:
             network, target = self.networks[policy], self.targets[policy]
             assert isinstance(network, AgentNetwork)
             assert isinstance(target, AgentNetwork)
-            play = _Play(
-                seen=names(rows, f"{OBSERVATIONS}/{policy}"),
-                coming=names(rows, f"{NEXT}{OBSERVATIONS}/{policy}"),
-                memory=names(rows, f"{MEMORY}/{policy}"),
+            play = _AgentRows(
+                observations=subcolumns(rows, f"{OBSERVATIONS}/{policy}"),
+                next_observations=subcolumns(rows, f"{NEXT}{OBSERVATIONS}/{policy}"),
+                recurrent_state=subcolumns(rows, f"{RECURRENT_STATE}/{policy}"),
                 actions=rows[f"{ACTIONS}/{policy}"],
                 present=rows[f"{PRESENT}/{policy}"],
             )
             if policy in learning:
-                network.encoder.update_statistics({name: rows[play.present] for name, rows in play.seen.items()})
-            values, online = self._both(network, play)
+                network.encoder.update_statistics(
+                    {name: rows[play.present] for name, rows in play.observations.items()}
+                )
+            values, online = self._current_and_next(network, play)
             taken.append(values.gather(-1, play.actions.unsqueeze(-1)).squeeze(-1))
             with torch.no_grad():
-                _, valued = self._both(target, play)
-                mask = play.coming[ACTION_MASK].flatten(2) if ACTION_MASK in play.coming else None
+                _, valued = self._current_and_next(target, play)
+                mask = play.next_observations[ACTION_MASK].flatten(2) if ACTION_MASK in play.next_observations else None
                 chosen = next_actions(online if self.settings.double else None, valued, mask)
                 best.append(valued.gather(-1, chosen.unsqueeze(-1)).squeeze(-1))
         return torch.cat(taken, dim=1), torch.cat(best, dim=1)
 
-    def _both(self, network: AgentNetwork, play: _Play) -> tuple[Tensor, Tensor]:
-        """Values of what n agents saw, (k, n, actions), and of what they saw next, without gradients."""
+    def _current_and_next(self, network: AgentNetwork, play: _AgentRows) -> tuple[Tensor, Tensor]:
+        """Return the values (k, n, actions) of current observations, and of next ones without gradients."""
         if self.settings.recurrence is not None:
-            return _in_sequences(network, play, self.settings.recurrence.sequence)
-        values = network.values(flat(play.seen)).unflatten(0, play.present.shape)
+            return _sequence_values(network, play, self.settings.recurrence.sequence)
+        values = network.values(flatten_leading(play.observations)).unflatten(0, play.present.shape)
         with torch.no_grad():
-            return values, network.values(flat(play.coming)).unflatten(0, play.present.shape)
+            return values, network.values(flatten_leading(play.next_observations)).unflatten(0, play.present.shape)
 
 
-def _in_sequences(network: AgentNetwork, play: _Play, steps: int) -> tuple[Tensor, Tensor]:
-    """As `_both`: rows (S · T, n, …) become T steps of S · n agents, and rows again.
+def _sequence_values(network: AgentNetwork, play: _AgentRows, steps: int) -> tuple[Tensor, Tensor]:
+    """As `_current_and_next`, on rows (S · T, n, …) unrolled as T steps of S · n agents.
 
-    What an agent remembered before the first step is what it had when it acted (Kapturowski et al., 2019, "Recurrent
-    experience replay in distributed reinforcement learning", stored state); nothing, where an episode begins.
+    The initial recurrent state is the stored one from when the agent acted (Kapturowski et al., 2019, "Recurrent
+    experience replay in distributed reinforcement learning", stored state).
     """
     agents = play.present.shape[1]
 
@@ -168,23 +260,23 @@ def _in_sequences(network: AgentNetwork, play: _Play, steps: int) -> tuple[Tenso
     def in_rows(column: Tensor) -> Tensor:
         return column.unflatten(1, (-1, agents)).transpose(0, 1).flatten(0, 1)
 
-    acted, there = in_time(play.actions), in_time(play.present)
-    state = {key: in_time(column)[0] for key, column in play.memory.items()}
-    seen = {name: in_time(column) for name, column in play.seen.items()}
-    values, behind = network.unroll(seen, state, acted, there)
+    actions, present = in_time(play.actions), in_time(play.present)
+    state = {key: in_time(column)[0] for key, column in play.recurrent_state.items()}
+    observations = {name: in_time(column) for name, column in play.observations.items()}
+    values, hidden = network.unroll(observations, state, actions, present)
     with torch.no_grad():
-        coming = flat({name: in_time(column) for name, column in play.coming.items()})
-        following = network.values_after(coming, acted.flatten(), behind.flatten(0, 1))
+        next_observations = flatten_leading({name: in_time(column) for name, column in play.next_observations.items()})
+        following = network.values_after(next_observations, actions.flatten(), hidden.flatten(0, 1))
     return in_rows(values), in_rows(following.unflatten(0, (steps, -1)))
 
 
-def columns(of_teams: Teams, interface: Interface) -> dict[str, list[int]]:
-    """team → where its agents stand when those of all policies stand beside one another, policy by policy."""
+def team_columns(of_teams: Teams, interface: Interface) -> dict[str, list[int]]:
+    """Return team → the indices of its agents among the columns of all policies."""
     order = [
         agent for policy in interface.policy_ids for agent in interface.agents if interface.policies[agent] == policy
     ]
     return {team: [order.index(agent) for agent in members] for team, members in of_teams.items()}
 
 
-def _mixer(team: str) -> str:
+def _mixer_name(team: str) -> str:
     return f"mixer/{team}"

@@ -1,11 +1,11 @@
-"""Episode chunks → train batch of one policy, a column at a time.
+"""Builds train batches from episode chunks: GAE advantages, value targets, sequences, shuffled minibatches.
 
-RLlib's default learner pipeline handles each time step as a Python object. Here the chunks of a policy are
-concatenated, their observations, T + 1 per chunk of T steps, are valued in a few passes, and the last of each chunk
-serves as bootstrap: 0 where the agent terminated, its value where the agent was truncated or the chunk was cut.
+RLlib's default learner pipeline handles each time step as a Python object. Here, the chunks of a policy are
+concatenated, and their observations, T + 1 per chunk of T steps, are valued in a few passes. The last observation of a
+chunk is the bootstrap: 0 if the agent terminated, its value if the agent was truncated or the chunk was cut.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,22 +16,64 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from torch import Tensor
 
-from training.learners.advantages import generalized_advantages
 from training.modules.actor_critic import ActorCritic
+from training.rllib_compat import column_data
+
+
+def generalized_advantages(
+    rewards: NDArray,
+    values: NDArray,
+    next_values: NDArray,
+    lasts: NDArray,
+    gamma: float,
+    lambda_: float,
+) -> NDArray:
+    """Return the advantages of the steps of concatenated chunks.
+
+        δ_t = r_t + γ V(s_{t+1}) − V(s_t)
+        A_t = δ_t + γλ A_{t+1},    A_{t+1} = 0 after the last step of a chunk
+
+    Schulman et al., 2016, "High-dimensional continuous control using generalized advantage estimation",
+    arXiv 1506.02438, equations 11 and 16.
+
+    Args:
+        rewards: (n,).
+        values: (n,), of the steps' observations.
+        next_values: (n,), 0 where the agent terminated, and the value of the last observation where it was truncated or
+            the chunk was cut.
+        lasts: (n,) bool, True at the last step of each chunk.
+        gamma: γ.
+        lambda_: λ.
+
+    Returns:
+        (n,) float64.
+    """
+    assert rewards.shape == values.shape == next_values.shape == lasts.shape
+    deltas = rewards.astype(np.float64) + gamma * next_values - values
+    decays = np.where(lasts, 0.0, gamma * lambda_)
+    advantages = np.empty_like(deltas)
+    advantage = 0.0
+    # Plain floats are faster than one NumPy call per time step of a padded matrix.
+    steps = zip(range(len(deltas) - 1, -1, -1), deltas[::-1].tolist(), decays[::-1].tolist(), strict=True)
+    for t, delta, decay in steps:
+        advantage = delta + decay * advantage
+        advantages[t] = advantage
+    return advantages
+
 
 Chunks = Sequence[SingleAgentEpisode]
 Bootstraps = Callable[[Chunks], NDArray]
-"""Chunks → (c,) bool: whether the value of the last observation of each counts."""
+"""Chunks → (c,) bool: whether the value of each chunk's last observation counts."""
 
-VALUED_AT_ONCE = 2048
-"""Rows of one pass: of pictures as floats, more than a few thousand fill the memory."""
+VALUE_PASS_ROWS = 2048
+"""Rows per forward pass: more than a few thousand images as floats would exhaust memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sequences:
-    """Steps that follow one another, of a policy with a memory. Sequence i is steps starts[i] … + lengths[i] - 1.
+    """Consecutive steps for a recurrent policy. Sequence i is steps starts[i] to starts[i] + lengths[i] - 1.
 
-    starts, lengths: (S,). state: key → (S, width), that each began from.
+    starts, lengths: (S,). state: key → (S, width), the initial recurrent states.
     """
 
     starts: Tensor
@@ -43,9 +85,9 @@ class Sequences:
 class TrainBatch:
     """n steps of one policy.
 
-    observations: ONNX input name → (N, …) in the environment's dtype, N ≥ n; those of the steps are rows `acted`, (n,),
-    so that pictures are not copied once more. actions: raw, (n,) or (n, m). dist_inputs: (n, d), that they were drawn
-    by. log_p, advantages (standardised), targets (of the value function): (n,) float32.
+    observations: ONNX input name → (N, …) in the environment's dtype, N ≥ n; the steps' own are rows `acted`, (n,),
+    which avoids copying images. actions: raw, (n,) or (n, m). dist_inputs: (n, d), of the sampling policy. log_p,
+    advantages (standardised), targets (of the value function): (n,) float32.
     """
 
     observations: dict[str, Tensor]
@@ -64,11 +106,11 @@ class TrainBatch:
 
     @property
     def units(self) -> int:
-        """What minibatches are drawn from: sequences with a memory, else steps."""
+        """The number of units that minibatches are drawn from: sequences if recurrent, otherwise steps."""
         return len(self) if self.sequences is None else len(self.sequences.starts)
 
     def take(self, units: Tensor) -> "Minibatch":
-        """The steps of some units, in order."""
+        """Return the steps of some units, in order."""
         if self.sequences is None:
             steps, memory = units, {}
         else:
@@ -90,7 +132,7 @@ class TrainBatch:
 
 @dataclass(frozen=True, slots=True)
 class Minibatch:
-    """Some steps of a TrainBatch. inputs: what `forward_train` of the policy's module takes."""
+    """Some steps of a TrainBatch. inputs: the arguments of the module's `forward_train`."""
 
     inputs: dict[str, Any]
     actions: Tensor
@@ -100,8 +142,8 @@ class Minibatch:
     targets: Tensor
 
 
-def unless_terminated(chunks: Chunks) -> NDArray:
-    """Only what follows a terminal state is worth nothing: a truncated agent could have gone on."""
+def bootstrap_unless_terminated(chunks: Chunks) -> NDArray:
+    """Bootstrap truncated and cut chunks: only terminal states have no future return."""
     return np.array([not chunk.is_terminated for chunk in chunks])
 
 
@@ -112,25 +154,31 @@ def train_batch(
     gamma: float,
     lambda_: float,
     sequence: int | None = None,
-    bootstraps: Bootstraps = unless_terminated,
+    bootstraps: Bootstraps = bootstrap_unless_terminated,
 ) -> TrainBatch:
-    """The steps of non-empty `chunks`, on the module's device. Updates the module's observation statistics first.
+    """Build the batch of non-empty `chunks` on the module's device, after updating its observation statistics.
 
-    sequence: steps of the sequences that chunks are cut into, of a module with a memory.
+    Args:
+        module: The policy's module.
+        chunks: Non-empty episode chunks of the policy.
+        gamma: Discount factor.
+        lambda_: λ of the advantages.
+        sequence: Maximum length of the sequences for a recurrent module.
+        bootstraps: Selects the chunks whose last observation is bootstrapped from.
     """
     device = next(module.parameters()).device
     lengths = np.array([len(chunk) for chunk in chunks])
     acted = np.delete(np.arange(lengths.sum() + len(chunks)), np.cumsum(lengths + 1) - 1)
     observations = {
-        name: torch.from_numpy(np.concatenate([chunk.observations.data[name] for chunk in chunks])).to(device)
-        for name in chunks[0].observations.data
+        name: torch.from_numpy(np.concatenate([column_data(chunk.observations)[name] for chunk in chunks])).to(device)
+        for name in column_data(chunks[0].observations)
     }
     module.encoder.update_statistics(observations)
     state = {key: torch.from_numpy(column).to(device) for key, column in _states(chunks).items()}
     values, bootstrap = _values(module, observations, acted, lengths, state)
     next_values = np.append(values[1:], 0.0)
     next_values[np.cumsum(lengths) - 1] = bootstrap * bootstraps(chunks)
-    rewards = np.concatenate([chunk.rewards.data for chunk in chunks])
+    rewards = np.concatenate([column_data(chunk.rewards) for chunk in chunks])
     lasts = np.zeros(len(acted), dtype=bool)
     lasts[np.cumsum(lengths) - 1] = True
     advantages = generalized_advantages(rewards, values, next_values, lasts, gamma, lambda_)
@@ -142,7 +190,7 @@ def train_batch(
     return TrainBatch(
         observations=observations,
         acted=column(acted),
-        actions=column(np.concatenate([chunk.actions.data for chunk in chunks])),
+        actions=column(np.concatenate([column_data(chunk.actions) for chunk in chunks])),
         dist_inputs=column(_outputs(chunks, Columns.ACTION_DIST_INPUTS)),
         log_p=column(_outputs(chunks, Columns.ACTION_LOGP)),
         advantages=column(_standardized(advantages).astype(np.float32)),
@@ -159,7 +207,7 @@ def _values(
     lengths: NDArray,
     state: dict[str, Tensor],
 ) -> tuple[NDArray, NDArray]:
-    """Values of the steps' observations (n,), and of the last observation of each chunk (c,)."""
+    """Return the values of the steps' observations, (n,), and of each chunk's last observation, (c,)."""
     lasts, ends = np.cumsum(lengths) - 1, np.cumsum(lengths + 1) - 1
     if not state:
         values, _ = _value_pass(module, observations, np.arange(lengths.sum() + len(lengths)), {})
@@ -173,10 +221,10 @@ def _values(
 def _value_pass(
     module: ActorCritic, observations: dict[str, Tensor], rows: NDArray, state: dict[str, Tensor]
 ) -> tuple[NDArray, dict[str, Tensor]]:
-    """Values of some rows of the observations, one step each from its own state, and the states after."""
+    """Return the values of some rows, one step each from its own recurrent state, and the states after it."""
     values, states = [], []
-    for first in range(0, len(rows), VALUED_AT_ONCE):
-        part = slice(first, first + VALUED_AT_ONCE)
+    for first in range(0, len(rows), VALUE_PASS_ROWS):
+        part = slice(first, first + VALUE_PASS_ROWS)
         batch = {
             Columns.OBS: {name: value[rows[part]] for name, value in observations.items()},
             Columns.STATE_IN: {key: value[part] for key, value in state.items()},
@@ -188,15 +236,15 @@ def _value_pass(
 
 
 def _states(chunks: Chunks) -> dict[str, NDArray]:
-    """key → (n, width), the state that each step began from; empty without a memory."""
+    """Return key → (n, width), the recurrent state before each step; empty if not recurrent."""
     if Columns.STATE_IN not in chunks[0].extra_model_outputs:
         return {}
-    columns = [chunk.extra_model_outputs[Columns.STATE_IN].data for chunk in chunks]
+    columns = [column_data(chunk.extra_model_outputs[Columns.STATE_IN]) for chunk in chunks]
     return {key: np.concatenate([column[key] for column in columns]) for key in columns[0]}
 
 
 def _sequences(lengths: NDArray, sequence: int, state: dict[str, Tensor]) -> Sequences:
-    """Cut each chunk into sequences of `sequence` steps and a rest."""
+    """Split each chunk into sequences of `sequence` steps and a remainder."""
     firsts = np.cumsum(lengths) - lengths
     starts = np.concatenate([first + np.arange(0, n, sequence) for first, n in zip(firsts, lengths, strict=True)])
     stops = np.append(starts[1:], lengths.sum())
@@ -206,8 +254,27 @@ def _sequences(lengths: NDArray, sequence: int, state: dict[str, Tensor]) -> Seq
 
 
 def _outputs(chunks: Chunks, column: str) -> NDArray:
-    return np.concatenate([chunk.extra_model_outputs[column].data for chunk in chunks])
+    return np.concatenate([column_data(chunk.extra_model_outputs[column]) for chunk in chunks])
 
 
 def _standardized(values: NDArray) -> NDArray:
     return (values - values.mean()) / max(1e-4, values.std())
+
+
+def minibatches(batches: Mapping[str, TrainBatch], *, size: int, epochs: int) -> Iterator[dict[str, Minibatch]]:
+    """Yield policy id → minibatch; each epoch visits each step of each policy once, in a new random order.
+
+    All policies have the same number of minibatches, given by the policy with the most steps and `size`. RLlib's
+    MiniBatchCyclicIterator uses equal sizes instead, which repeats the few steps of a small policy many times per
+    epoch. For recurrent policies, whole sequences are drawn.
+    """
+    count = -(-max(len(batch) for batch in batches.values()) // size)
+    for _ in range(epochs):
+        orders = {policy: _order(batch).tensor_split(count) for policy, batch in batches.items()}
+        for i in range(count):
+            yield {policy: batches[policy].take(order[i]) for policy, order in orders.items() if len(order[i])}
+
+
+def _order(batch: TrainBatch) -> torch.Tensor:
+    # Drawn on the CPU, for the same order on every device.
+    return torch.randperm(batch.units).to(batch.acted.device)

@@ -1,1 +1,1 @@
-"""RLModules."""
+"""Neural networks as RLModules: actor-critic, Q-networks, MADDPG, QMIX, encoders and recurrent layers."""

@@ -1,4 +1,7 @@
-"""Action distributions over their raw actions, in torch: see league/policies/actions.py for the convention."""
+"""Action distributions in torch, for losses and exported graphs; see league/policies/actions.py for the convention.
+
+training/sampling/distributions.py is the NumPy counterpart.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,43 +15,39 @@ from torch import Tensor
 from league.errors import ConfigError
 
 
-class Distribution(Protocol):
-    """inputs: (k, d) float32, raw actions: (k,) or (k, m); each answer has a row's worth, (k,)."""
+class TorchDistribution(Protocol):
+    """A distribution of raw actions. inputs: (k, d) float32. raw: (k,) or (k, m). Results: (k,)."""
 
     @property
     def outputs(self) -> int:
-        """How many of the d inputs a network answers from the observation."""
-        ...
+        """The number of network outputs among the d inputs."""
 
     def evaluate(self, inputs: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Log-probability (density) of the raw actions, and the entropy in nats."""
-        ...
+        """Return the log-probabilities (densities) of the raw actions, and the entropies in nats."""
 
     def divergence(self, old: Tensor, new: Tensor) -> Tensor:
-        """KL(old || new) of two inputs."""
-        ...
+        """Return KL(old || new) per row."""
 
     def mode(self, inputs: Tensor) -> Tensor:
-        """The most probable raw action."""
-        ...
+        """Return the most probable raw actions."""
 
 
-def distribution(space: gymnasium.Space) -> Distribution:
-    """The distribution over raw actions of `space`. Raises ConfigError where there is none."""
+def torch_distribution(space: gymnasium.Space) -> TorchDistribution:
+    """Return the distribution over raw actions of `space`. Raises ConfigError for unsupported spaces."""
     match space:
         case gymnasium.spaces.Discrete():
-            return Categorical(int(space.n))
+            return TorchCategorical(int(space.n))
         case gymnasium.spaces.MultiDiscrete():
-            return Categoricals(tuple(space.nvec.ravel().tolist()))
+            return TorchMultiCategorical(tuple(space.nvec.ravel().tolist()))
         case gymnasium.spaces.Box() if np.issubdtype(space.dtype, np.floating):
-            return Gaussian(math.prod(space.shape))
+            return TorchGaussian(math.prod(space.shape))
     raise ConfigError(
-        f"training: no policy has actions of {space}: expected Discrete, MultiDiscrete or a Box of floats"
+        f"training: unsupported action space {space}: expected Discrete, MultiDiscrete or a Box of floats"
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Categorical:
+class TorchCategorical:
     """One of n; inputs are logits."""
 
     n: int
@@ -70,8 +69,8 @@ class Categorical:
 
 
 @dataclass(frozen=True, slots=True)
-class Categoricals:
-    """Independent choices, one of sizes[i] each; inputs are their logits one behind another."""
+class TorchMultiCategorical:
+    """Independent choices, one of sizes[i] each; inputs are their concatenated logits."""
 
     sizes: tuple[int, ...]
 
@@ -81,22 +80,22 @@ class Categoricals:
 
     def evaluate(self, inputs: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
         parts = [
-            Categorical(n).evaluate(part, raw[:, i])
+            TorchCategorical(n).evaluate(part, raw[:, i])
             for i, (n, part) in enumerate(zip(self.sizes, inputs.split(self.sizes, dim=-1), strict=True))
         ]
         return torch.stack([log_p for log_p, _ in parts]).sum(0), torch.stack([entropy for _, entropy in parts]).sum(0)
 
     def divergence(self, old: Tensor, new: Tensor) -> Tensor:
         pairs = zip(self.sizes, old.split(self.sizes, dim=-1), new.split(self.sizes, dim=-1), strict=True)
-        return torch.stack([Categorical(n).divergence(before, after) for n, before, after in pairs]).sum(0)
+        return torch.stack([TorchCategorical(n).divergence(before, after) for n, before, after in pairs]).sum(0)
 
     def mode(self, inputs: Tensor) -> Tensor:
         return torch.stack([part.argmax(dim=-1) for part in inputs.split(self.sizes, dim=-1)], dim=-1)
 
 
 @dataclass(frozen=True, slots=True)
-class Gaussian:
-    """m independent normal numbers; inputs are their means, then the logarithms of their standard deviations."""
+class TorchGaussian:
+    """m independent normal variables; inputs are means, then logarithms of standard deviations."""
 
     m: int
 

@@ -1,15 +1,204 @@
-"""What reads an observation: features, then hidden layers. Several policies may share one."""
+"""Observation encoders: dense, convolutional and nested, with input normalisation.
+
+Each part of an observation is converted to float32: integers become one-hot, boxes with wide finite bounds, such as 0
+to 255 for images, are scaled to [0, 1], and other numbers are taken as they are.
+"""
 
 from collections.abc import Sequence
 
 import gymnasium
+import numpy as np
+import torch
 from torch import Tensor, nn
 
-from training.modules.features import Convolutions, Features
+from league.errors import ConfigError
+from league.spaces import ACTION_MASK
+
+MIN_VARIANCE = 1e-8
+MAX_DEVIATIONS = 10.0
+"""Values are clipped at this many standard deviations from the mean."""
+
+
+class RunningNormalization(nn.Module):
+    """Normalises by the running mean and variance of each element.
+
+    They are buffers: part of the weights and of the graph.
+
+    Before the first `update`, values are only clipped.
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, shape: Sequence[int]) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        # Doubles: far from 0, float32 rounding would dominate the deviations.
+        self.register_buffer("mean", torch.zeros(*shape, dtype=torch.float64))
+        self.register_buffer("variance", torch.ones(*shape, dtype=torch.float64))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(B, *shape) → (B, *shape) float32."""
+        scaled = (values - self.mean) * torch.rsqrt(self.variance + MIN_VARIANCE)
+        return scaled.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS).float()
+
+    @torch.no_grad()
+    def update(self, values: Tensor) -> None:
+        """Add a batch (B, *shape).
+
+        Chan, Golub and LeVeque, 1979, "Updating formulae and a pairwise algorithm for computing sample variances":
+        with δ the difference of the two means, M = M_a + M_b + δ² n_a n_b / n.
+        """
+        values, seen = values.double(), len(values)
+        total = self.count + seen
+        delta = values.mean(0) - self.mean
+        squares = self.variance * self.count + values.var(0, correction=0) * seen
+        squares += delta.square() * self.count * seen / total
+        self.mean += delta * seen / total
+        self.variance.copy_(squares / total)
+        self.count.copy_(total)
+
+
+MIN_SCALED_SPAN, MAX_SCALED_SPAN = 100.0, 1e6
+"""A Box is scaled if all spans between its bounds are in this range; wider bounds say nothing about its values."""
+
+Convolutions = Sequence[tuple[int, int, int]]
+"""(filters, kernel, stride) each, without padding."""
+
+
+class ObservationFeatures(nn.Module):
+    """Concatenates all parts of an observation except the action mask: ONNX input name → (B, …), to (B, width) float32.
+
+    A Box of shape (height, width, channels) passes through the convolutions, each followed by ReLU; others are
+    flattened. normalize: scale boxes of floats by running statistics instead of their bounds. Raises ConfigError if the
+    convolutions do not fit.
+    """
+
+    def __init__(self, space: gymnasium.spaces.Dict, convolutions: Convolutions = (), normalize: bool = False) -> None:
+        super().__init__()
+        spaces = {name: part for name, part in sorted(space.spaces.items()) if name != ACTION_MASK}
+        self.names = tuple(spaces)
+        # A list, since names may contain dots, which torch's ModuleDict rejects.
+        self.parts = nn.ModuleList(_feature(part, convolutions, normalize) for part in spaces.values())
+        if convolutions and not any(isinstance(part, ImageEncoder) for part in self.parts):
+            raise ConfigError("training.convolutions: no part of the observation is a Box of (height, width, channels)")
+        with torch.no_grad():
+            example = {name: torch.as_tensor(part.sample())[None] for name, part in spaces.items()}
+            self.width = self(example).shape[-1]
+
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        rows = [part(observations[name]) for name, part in zip(self.names, self.parts, strict=True)]
+        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=-1)
+
+    def update_statistics(self, observations: dict[str, Tensor]) -> None:
+        """Update the running statistics of the parts that have them."""
+        for name, part in zip(self.names, self.parts, strict=True):
+            for layer in part.modules():
+                if isinstance(layer, RunningNormalization):
+                    layer.update(observations[name])
+
+
+class OneHot(nn.Module):
+    """Integers (B, …), element i in [starts[i], starts[i] + sizes[i]) → (B, sum of sizes)."""
+
+    columns: Tensor
+    values: Tensor
+
+    def __init__(self, starts: Sequence[int], sizes: Sequence[int]) -> None:
+        super().__init__()
+        columns = np.repeat(np.arange(len(sizes)), sizes)
+        values = np.concatenate([start + np.arange(size) for start, size in zip(starts, sizes, strict=True)])
+        self.register_buffer("columns", torch.as_tensor(columns), persistent=False)
+        self.register_buffer("values", torch.as_tensor(values), persistent=False)
+
+    def forward(self, integers: Tensor) -> Tensor:
+        flat = integers.reshape(integers.shape[0], -1).long()
+        return (flat[:, self.columns] == self.values).float()
+
+
+class UnitScale(nn.Module):
+    """Scales [low, high] to [0, 1]."""
+
+    low: Tensor
+    share: Tensor
+
+    def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
+        super().__init__()
+        self.starts_at_zero = not low.any()
+        self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32), persistent=False)
+        self.register_buffer("share", torch.as_tensor(1 / (high - low), dtype=torch.float32), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        values = values.float()
+        return values * self.share if self.starts_at_zero else (values - self.low) * self.share
+
+
+class ToFloat(nn.Module):
+    """Converts to float32."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        return values.float()
+
+
+class ImageEncoder(nn.Module):
+    """Images (B, height, width, channels) → convolutions → (B, width)."""
+
+    def __init__(self, numbers: nn.Module, shape: tuple[int, ...], convolutions: Convolutions) -> None:
+        super().__init__()
+        self.numbers = numbers
+        height, width, channels = shape
+        layers: list[nn.Module] = []
+        for filters, kernel, stride in convolutions:
+            if min(height, width) < kernel:
+                raise ConfigError(f"training.convolutions: kernel {kernel} is larger than images of {height}×{width}")
+            layer = nn.Conv2d(channels, filters, kernel, stride)
+            nn.init.orthogonal_(layer.weight, 2**0.5)
+            nn.init.zeros_(layer.get_parameter("bias"))
+            # Observations have their channels last; this layout avoids moving them in memory.
+            layer.weight.data = layer.weight.data.to(memory_format=torch.channels_last)
+            layers += [layer, nn.ReLU()]
+            height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, filters
+        self.convolutions = nn.Sequential(*layers, nn.Flatten())
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.convolutions(self.numbers(values).permute(0, 3, 1, 2))
+
+
+def _feature(space: gymnasium.Space, convolutions: Convolutions, normalize: bool) -> nn.Module:
+    match space:
+        case gymnasium.spaces.Discrete():
+            return OneHot([int(space.start)], [int(space.n)])
+        case gymnasium.spaces.MultiDiscrete():
+            return OneHot(space.start.ravel().tolist(), space.nvec.ravel().tolist())
+        case gymnasium.spaces.MultiBinary():
+            return nn.Sequential(ToFloat(), nn.Flatten())
+        case gymnasium.spaces.Box():
+            numbers = _box_feature(space, normalize)
+            if convolutions and len(space.shape) == 3:
+                return ImageEncoder(numbers, space.shape, convolutions)
+            return nn.Sequential(numbers, nn.Flatten())
+    raise ConfigError(f"training: unsupported observation space {space}")
+
+
+def _box_feature(space: gymnasium.spaces.Box, normalize: bool) -> nn.Module:
+    if normalize and np.issubdtype(space.dtype, np.floating):
+        return RunningNormalization(space.shape)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    with np.errstate(over="ignore"):
+        spans = high - low
+    if spans.size and spans.min() >= MIN_SCALED_SPAN and spans.max() <= MAX_SCALED_SPAN:
+        return UnitScale(*(_scalar_if_equal(bound) for bound in (low, high)))
+    return ToFloat()
+
+
+def _scalar_if_equal(bound: np.ndarray) -> np.ndarray:
+    """Return a scalar if all elements are equal."""
+    return bound.flat[:1].reshape(()) if (bound == bound.flat[0]).all() else bound
 
 
 class Encoder(nn.Module):
-    """ONNX input name → (B, …), to (B, width) float32. hidden: widths of the layers, ReLU behind each."""
+    """ONNX input name → (B, …), to (B, width) float32. hidden: widths of the layers, each followed by ReLU."""
 
     def __init__(
         self,
@@ -19,7 +208,7 @@ class Encoder(nn.Module):
         normalize: bool = False,
     ) -> None:
         super().__init__()
-        self.features = Features(space, convolutions, normalize)
+        self.features = ObservationFeatures(space, convolutions, normalize)
         layers: list[nn.Module] = []
         self.width = self.features.width
         for width in hidden:
@@ -31,12 +220,12 @@ class Encoder(nn.Module):
         return self.hidden(self.features(observations))
 
     def update_statistics(self, observations: dict[str, Tensor]) -> None:
-        """Take a batch into the running statistics of the observations, where they are kept."""
+        """Update the running statistics of the observations, if normalised."""
         self.features.update_statistics(observations)
 
 
 def linear(inputs: int, outputs: int, gain: float) -> nn.Linear:
-    """A layer with orthogonal weights and no bias to begin with."""
+    """Create a layer with orthogonal weights and zero bias."""
     layer = nn.Linear(inputs, outputs)
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)

@@ -1,4 +1,4 @@
-"""Values of discrete actions: dueling, distributional and noisy where asked for, and masked wherever it acts."""
+"""The Q-network of masked DQN, with dueling heads, noisy layers and C51's atoms."""
 
 from typing import Any
 
@@ -7,24 +7,54 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from league.spaces import ACTION_MASK
-from training.modules.acting import MASKED, Acting
-from training.modules.distributions import Categorical
+from training.modules.distributions import TorchCategorical
 from training.modules.encoder import Encoder, linear
-from training.modules.noisy import NoisyLinear
+from training.modules.policy_module import MASKED_LOGIT, PolicyModule
+
+INITIAL_SIGMA = 0.5
+"""σ₀ of section 3.2."""
 
 
-class QNetwork(Acting):
-    """Encoder and heads. model_config: `hidden`, `convolutions`, `normalize` as of the encoder; `dueling`, `noisy`;
-    `atoms`, (number, low, high) of the returns that C51's atoms stand for, or None.
+class NoisyLinear(nn.Module):
+    """y = (μ_w + σ_w ε_w) x + μ_b + σ_b ε_b with factorised noise, equations 9 to 11: ε_w = f(ε_out) f(ε_in)ᵀ and
+    ε_b = f(ε_out), f(x) = sgn(x) √|x|. Without noise, ε = 0."""
 
-    ACTION_DIST_INPUTS are values, MASKED where an action is illegal: their mode is the greedy legal action. While
-    exploring they are the logarithms of the probabilities by which ε-greedy play acts.
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.inputs, self.outputs = inputs, outputs
+        bound = inputs**-0.5
+        self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound))
+        self.weight_deviation = nn.Parameter(torch.full((outputs, inputs), INITIAL_SIGMA * bound))
+        self.bias_deviation = nn.Parameter(torch.full((outputs,), INITIAL_SIGMA * bound))
+
+    def forward(self, x: Tensor, noise: bool = False) -> Tensor:
+        """(B, inputs) → (B, outputs). noise: draw new noise, the same for all rows."""
+        if not noise:
+            return nn.functional.linear(x, self.weight, self.bias)
+        incoming, outgoing = (_scaled_noise(torch.randn(size, device=x.device)) for size in (self.inputs, self.outputs))
+        weight = self.weight + self.weight_deviation * torch.outer(outgoing, incoming)
+        return nn.functional.linear(x, weight, self.bias + self.bias_deviation * outgoing)
+
+
+def _scaled_noise(noise: Tensor) -> Tensor:
+    return noise.sign() * noise.abs().sqrt()
+
+
+class QNetwork(PolicyModule):
+    """Encoder and heads.
+
+    model_config: `hidden`, `convolutions`, `normalize` of the encoder; `dueling`, `noisy`; `atoms`, (number, low, high)
+    of C51's returns, or None.
+
+    ACTION_DIST_INPUTS are values, MASKED_LOGIT for illegal actions: their mode is the greedy legal action. With
+    exploration they are the log-probabilities of ε-greedy actions.
     """
 
     def setup(self) -> None:
         config = self.model_config
         self.actions = int(self.action_space.n)
-        self.distribution = Categorical(self.actions)
+        self.distribution = TorchCategorical(self.actions)
         self.encoder = Encoder(
             self.observation_space, config["hidden"], config.get("convolutions", ()), config.get("normalize", False)
         )
@@ -35,23 +65,23 @@ class QNetwork(Acting):
         self.advantages = self._head(self.actions * self.depth)
         self.value = self._head(self.depth) if self.dueling else None
 
-    def answers(self, observations: dict[str, Tensor], noise: bool = False) -> Tensor:
-        """(B, n) values, or (B, n, atoms) logits of their distributions; not masked.
+    def head_outputs(self, observations: dict[str, Tensor], noise: bool = False) -> Tensor:
+        """Return values (B, n), or logits (B, n, atoms) of return distributions, without masks.
 
-        Dueling: V + A − mean A (Wang et al., 2016, arXiv 1511.06581, equation 9), the mean of the legal actions: what
-        is never played is never learned, and should not move what is.
+        Dueling: V + A − mean A (Wang et al., 2016, arXiv 1511.06581, equation 9), with the mean over legal actions:
+        values of actions that are never played are never learned, and should not affect others.
         """
         noise = noise and self.noisy
         embeddings = self.encoder(observations)
         answers = self._answer(self.advantages, embeddings, noise).unflatten(-1, (self.actions, self.depth))
         if self.value is not None:
             value = self._answer(self.value, embeddings, noise).unsqueeze(-2)
-            counted = legal(observations, self.actions).unsqueeze(-1)
+            counted = legal_actions(observations, self.actions).unsqueeze(-1)
             answers = value + answers - (answers * counted).sum(-2, keepdim=True) / counted.sum(-2, keepdim=True)
         return answers if self.atoms is not None else answers.squeeze(-1)
 
     def expected(self, answers: Tensor) -> Tensor:
-        """What `answers` gave → (B, n) values."""
+        """Convert `head_outputs` to values, (B, n)."""
         return answers if self.atoms is None else (answers.softmax(-1) * self.atoms).sum(-1)
 
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
@@ -62,8 +92,8 @@ class QNetwork(Acting):
         return {Columns.ACTION_DIST_INPUTS: epsilon_greedy(values, self.exploration)}
 
     def _masked(self, observations: dict[str, Tensor], noise: bool) -> Tensor:
-        values = self.expected(self.answers(observations, noise))
-        return masked(values, observations)
+        values = self.expected(self.head_outputs(observations, noise))
+        return mask_illegal(values, observations)
 
     def _head(self, outputs: int) -> nn.Module:
         width = self.encoder.width
@@ -73,16 +103,18 @@ class QNetwork(Acting):
         return head(embeddings, noise) if isinstance(head, NoisyLinear) else head(embeddings)
 
 
-def masked(values: Tensor, observations: dict[str, Tensor]) -> Tensor:
-    """Values (B, n), MASKED where the mask forbids an action."""
+def mask_illegal(values: Tensor, observations: dict[str, Tensor]) -> Tensor:
+    """Set the values (B, n) of illegal actions to MASKED_LOGIT."""
     if ACTION_MASK not in observations:
         return values
-    return torch.where(observations[ACTION_MASK].flatten(1).bool(), values, MASKED)
+    return torch.where(observations[ACTION_MASK].flatten(1).bool(), values, MASKED_LOGIT)
 
 
-def legal(observations: dict[str, Tensor], actions: int) -> Tensor:
-    """(B, n) bool, which actions the mask allows. Where it allows none, as in some environments' last observations, it
-    says nothing about what could have been done, and all count."""
+def legal_actions(observations: dict[str, Tensor], actions: int) -> Tensor:
+    """Return (B, n) bool, which actions the mask allows.
+
+    If the mask allows no action, as in the last observations of some environments, all actions count.
+    """
     if ACTION_MASK not in observations:
         return next(iter(observations.values())).new_ones(1, actions, dtype=torch.bool)
     allowed = observations[ACTION_MASK].flatten(1).bool()
@@ -90,10 +122,12 @@ def legal(observations: dict[str, Tensor], actions: int) -> Tensor:
 
 
 def epsilon_greedy(values: Tensor, epsilon: float) -> Tensor:
-    """Masked values (B, n) → log-probabilities of acting at random among legal actions with probability ε, else
-    greedily; MASKED where they are 0. A value of exactly 0 is one like others."""
-    are_legal = values > MASKED
+    """Convert masked values (B, n) to log-probabilities of ε-greedy actions among the legal ones.
+
+    Illegal actions have MASKED_LOGIT.
+    """
+    are_legal = values > MASKED_LOGIT
     count = are_legal.sum(-1, keepdim=True).clamp(min=1)
     best = nn.functional.one_hot(values.argmax(-1), values.shape[-1])
     probabilities = are_legal * (epsilon / count) + (1 - epsilon) * best
-    return torch.where(probabilities > 0, probabilities.clamp(min=1e-30).log(), MASKED)
+    return torch.where(probabilities > 0, probabilities.clamp(min=1e-30).log(), MASKED_LOGIT)

@@ -1,1 +1,1 @@
-"""The EnvRunner on the kernel's lockstep stepping."""
+"""Sampling: an EnvRunner on the league's lockstep stepping, opponents, recorders, exploration."""

@@ -1,4 +1,4 @@
-"""What a runner reports of its play."""
+"""Collects a runner's statistics of play and logs them under RLlib's metric names."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -30,18 +30,17 @@ from league.environments.stepping import Ending
 from training.sampling.distributions import Distribution
 
 ENTROPY = "entropy"
-"""Mean entropy of the distributions that were played from, in nats, per policy."""
+"""Mean entropy of the action distributions while sampling, in nats, per policy."""
 CRASHES = "crashes"
-"""Episodes that were lost because the environment raised."""
+"""Number of episodes lost because the environment raised."""
 EPISODE_MODULE_LEN_MEAN = "module_episode_len_mean"
 EPISODE_AGENT_LEN_MEAN = "agent_episode_len_mean"
-"""Actions of an agent in an episode, mean over the agents of a policy, or of one agent."""
+"""Actions of an agent per episode: mean over the agents of a policy, or of one agent."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentEpisode:
-    """What an agent of the league's own had from an episode: its return counts from the episode's first step on, its
-    steps from where its policy took over."""
+    """One agent's part of an episode: the return of the whole episode, and the steps that its policy played."""
 
     agent: int
     steps: int
@@ -50,83 +49,84 @@ class AgentEpisode:
 
 @dataclass(slots=True)
 class PlayedEpisode:
-    """steps: of the environment, random and opponents' ones included. agents: the league's own, as they left."""
+    """steps: of the environment, including random and opponents' moves. agents: those of the league's policies."""
 
     steps: int = 0
     agents: list[AgentEpisode] = field(default_factory=list)
 
 
 class PlayMetrics:
-    """Gathers plays and episodes, and logs them in one go: MetricsLogger costs more per value than a game's move."""
+    """Collects plays and episodes and logs them in one call: MetricsLogger is slower per value than a game's move."""
 
     def __init__(
         self,
         agents: tuple[str, ...],
         policies: tuple[str, ...],
         distributions: Mapping[str, Distribution],
-        copies: int,
+        num_envs: int,
     ) -> None:
-        """policies: that of each agent. distributions: what each policy's actions are drawn from."""
+        """policies: the policy of each agent. distributions: policy id → its action distribution."""
         self._agents = agents
         self._policies = policies
         self._distributions = distributions
-        self._returns = np.zeros(copies * len(agents))
-        self._steps = np.zeros(copies * len(agents), dtype=np.int64)
-        self._playing = [PlayedEpisode() for _ in range(copies)]
+        self._returns = np.zeros(num_envs * len(agents))
+        self._steps = np.zeros(num_envs * len(agents), dtype=np.int64)
+        self._playing = [PlayedEpisode() for _ in range(num_envs)]
         self.steps = 0
-        """Moves of all agents since the runner began."""
+        """Actions of all agents since the runner started."""
         self.episodes = 0
-        """Episodes finished since the runner began."""
+        """Episodes finished since the runner started."""
         self._logged_steps = self._logged_episodes = 0
         self._clear()
 
     def add_rows(self, slots: NDArray, rewards: NDArray, are_own: bool) -> None:
-        """Agents must act, and have got rewards. slots: copy · agents + agent. are_own: by a policy of the league."""
+        """Add the rewards of agents that must act. slots: env · agents + agent. are_own: controlled by the league's
+        policies."""
         self._returns[slots] += rewards
         if are_own:
             self._steps[slots] += 1
 
     def add_play(self, policy: str, dist_inputs: NDArray) -> None:
-        """Actions were drawn by the rows of (k, d) inputs of distributions."""
+        """Add the distribution inputs (k, d) that a policy's actions were drawn from."""
         self._plays[policy].append(dist_inputs)
 
     def add_moves(self, moves: int) -> None:
-        """So many agents have acted, whoever plays them."""
+        """Add a number of actions, whoever took them."""
         self.steps += moves
 
     def add_step(self) -> None:
-        """All copies have taken a step."""
+        """Count a step in all environments."""
         for episode in self._playing:
             episode.steps += 1
 
     def add_agent(self, ending: Ending) -> None:
-        """An agent has left its episode. One that none of the league's policies played counts for nothing."""
-        slot = ending.copy * len(self._agents) + ending.agent
+        """Add an agent that left its episode; ignored if no policy of the league controlled it."""
+        slot = ending.env * len(self._agents) + ending.agent
         if self._steps[slot]:
             returned = float(self._returns[slot]) + ending.reward
-            self._playing[ending.copy].agents.append(AgentEpisode(ending.agent, int(self._steps[slot]), returned))
+            self._playing[ending.env].agents.append(AgentEpisode(ending.agent, int(self._steps[slot]), returned))
         self._steps[slot] = self._returns[slot] = 0
 
-    def add_episode(self, copy: int) -> None:
-        """The episode in `copy` is over."""
+    def add_episode(self, env: int) -> None:
+        """Add a finished episode."""
         self.episodes += 1
-        if self._playing[copy].agents:
-            self._finished.append(self._playing[copy])
-        self.forget(copy)
+        if self._playing[env].agents:
+            self._finished.append(self._playing[env])
+        self.forget(env)
 
-    def add_crash(self, copy: int) -> None:
-        """The environment of `copy` has crashed, and its episode is lost."""
+    def add_crash(self, env: int) -> None:
+        """Add a crash, whose episode is lost."""
         self._crashes += 1
-        self.forget(copy)
+        self.forget(env)
 
-    def forget(self, copy: int) -> None:
-        """The episode in `copy` is left."""
-        self._playing[copy] = PlayedEpisode()
-        slots = slice(copy * len(self._agents), (copy + 1) * len(self._agents))
+    def forget(self, env: int) -> None:
+        """Drop the open episode of an environment."""
+        self._playing[env] = PlayedEpisode()
+        slots = slice(env * len(self._agents), (env + 1) * len(self._agents))
         self._steps[slots] = self._returns[slots] = 0
 
     def log(self, metrics: MetricsLogger) -> None:
-        """Log all since the last call under RLlib's names."""
+        """Log everything since the last call under RLlib's names."""
         steps, episodes = self.steps - self._logged_steps, self.episodes - self._logged_episodes
         metrics.log_value(NUM_ENV_STEPS_SAMPLED, steps, reduce="sum")
         metrics.log_value(NUM_ENV_STEPS_SAMPLED_LIFETIME, steps, reduce="lifetime_sum", with_throughput=True)

@@ -1,4 +1,4 @@
-"""Runners that sample closed transitions for replay instead of episodes."""
+"""Environment runners for off-policy algorithms: exploring play, recorded as transitions for replay."""
 
 from typing import Any
 
@@ -6,59 +6,90 @@ import torch
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from league.seeds import derive
-from training.replay import Block
-from training.sampling.closed import JointTransitions, OwnTransitions
+from league.training_config import MADDPGConfig
+from training.modules.distributions import TorchGaussian
+from training.replay_buffer import TransitionBlock
+from training.sampling.closed_transitions import JointTransitions, JointTransitionsWithoutState, PolicyTransitions
+from training.sampling.distributions import OrnsteinUhlenbeck
 from training.sampling.env_runner import LockstepEnvRunner, initial_states, one_thread
 
 
 class ReplayRunner(LockstepEnvRunner):
-    """Each policy's own transitions: for independent learners, also in turn-based games."""
+    """Samples each policy's own transitions, for independent learners; turn-based games are supported."""
 
-    recorders: type[OwnTransitions] | type[JointTransitions] = OwnTransitions
+    recorders: type[PolicyTransitions] | type[JointTransitions] = PolicyTransitions
 
     def make_env(self) -> None:
         super().make_env()
         assert self.env is not None
         assert self._play is not None
         initial = initial_states(self.module)
-        self._closed = self.recorders(self.interface, self.env.agents, self.env.copies, initial)
+        self._closed = self.recorders(self.interface, self.env.agents, self.env.num_envs, initial)
         self._play.recorder = self._closed
 
-    def transitions(self, actions: int, exploration: float) -> tuple[int, dict[str, Block]]:
-        """Play at least so many actions of all agents; returns how many they were, and what was closed: policy id →
-        transitions. exploration: see Acting."""
-        assert self._play is not None, "a runner that only keeps weights cannot sample"
+    def transitions(self, actions: int, exploration: float) -> tuple[int, dict[str, TransitionBlock]]:
+        """Play at least `actions` actions of all agents.
+
+        Returns their exact number, and buffer key → completed transitions. exploration: see PolicyModule.
+        """
+        assert self._play is not None, "a runner that only holds weights cannot sample"
         play = self._play
         for module in self.module.values():
             module.exploration = exploration
-        with self._named(), one_thread():
+        with self._errors_with_league(), one_thread():
             if not self._has_begun:
-                self.begin_anew(self.num_env_steps_sampled_lifetime)
+                self.reset_episodes(self.num_env_steps_sampled_lifetime)
             before = play.metrics.steps
             while play.metrics.steps < before + actions:
-                play.step(self._explore, explore=True)
+                play.step(self._forward_exploration, explore=True)
         return play.metrics.steps - before, self._closed.cut()
 
     def sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
-        """Chunks of episodes, as the base class's: to look at the policies. The episodes under way are left."""
-        assert self._play is not None, "a runner that only keeps weights cannot sample"
+        """Return episode chunks as the base class does, to inspect the policies. Drops the open episodes."""
+        assert self._play is not None, "a runner that only holds weights cannot sample"
         if not self._has_begun:
-            self.begin_anew(self.num_env_steps_sampled_lifetime)
+            self.reset_episodes(self.num_env_steps_sampled_lifetime)
         self._play.record_by(self._chunks)
         try:
             return super().sample(**kwargs)
         finally:
             self._play.record_by(self._closed)
 
-    def begin_anew(self, steps: int) -> None:
-        super().begin_anew(steps)
+    def reset_episodes(self, steps: int) -> None:
+        super().reset_episodes(steps)
         if self.worker_index:
-            # In the learner's process, the algorithm seeds torch.
+            # A local runner shares the learner's process, where the algorithm seeds torch.
             torch.manual_seed(derive(self.config.seed or 0, "noise", self.worker_index, steps))
 
 
 class JointRunner(ReplayRunner):
-    """Joint transitions of all agents, with the global state: for centralised learners."""
+    """Samples joint transitions of all agents with the global state, for centralised learners."""
 
     recorders = JointTransitions
     gives_states = True
+
+
+class ActorRunner(JointRunner):
+    """Samples joint transitions without the global state.
+
+    Actions of a Box explore by an Ornstein–Uhlenbeck process per agent if `theta` is set, otherwise independently at
+    each step; the deviation is part of their distribution inputs.
+    """
+
+    recorders = JointTransitionsWithoutState
+    gives_states = False
+
+    def make_env(self) -> None:
+        super().make_env()
+        settings = self.league.training
+        assert isinstance(settings, MADDPGConfig)
+        assert self.env is not None
+        assert self._play is not None
+        if settings.theta is not None:
+            self._play.noises = {
+                policy: OrnsteinUhlenbeck(
+                    settings.theta, self.env.num_envs, len(self.env.agents), module.distribution.m
+                )
+                for policy, module in self.module.items()
+                if isinstance(module.distribution, TorchGaussian)
+            }

@@ -1,4 +1,4 @@
-"""Both clients against a real replica: they send, read and refuse alike."""
+"""Both clients against a real replica: requests, responses and errors are the same."""
 
 import inspect
 from collections import deque
@@ -27,25 +27,25 @@ from league.errors import (
 )
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
-from league.registry.rows import Portion
-from serve_app.traffic import position
-from tests.league.client.conftest import Connect
-from tests.league.policies.graphs import masked_mlp
-from tests.serve_app.streaming import Listening, listening
-from tests.serve_app.test_alias_watcher import until
+from league.registry.storage.rows import Portion
+from serve_app.models.traffic_split import key_position
+from tests.support.clients import Connect
+from tests.support.graphs import masked_mlp
+from tests.support.streaming import Listening, listening
+from tests.support.waiting import until
 
 BOARD = {"observation": np.zeros((6, 7, 2), np.int8), "action_mask": np.ones(7, np.int8)}
 
 
-def test_the_two_clients_are_called_alike() -> None:
+def test_both_clients_have_the_same_signatures() -> None:
     for name, method in inspect.getmembers(Client, inspect.isfunction):
         if not name.startswith("_"):
             assert arguments(getattr(AsyncClient, name)) == arguments(method), name
     assert arguments(AsyncClient) == arguments(Client)
 
 
-def arguments(called: Callable[..., Any]) -> list[str]:
-    return [str(parameter) for parameter in inspect.signature(called).parameters.values()]
+def arguments(function: Callable[..., Any]) -> list[str]:
+    return [str(parameter) for parameter in inspect.signature(function).parameters.values()]
 
 
 def boards(count: int) -> dict[str, np.ndarray]:
@@ -56,7 +56,7 @@ def boards(count: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("encoding", ["base64", "lists", "png"])
-def test_a_batch_is_answered_as_the_graph_does(connect: Connect, url: str, encoding: Any) -> None:
+def test_a_batch_gets_the_actions_of_the_graph(connect: Connect, url: str, encoding: Any) -> None:
     batch = boards(8)
     expected = OnnxPolicy(masked_mlp(seed=1)).act(batch).actions.tolist()
     client = connect(url, encoding=encoding)
@@ -68,7 +68,7 @@ def test_a_batch_is_answered_as_the_graph_does(connect: Connect, url: str, encod
     assert {each.sha256 for each in one} == {answer.sha256}
 
 
-def test_actions_are_as_the_environment_takes_them(connect: Connect, url: str) -> None:
+def test_actions_have_the_types_of_the_environment(connect: Connect, url: str) -> None:
     client = connect(url)
     vector = client.act("vector", np.array([0.5, -2 / 3], np.float32)).action
     assert (vector.dtype, vector.shape) == (np.float32, (2,))
@@ -79,13 +79,13 @@ def test_actions_are_as_the_environment_takes_them(connect: Connect, url: str) -
 
 
 @pytest.mark.parametrize("encoding", ["base64", "png", "lists"])
-def test_images_arrive_as_they_are(connect: Connect, url: str, encoding: Any) -> None:
+def test_images_are_transmitted_unchanged(connect: Connect, url: str, encoding: Any) -> None:
     frame = np.random.default_rng(0).integers(0, 256, (84, 84, 4), dtype=np.uint8)
     action = connect(url, encoding=encoding).act("pistons", frame).action
     np.testing.assert_allclose(action, [frame.mean() / 1000], rtol=1e-5)
 
 
-def test_an_array_of_another_dtype_is_refused_as_base64_and_converted_as_lists(connect: Connect, url: str) -> None:
+def test_another_dtype_is_rejected_as_base64_and_converted_as_lists(connect: Connect, url: str) -> None:
     observation = np.array([0.5, -0.25])
     with pytest.raises(ObservationError, match="float64"):
         connect(url).act("vector", observation)
@@ -94,20 +94,20 @@ def test_an_array_of_another_dtype_is_refused_as_base64_and_converted_as_lists(c
     np.testing.assert_array_equal(connect(url).act("vector", swapped).action, swapped)
 
 
-def test_what_is_drawn_comes_again_with_its_seed(connect: Connect, url: str) -> None:
+def test_the_seed_of_an_answer_reproduces_it(connect: Connect, url: str) -> None:
     client = connect(url)
     first = client.act("board", BOARD, explore=True)
     assert first.seed is not None
     assert client.act("board", BOARD, explore=True, seed=first.seed).action == first.action
-    drawn = {client.act("board", BOARD, explore=True).action for _ in range(30)}
-    assert len(drawn) > 1, "each call has a seed of its own"
+    actions = {client.act("board", BOARD, explore=True).action for _ in range(30)}
+    assert len(actions) > 1, "each call has its own seed"
     batch = boards(5)
     again = [client.act_batch("board", batch, explore=True, seed=[1, 2, 3, 4, 5]).actions for _ in range(2)]
     assert again[0] == again[1]
     assert client.act("board", BOARD).seed is None
 
 
-def test_probabilities_come_if_they_are_asked_for(connect: Connect, url: str) -> None:
+def test_probabilities_are_returned_on_request(connect: Connect, url: str) -> None:
     client = connect(url)
     mask = np.array([1, 0, 1, 1, 1, 1, 1], np.int8)
     answer = client.act("board", BOARD | {"action_mask": mask}, probabilities=True)
@@ -129,7 +129,7 @@ def test_recurrent_state_is_a_token_for_the_next_call(connect: Connect, url: str
     assert second.state != first.state
     batch = client.act_batch("memory", np.ones((2, 1), np.float32), state=[first.state, None])
     assert batch.state == [second.state, first.state]
-    assert batch.answer(0).action == second.action
+    assert batch.response(0).action == second.action
 
 
 @pytest.mark.parametrize(
@@ -146,21 +146,21 @@ def test_recurrent_state_is_a_token_for_the_next_call(connect: Connect, url: str
         ("choice", np.zeros((600, 1024), np.int8), BodyTooLarge),
     ],
 )
-def test_what_cannot_be_answered_is_raised_by_its_code(
+def test_errors_are_raised_by_their_code(
     connect: Connect, url: str, model: str, observation: Any, expected: type[Exception]
 ) -> None:
     with pytest.raises(expected) as raised:
-        connect(url, patience=0.2).act(model, observation)
+        connect(url, retry_deadline=0.2).act(model, observation)
     assert type(raised.value) is expected
 
 
 @pytest.mark.parametrize("batch", [[], {"observation": np.zeros((2, 1)), "action_mask": np.zeros((3, 1))}, "abc", 7])
-def test_what_is_no_batch_is_refused(connect: Connect, url: str, batch: Any) -> None:
+def test_an_invalid_batch_is_rejected(connect: Connect, url: str, batch: Any) -> None:
     with pytest.raises(InvalidInput):
         connect(url).act_batch("board", batch)
 
 
-def test_what_there_is_to_ask_for(connect: Connect, url: str) -> None:
+def test_leagues_versions_and_aliases_are_listed(connect: Connect, url: str) -> None:
     client = connect(url)
     assert {league["league"]: league["champion"] for league in client.leagues()}["board"] == 1
     assert [version["version"] for version in client.versions("board")] == [1, 2, 3]
@@ -170,8 +170,8 @@ def test_what_there_is_to_ask_for(connect: Connect, url: str) -> None:
     client.wait_until_ready()
 
 
-def test_a_server_that_is_not_there(connect: Connect) -> None:
-    client = connect("http://127.0.0.1:9", patience=0.05)
+def test_a_server_that_cannot_be_reached_is_reported(connect: Connect) -> None:
+    client = connect("http://127.0.0.1:9", retry_deadline=0.05)
     assert not client.is_live()
     with pytest.raises(NotReady, match=r"was not ready within 0\.1 s"):
         client.wait_until_ready(0.1)
@@ -180,13 +180,15 @@ def test_a_server_that_is_not_there(connect: Connect) -> None:
 
 
 @pytest.mark.parametrize("options", [{"url": "127.0.0.1:8000"}, {"timeout": 0.0}, {"key": "é"}, {"caller": "é"}])
-def test_what_no_client_can_be_made_of(connect: Connect, options: dict[str, Any]) -> None:
+def test_invalid_client_options_are_rejected(connect: Connect, options: dict[str, Any]) -> None:
     with pytest.raises(InvalidInput):
         connect(**options)
 
 
-def test_keys_open_what_they_are_for(connect: Connect, registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, token = registry.create_key("player", ["act"])
+def test_keys_are_limited_to_their_scopes(
+    connect: Connect, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, token = registry.keys.create("player", ["act"])
     with listening(registry.storage) as listener:
         with pytest.raises(Unauthenticated):
             connect(listener.url).act("board", BOARD)
@@ -194,30 +196,30 @@ def test_keys_open_what_they_are_for(connect: Connect, registry: Registry, monke
         client = connect(listener.url)
         client.wait_until_ready()
         assert client.act("board", BOARD).version == 1
-        with pytest.raises(Forbidden, match="scope promote: player is for act"):
+        with pytest.raises(Forbidden, match="requires the scope promote; the key player has act"):
             client.promote("board@2")
         with client.stream("board") as stream:
             assert stream.act(BOARD) == client.act("board", BOARD).action
-            registry.revoke_key("player")
+            registry.keys.revoke("player")
             with pytest.raises(Unauthenticated, match="revoked"):
                 until(lambda: stream.act(BOARD) is None)
 
 
-def test_a_key_s_rate_is_waited_for_as_long_as_there_is_patience(connect: Connect, registry: Registry) -> None:
-    _, token = registry.create_key("slow", ["act"], rate=1.0)
+def test_a_rate_limited_request_is_retried_until_the_deadline(connect: Connect, registry: Registry) -> None:
+    _, token = registry.keys.create("slow", ["act"], rate=1.0)
     with listening(registry.storage) as listener:
-        hasty = connect(listener.url, key=token, patience=0.0)
+        without_retries = connect(listener.url, key=token, retry_deadline=0.0)
         with pytest.raises(RateLimited) as raised:
-            deque((hasty.act("board", BOARD) for _ in range(5)), maxlen=0)
+            deque((without_retries.act("board", BOARD) for _ in range(5)), maxlen=0)
         assert raised.value.wait == 1
-        patient = connect(listener.url, key=token, patience=30.0)
-        assert [patient.act("board", BOARD).version for _ in range(2)] == [1, 1]
+        patient = connect(listener.url, key=token, retry_deadline=30.0)
+        action = patient.act("board", BOARD).action
         with patient.stream("board") as stream:
-            assert [stream.act(BOARD) for _ in range(2)] == [patient.act("board", BOARD).action] * 2
+            assert [stream.act(BOARD) for _ in range(2)] == [action] * 2
 
 
-def test_promotions_are_applied_once_and_followed_everywhere(connect: Connect, registry: Registry) -> None:
-    _, token = registry.create_key("operator", ["act", "read", "promote"])
+def test_promotions_are_applied_once_and_awaited_on_all_replicas(connect: Connect, registry: Registry) -> None:
+    _, token = registry.keys.create("operator", ["act", "read", "promote"])
     with listening(registry.storage) as listener:
         client = connect(listener.url, key=token)
         moved = client.promote("board@2", expected=1, reason="better", wait=30)
@@ -233,18 +235,18 @@ def test_promotions_are_applied_once_and_followed_everywhere(connect: Connect, r
         assert (back.kind, back.version) == ("rollback", 2)
         assert client.promote("board@1", alias="candidate", expected=None, wait=30).alias == "candidate"
         assert client.act("board@candidate", BOARD).version == 1
-        with pytest.raises(InvalidInput, match="expected the number"):
+        with pytest.raises(InvalidInput, match="expected a version number"):
             client.promote("board@candidate")
 
 
-def test_evaluations_are_started_once_followed_and_stopped(connect: Connect, registry: Registry) -> None:
-    _, token = registry.create_key("operator", ["read", "evaluate"])
+def test_evaluations_are_started_once_listed_and_stopped(connect: Connect, registry: Registry) -> None:
+    _, token = registry.keys.create("operator", ["read", "evaluate"])
     with listening(registry.storage) as listener:
         client = connect(listener.url, key=token)
         same = [client.evaluate("board", contestants=["board@champion"], idempotency_key="once") for _ in range(2)]
         assert same[0] == same[1]
         number = same[0]["evaluation"]
-        assert (same[0]["state"], same[0]["asked"]["contestants"]) == ("queued", ["board@1"])
+        assert (same[0]["state"], same[0]["request"]["contestants"]) == ("queued", ["board@1"])
         other = client.evaluate("board", blocks=2, reason="try", wait=0.1)
         assert (other["state"], other["reason"]) == ("queued", "try")
         assert [each["evaluation"] for each in client.evaluations("board")] == [other["evaluation"], number]
@@ -253,18 +255,16 @@ def test_evaluations_are_started_once_followed_and_stopped(connect: Connect, reg
         assert client.evaluation("board", number)["stopped_by"] == "operator"
         with pytest.raises(UnknownVersion):
             client.evaluate("board", contestants=["board@9"])
-        with pytest.raises(Forbidden, match="scope promote as well"):
+        with pytest.raises(Forbidden, match="requires a key with the scope promote"):
             client.evaluate("board", kind="nightly")
         with pytest.raises(UnknownEvaluation):
             client.evaluation("board", 99)
 
 
-def test_a_caller_stays_with_one_version_while_a_canary_is_tried(
-    connect: Connect, registry: Registry, listener: Listening
-) -> None:
-    setting = registry.set_traffic("board", canary=Portion(2, 0.5), actor="test", reason="test")
-    until(lambda: [one.traffic for one in registry.acknowledgements("board")] == [setting.id])
-    expected = {f"player-{i}": 2 if position("board", b"player-%d" % i) < 0.5 else 1 for i in range(20)}
+def test_a_caller_keeps_its_version_during_a_canary(connect: Connect, registry: Registry, listener: Listening) -> None:
+    setting = registry.traffic.set("board", canary=Portion(2, 0.5), actor="test", reason="test")
+    until(lambda: [one.traffic for one in registry.replicas.acknowledgements("board")] == [setting.id])
+    expected = {f"player-{i}": 2 if key_position("board", b"player-%d" % i) < 0.5 else 1 for i in range(20)}
     assert set(expected.values()) == {1, 2}
     for caller, version in expected.items():
         client = connect(listener.url, caller=caller)

@@ -1,4 +1,4 @@
-"""What the pages about the client and the stream show does what they say."""
+"""The snippets on the pages of the client and of streams run as shown."""
 
 import ast
 import re
@@ -12,10 +12,10 @@ import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.stream_framing import REPLY, request
-from tests.league.policies.graphs import masked_mlp
-from tests.serve_app.leagues import BOARD, promote, publish, register
-from tests.serve_app.streaming import listening
+from serve_app.inference.stream_codec import REPLY, encode_request
+from tests.support.graphs import masked_mlp
+from tests.support.served_leagues import BOARD, promote, publish, register
+from tests.support.streaming import listening
 
 ROOT = Path(__file__).parents[3]
 URL = "http://127.0.0.1:8000"
@@ -32,22 +32,22 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     registry.close()
 
 
-def blocks(page: str, language: str) -> list[str]:
+def snippets(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), flags=re.S | re.M)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/client.md"])
-def test_each_snippet_runs_after_those_before(
+@pytest.mark.parametrize("page", ["README.md", "docs/client.md", "docs/serving.md"])
+def test_snippets_run_in_order(
     page: str, url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
-    shown = [block for block in blocks(page, "python") if page != "README.md" or "league.client" in block]
+    blocks = snippets(page, "python")
     names: dict[str, object] = {}
-    for block in shown:
+    for block in blocks:
         exec(compile(ast.parse(block.replace(URL, url)), page, "exec"), names)
         printed = capsys.readouterr().out
         assert ("print(" in block) == bool(printed), block
-    assert shown
+    assert blocks
 
 
 CHECK = """
@@ -65,11 +65,11 @@ int main() {
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
-def test_the_framing_in_another_language_is_ours(tmp_path: Path) -> None:
-    (snippet,) = blocks("docs/stream.md", "cpp")
+def test_the_c_plus_plus_framing_is_ours(tmp_path: Path) -> None:
+    (snippet,) = snippets("docs/stream.md", "cpp")
     (tmp_path / "shown.cpp").write_text(snippet + CHECK)
     command = ["g++", "-std=c++17", "-Wall", "-Werror", "shown.cpp", "-o", "shown"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     message = subprocess.run([tmp_path / "shown"], check=True, capture_output=True).stdout
-    assert message == request([np.ones((2, 84), np.int8), np.ones((2, 7), np.int8)], 2, reset=True)
+    assert message == encode_request([np.ones((2, 84), np.int8), np.ones((2, 7), np.int8)], 2, reset=True)
     assert REPLY.size == 16

@@ -1,4 +1,4 @@
-"""Episodes over HTTP stay at the version that began them, or say that it is gone."""
+"""Episodes over HTTP stay on the version that started them, or report that it is gone."""
 
 import shutil
 
@@ -7,26 +7,26 @@ import pytest
 
 from league.errors import InvalidReference, UnknownLeague, UnknownVersion, VersionRetired
 from league.registry.registry import Registry
-from tests.league.client.conftest import Connect
-from tests.serve_app.leagues import promote
-from tests.serve_app.streaming import Listening, listening
-from tests.serve_app.test_action import BOARD
-from tests.serve_app.test_alias_watcher import until
+from tests.support.actions import BOARD
+from tests.support.clients import Connect
+from tests.support.served_leagues import promote
+from tests.support.streaming import Listening, listening
+from tests.support.waiting import until
 
 ONE = np.ones(1, np.float32)
 
 
-def test_an_episode_stays_at_its_version_across_promotions(
+def test_an_episode_keeps_its_version_across_promotions(
     connect: Connect, registry: Registry, listener: Listening
 ) -> None:
     client = connect(listener.url)
-    registry.set_alias("board", "candidate", 3, expected=None, actor="test", reason="test")
+    registry.aliases.set("board", "candidate", 3, expected=None, actor="test", reason="test")
     with client.episode("board") as episode, client.episode("board@candidate") as of_alias:
         assert (episode.version, episode.last, episode.steps) == (None, None, 0)
         first = episode.act(BOARD)
         of_alias.act(BOARD)
         promote(registry, "board", 2)
-        registry.set_alias("board", "candidate", 1, expected=3, actor="test", reason="test")
+        registry.aliases.set("board", "candidate", 1, expected=3, actor="test", reason="test")
         until(lambda: client.act("board", BOARD).version == 2)
         assert [episode.act(BOARD) for _ in range(3)] == [first] * 3
         of_alias.act(BOARD)
@@ -38,21 +38,21 @@ def test_an_episode_stays_at_its_version_across_promotions(
         assert episode.version == 2
 
 
-def test_an_episode_brings_its_recurrent_state_along(connect: Connect, url: str) -> None:
+def test_an_episode_carries_its_recurrent_state(connect: Connect, url: str) -> None:
     client = connect(url)
     with client.episode("memory") as one, client.episode("memory") as other:
         assert [one.act(ONE) for _ in range(4)] == [0, 0, 1, 1]
         assert [other.act(ONE) for _ in range(3)] == [0, 0, 1]
 
 
-def test_an_episode_that_explores_is_reproducible(connect: Connect, url: str) -> None:
-    def played(seed: int | None) -> list[int]:
+def test_an_exploring_episode_is_reproducible(connect: Connect, url: str) -> None:
+    def play(seed: int | None) -> list[int]:
         with connect(url).episode("board", explore=True, seed=seed) as episode:
             return [episode.act(BOARD) for _ in range(30)]
 
-    assert played(1) == played(1) != played(2)
-    assert len(set(played(1))) > 1
-    assert played(None) != played(None)
+    assert play(1) == play(1) != play(2)
+    assert len(set(play(1))) > 1
+    assert play(None) != play(None)
     with connect(url).episode("board", explore=True, seed=1) as episode:
         action = episode.act(BOARD, probabilities=True)
         assert episode.last is not None
@@ -61,9 +61,9 @@ def test_an_episode_that_explores_is_reproducible(connect: Connect, url: str) ->
         assert alone.action == action
 
 
-def test_an_episode_outlives_its_replica_but_not_its_version(connect: Connect, registry: Registry) -> None:
+def test_an_episode_survives_its_replica_but_not_its_version(connect: Connect, registry: Registry) -> None:
     with listening(registry.storage) as first:
-        client = connect(first.url, patience=20)
+        client = connect(first.url, retry_deadline=20)
         episode, other = client.episode("memory"), client.episode("board@3")
         assert [episode.act(ONE) for _ in range(2)] == [0, 0]
         other.act(BOARD)
@@ -73,14 +73,14 @@ def test_an_episode_outlives_its_replica_but_not_its_version(connect: Connect, r
         assert episode.act(ONE) == 1
         assert episode.last is not None
         assert episode.last.replica == "replica-2"
-        with pytest.raises(VersionRetired, match=r"cannot go on after 1 actions of board@3"):
+        with pytest.raises(VersionRetired, match=r"cannot continue after 1 actions of board@3"):
             other.act(BOARD)
 
 
 @pytest.mark.parametrize(
     ("model", "expected"), [("nobody", UnknownLeague), ("board@99", UnknownVersion), ("a.b.c", InvalidReference)]
 )
-def test_an_episode_that_cannot_begin(connect: Connect, url: str, model: str, expected: type[Exception]) -> None:
+def test_an_episode_that_cannot_start_raises(connect: Connect, url: str, model: str, expected: type[Exception]) -> None:
     with pytest.raises(expected) as raised:
         connect(url).episode(model).act(BOARD)
     assert type(raised.value) is expected

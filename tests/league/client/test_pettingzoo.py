@@ -1,4 +1,4 @@
-"""PettingZoo's environments played through a real server: what comes of it is what playing them at home gives."""
+"""PettingZoo environments played through a real server give the same results as with local policies."""
 
 from collections.abc import Iterator
 from copy import deepcopy
@@ -22,10 +22,11 @@ from league.settings import Storage
 from league.spaces import Box as BoxSpace
 from league.spaces import DictSpace
 from league.spaces import Discrete as DiscreteSpace
-from tests.league.policies.graphs import masked_mlp
-from tests.serve_app.inference_protocol.leagues import CHOICE, table
-from tests.serve_app.leagues import everything, promote, publish, register
-from tests.serve_app.streaming import Listening, listening
+from tests.support.graphs import masked_mlp
+from tests.support.protocol_leagues import CHOICE, table
+from tests.support.served_leagues import everything, promote, publish, register
+from tests.support.streaming import Listening, listening
+from tests.support.waiting import until
 
 TICTACTOE = AgentInterface(
     observation=DictSpace(
@@ -65,8 +66,8 @@ def client(listener: Listening) -> Iterator[Client]:
         yield client
 
 
-def at_home(policies: dict[str, Policy]) -> list[tuple[str, int]]:
-    """Tic-tac-toe as PettingZoo's own loop plays it."""
+def play_locally(policies: dict[str, Policy]) -> list[tuple[str, int]]:
+    """Tic-tac-toe in PettingZoo's agent_iter loop."""
     environment, moves = tictactoe_v3.env(), []
     environment.reset(seed=3)
     for agent in environment.agent_iter():
@@ -80,40 +81,40 @@ def at_home(policies: dict[str, Policy]) -> list[tuple[str, int]]:
     return moves
 
 
-def test_an_aec_environment_is_played_to_its_end(client: Client) -> None:
+def test_an_aec_environment_is_played_to_the_end(client: Client) -> None:
     policies = {f"player_{1 + seed}": OnnxPolicy(masked_mlp((3, 3, 2), 9, seed=seed)) for seed in range(2)}
     steps = list(play(tictactoe_v3.env(), client, BOTH, seed=3))
-    moves = at_home(policies)
+    moves = play_locally(policies)
     by_agent = {agent: [step for step in steps if step.agent == agent] for agent in policies}
     for agent, own in by_agent.items():
         assert [step.action for step in own] == [action for mover, action in moves if mover == agent]
         assert [step.terminated for step in own] == [False] * (len(own) - 1) + [True]
         for step, following in pairwise(own):
             np.testing.assert_array_equal(step.next_observation["observation"], following.observation["observation"])
-        assert {step.answer.version for step in own if step.answer} == {1 if agent == "player_1" else 2}
+        assert {step.response.version for step in own if step.response} == {1 if agent == "player_1" else 2}
     assert sum(step.reward for step in steps) == 0
     assert {step.observation["action_mask"][step.action] for step in steps} == {1}
 
 
-def test_a_function_may_play_against_a_model(client: Client) -> None:
+def test_a_function_can_play_against_a_model(client: Client) -> None:
     def first_legal(observation: Any) -> int:
         return int(np.flatnonzero(observation["action_mask"])[0])
 
     steps = list(play(tictactoe_v3.env(), client, BOTH | {"player_2": first_legal}, seed=3, probabilities=True))
     for step in steps:
-        assert (step.answer is None) == (step.agent == "player_2")
-        assert step.answer is None or step.answer.probabilities.argmax() == step.action
+        assert (step.response is None) == (step.agent == "player_2")
+        assert step.response is None or step.response.probabilities.argmax() == step.action
 
 
-def told(steps: list[Step]) -> list[tuple[str, int, float]]:
+def summary(steps: list[Step]) -> list[tuple[str, int, float]]:
     return [(step.agent, step.action, step.reward) for step in steps]
 
 
-def test_a_parallel_environment_is_played_in_rounds(client: Client) -> None:
+def test_a_parallel_environment_is_played_step_by_step(client: Client) -> None:
     environment = rps_v2.parallel_env(max_cycles=12)
     players = {"player_0": "rps", "player_1": "rps@1"}
     games = [list(play(environment, client, players, seed=seed, explore=True)) for seed in (5, 5, 6)]
-    assert told(games[0]) == told(games[1]) != told(games[2])
+    assert summary(games[0]) == summary(games[1]) != summary(games[2])
     for steps in games:
         assert len(steps) == 2 * 12
         for one, other in zip(steps[::2], steps[1::2], strict=True):
@@ -123,15 +124,15 @@ def test_a_parallel_environment_is_played_in_rounds(client: Client) -> None:
         assert [step.truncated for step in steps] == [False] * 22 + [True] * 2
 
 
-class Counters(ParallelEnv):
-    """Two agents that see ones, and reuse the array in which they see them; the second one leaves early."""
+class Constant(ParallelEnv):
+    """Two agents with constant observations in a reused array; the second agent leaves early."""
 
     metadata: dict[str, Any] = {"name": "counters"}  # noqa: RUF012
     possible_agents = ["first", "second"]  # noqa: RUF012
     lengths = {"first": 5, "second": 3}  # noqa: RUF012
 
     def __init__(self) -> None:
-        self._seen = np.zeros(1, np.float32)
+        self._observation = np.zeros(1, np.float32)
 
     def observation_space(self, agent: str) -> Box:
         return Box(-np.inf, np.inf, (1,), np.float32)
@@ -141,18 +142,18 @@ class Counters(ParallelEnv):
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Any:
         self.agents, self._time = list(self.possible_agents), 0
-        self._seen[:] = 1
-        return dict.fromkeys(self.agents, self._seen), {agent: {} for agent in self.agents}
+        self._observation[:] = 1
+        return dict.fromkeys(self.agents, self._observation), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, int]) -> Any:
         self._time += 1
         acted = list(self.agents)
-        self._seen[:] = 1 if self._time < 5 else 7
+        self._observation[:] = 1 if self._time < 5 else 7
         over = {agent: self._time == self.lengths[agent] for agent in acted}
         self.agents = [agent for agent in acted if not over[agent]]
         nothing = dict.fromkeys(acted, False)
         return (
-            dict.fromkeys(acted, self._seen),
+            dict.fromkeys(acted, self._observation),
             {a: float(actions[a]) for a in acted},
             nothing,
             over,
@@ -160,33 +161,33 @@ class Counters(ParallelEnv):
         )
 
 
-def test_each_agent_has_its_own_memory(client: Client) -> None:
-    environment = Counters()
+def test_each_agent_has_its_own_recurrent_state(client: Client) -> None:
+    environment = Constant()
     for _ in range(2):
         steps = list(play(environment, client, {"first": "memory", "second": "memory"}))
-        of = {agent: [step for step in steps if step.agent == agent] for agent in environment.possible_agents}
-        assert [step.action for step in of["first"]] == [0, 0, 1, 1, 1]
-        assert [step.action for step in of["second"]] == [0, 0, 1]
-        assert [step.truncated for step in of["second"]] == [False, False, True]
-        assert [step.observation[0] for step in of["first"]] == [1] * 5, "as it was, though its array is reused"
-        assert of["first"][-1].next_observation[0] == 7
-        assert [step.reward for step in of["first"]] == [0, 0, 1, 1, 1]
+        by_agent = {agent: [step for step in steps if step.agent == agent] for agent in environment.possible_agents}
+        assert [step.action for step in by_agent["first"]] == [0, 0, 1, 1, 1]
+        assert [step.action for step in by_agent["second"]] == [0, 0, 1]
+        assert [step.truncated for step in by_agent["second"]] == [False, False, True]
+        assert [step.observation[0] for step in by_agent["first"]] == [1] * 5, "copied from the reused array"
+        assert by_agent["first"][-1].next_observation[0] == 7
+        assert [step.reward for step in by_agent["first"]] == [0, 0, 1, 1, 1]
 
 
-def test_a_promotion_in_between_changes_no_player(client: Client, registry: Registry) -> None:
+def test_a_promotion_during_an_episode_changes_no_player(client: Client, registry: Registry) -> None:
     steps = []
     for step in play(tictactoe_v3.env(), client, {"player_1": "tictactoe", "player_2": "tictactoe"}, seed=3):
         if not steps:
             promote(registry, "tictactoe", 2)
-            while client.act("tictactoe", deepcopy(step.observation)).version != 2:
-                pass
+            seen = deepcopy(step.observation)
+            until(lambda seen=seen: client.act("tictactoe", seen).version == 2)
         steps.append(step)
     promote(registry, "tictactoe", 1)
-    assert {step.answer.version for step in steps if step.answer} == {1}
+    assert {step.response.version for step in steps if step.response} == {1}
 
 
-def test_who_plays_must_be_said_for_everybody(client: Client) -> None:
-    with pytest.raises(InvalidInput, match="nobody plays player_2"):
+def test_each_agent_needs_a_player(client: Client) -> None:
+    with pytest.raises(InvalidInput, match="no player for player_2"):
         play(tictactoe_v3.env(), client, {"player_1": "tictactoe"})
     with pytest.raises(UnknownLeague):
         next(play(rps_v2.parallel_env(), client, {"player_0": "rps", "player_1": "nobody"}))

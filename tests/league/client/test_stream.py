@@ -1,4 +1,4 @@
-"""The client's streams: they act as a server's policies do, and go on elsewhere when a connection is lost."""
+"""The client's streams: actions equal those of calls, and a lost connection continues on another replica."""
 
 import asyncio
 import json
@@ -23,26 +23,27 @@ from league.errors import (
     VersionRetired,
 )
 from league.registry.registry import Registry
-from tests.league.client.conftest import SETTINGS, Connect
-from tests.serve_app.leagues import promote
-from tests.serve_app.streaming import Listening, listening
-from tests.serve_app.test_action import BOARD, boards
-from tests.serve_app.test_alias_watcher import until
+from tests.support.actions import BOARD, boards
+from tests.support.clients import SETTINGS, Connect
+from tests.support.served_leagues import promote
+from tests.support.streaming import Listening, listening
+from tests.support.waiting import until
 
 ONE = np.ones(1, np.float32)
+NO_SERVER = "http://127.0.0.1:9"
 
 
-def test_a_stream_acts_as_a_call_does(connect: Connect, url: str) -> None:
-    client, asked = connect(url), boards(8)
-    called = client.act_batch("board@2", asked)
+def test_a_stream_returns_the_actions_of_calls(connect: Connect, url: str) -> None:
+    client, observations = connect(url), boards(8)
+    response = client.act_batch("board@2", observations)
     with client.stream("board@2") as stream:
         assert stream.version == 2
-        assert [stream.act(board) for board in asked] == called.actions
-        assert stream.last == called.answer(7)
-        assert stream.act_batch(asked) == called.actions
-        assert stream.last == called
-        drawn = stream.act(asked[0], explore=True, seed=7, probabilities=True)
-        alone = client.act("board@2", asked[0], explore=True, seed=7, probabilities=True)
+        assert [stream.act(board) for board in observations] == response.actions
+        assert stream.last == response.response(7)
+        assert stream.act_batch(observations) == response.actions
+        assert stream.last == response
+        drawn = stream.act(observations[0], explore=True, seed=7, probabilities=True)
+        alone = client.act("board@2", observations[0], explore=True, seed=7, probabilities=True)
         assert (drawn, stream.last.seed) == (alone.action, 7)
         np.testing.assert_array_equal(stream.last.probabilities, alone.probabilities)
     with client.stream("vector") as stream:
@@ -55,14 +56,14 @@ def test_a_stream_keeps_recurrent_state_until_a_reset(connect: Connect, url: str
         assert [stream.act(ONE) for _ in range(3)] == [0, 0, 1]
         assert [stream.act(ONE, reset=True), stream.act(ONE), stream.act(ONE)] == [0, 0, 1]
         batch = np.array([[1], [2]], np.float32)
-        with pytest.raises(InvalidState, match="needs a reset"):
+        with pytest.raises(InvalidState, match="a reset is required"):
             stream.act_batch(batch)
         assert stream.act_batch(batch, reset=True) == [0, 0]
         assert stream.act_batch(batch) == [0, 1]
         assert stream.act_batch(batch, reset=[False, True]) == [1, 0]
 
 
-def test_what_is_refused_does_not_end_a_stream(connect: Connect, url: str) -> None:
+def test_an_error_does_not_end_a_stream(connect: Connect, url: str) -> None:
     with connect(url).stream("board") as stream:
         first = stream.act(BOARD)
         with pytest.raises(ObservationError, match="expected"):
@@ -73,25 +74,30 @@ def test_what_is_refused_does_not_end_a_stream(connect: Connect, url: str) -> No
 
 
 @pytest.mark.parametrize(("model", "expected"), [("nobody", UnknownLeague), ("headless", NotReady)])
-def test_a_stream_that_cannot_be_opened(connect: Connect, url: str, model: str, expected: type[Exception]) -> None:
-    with pytest.raises(expected) as raised, connect(url, patience=0.2).stream(model) as stream:
+def test_a_stream_that_cannot_be_opened_raises(
+    connect: Connect, url: str, model: str, expected: type[Exception]
+) -> None:
+    with pytest.raises(expected) as raised, connect(url, retry_deadline=0.2).stream(model) as stream:
         stream.act(BOARD)
     assert type(raised.value) is expected
 
 
-def test_nobody_there(connect: Connect) -> None:
-    with pytest.raises(RemoteError, match="stream: "), connect("http://127.0.0.1:9", patience=0.1).stream("a") as none:
-        none.act(BOARD)
+def test_a_stream_to_an_unreachable_server_raises(connect: Connect) -> None:
+    with (
+        pytest.raises(RemoteError, match="stream: "),
+        connect("http://127.0.0.1:9", retry_deadline=0.1).stream("a") as stream,
+    ):
+        stream.act(BOARD)
 
 
-def test_a_message_that_is_too_large_is_not_sent_again(connect: Connect, url: str) -> None:
+def test_a_message_that_is_too_large_is_not_retried(connect: Connect, url: str) -> None:
     with connect(url).stream("choice") as stream, pytest.raises(BodyTooLarge):
         stream.act(np.zeros(SETTINGS.max_body, np.int8))
 
 
-def test_a_stream_stays_or_follows(connect: Connect, registry: Registry, listener: Listening) -> None:
+def test_a_stream_is_pinned_or_follows_its_alias(connect: Connect, registry: Registry, listener: Listening) -> None:
     client = connect(listener.url)
-    registry.set_alias("board", "candidate", 3, expected=None, actor="test", reason="test")
+    registry.aliases.set("board", "candidate", 3, expected=None, actor="test", reason="test")
     with (
         client.stream("board") as pinned,
         client.stream("board", follow=True) as following,
@@ -108,19 +114,19 @@ def test_a_stream_stays_or_follows(connect: Connect, registry: Registry, listene
         assert [stream.version for stream in (pinned, candidate)] == [1, 3]
 
 
-def hang_up(listener: Listening) -> None:
-    """End all connections, as the death of a process does: without a word."""
+def abort_connections(listener: Listening) -> None:
+    """End all connections without a closing handshake, as when the process dies."""
     for connection in list(listener.uvicorn.server_state.connections):
         connection.loop.call_soon_threadsafe(connection.transport.abort)
 
 
 @pytest.mark.parametrize("is_warned", [True, False], ids=["drained", "died"])
 @pytest.mark.parametrize("follow", [True, False], ids=["following", "pinned"])
-def test_an_episode_goes_on_at_another_replica(
+def test_a_stream_continues_on_another_replica(
     connect: Connect, registry: Registry, is_warned: bool, follow: bool
 ) -> None:
     with listening(registry.storage) as first:
-        client = connect(first.url, patience=20)
+        client = connect(first.url, retry_deadline=20)
         one, two = client.stream("memory", follow=follow), client.stream("memory", follow=follow)
         pinned = client.stream("board", follow=follow)
         assert [one.act(ONE) for _ in range(2)] == [0, 0]
@@ -128,8 +134,8 @@ def test_an_episode_goes_on_at_another_replica(
         pinned.act(BOARD)
         promote(registry, "board", 2)
         if not is_warned:
-            hang_up(first)
-            assert one.act(ONE) == 1, "the same replica will do, too"
+            abort_connections(first)
+            assert one.act(ONE) == 1, "a reconnection to the same replica works too"
         port = int(first.url.rsplit(":")[-1])
     with listening(registry.storage, replica="replica-2", port=port):
         assert one.act(ONE) == 1
@@ -141,9 +147,9 @@ def test_an_episode_goes_on_at_another_replica(
             stream.close()
 
 
-def test_a_stream_whose_version_was_retired_says_so(connect: Connect, registry: Registry) -> None:
+def test_a_stream_whose_version_was_removed_raises(connect: Connect, registry: Registry) -> None:
     with listening(registry.storage) as first:
-        stream = connect(first.url, patience=20).stream("board@3")
+        stream = connect(first.url, retry_deadline=20).stream("board@3")
         stream.act(BOARD)
         port = int(first.url.rsplit(":")[-1])
     shutil.rmtree(registry.artifacts.path("board", 3))
@@ -152,18 +158,18 @@ def test_a_stream_whose_version_was_retired_says_so(connect: Connect, registry: 
 
 
 class Slow:
-    """A server that answers the first message of each connection only when that is told to it, with its number."""
+    """A server that answers the first message of each connection only when `speak` is set, with its number."""
 
     def __init__(self) -> None:
-        self.heard: list[dict[str, Any]] = []
-        self.speak = threading.Event()
+        self.received: list[dict[str, Any]] = []
+        self.respond = threading.Event()
 
     def __call__(self, connection: ServerConnection) -> None:
         for message in connection:
-            self.heard.append(json.loads(message))
-            number = len(self.heard)
+            self.received.append(json.loads(message))
+            number = len(self.received)
             if number == 1:
-                self.speak.wait(30)
+                self.respond.wait(30)
             connection.send(json.dumps({"action": number, "model": "board", "version": 1, "sha256": "0"}))
 
 
@@ -171,67 +177,70 @@ class Slow:
 def slow() -> Iterator[tuple[Slow, str]]:
     handler = Slow()
 
-    def greeted(connection: ServerConnection, _: Any, response: Any) -> None:
+    def add_headers(connection: ServerConnection, _: Any, response: Any) -> None:
         response.headers["x-league-version"] = "1"
 
     server: Server
-    with serve(handler, "127.0.0.1", 0, process_response=greeted) as server:
+    with serve(handler, "127.0.0.1", 0, process_response=add_headers) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield handler, f"http://127.0.0.1:{server.socket.getsockname()[1]}"
-        handler.speak.set()
+        handler.respond.set()
         server.shutdown()
     thread.join()
 
 
-def test_an_answer_that_comes_too_late_is_not_taken_for_another(connect: Connect, slow: tuple[Slow, str]) -> None:
+def test_a_late_answer_is_not_taken_for_the_next_one(connect: Connect, slow: tuple[Slow, str]) -> None:
     handler, url = slow
     with connect(url, timeout=0.3).stream("board") as stream:
-        assert stream.act(BOARD, explore=True) == 2, "asked again over another connection"
-        assert handler.heard[0] == handler.heard[1], "what is drawn does not change by that"
-        handler.speak.set()
+        assert stream.act(BOARD, explore=True) == 2, "retried over another connection"
+        assert handler.received[0] == handler.received[1], "the retry has the same seed"
+        handler.respond.set()
         assert [stream.act(BOARD) for _ in range(2)] == [3, 4]
 
 
-def test_no_patience_is_no_second_attempt(connect: Connect, slow: tuple[Slow, str]) -> None:
+def test_a_retry_deadline_of_zero_disables_retries(connect: Connect, slow: tuple[Slow, str]) -> None:
     handler, url = slow
-    with connect(url, timeout=0.2, patience=0).stream("board") as stream:
+    with connect(url, timeout=0.2, retry_deadline=0).stream("board") as stream:
         with pytest.raises(RemoteError, match="lost"):
             stream.act(BOARD)
-        assert len(handler.heard) == 1
+        assert len(handler.received) == 1
 
 
-@pytest.mark.parametrize(("head", "said"), [({}, "{}"), ({"x-league-version": "1"}, "<html>")], ids=["head", "words"])
-def test_somebody_else_s_server(connect: Connect, head: dict[str, str], said: str) -> None:
-    def greeted(_: ServerConnection, __: Any, response: Any) -> None:
+@pytest.mark.parametrize(("head", "body"), [({}, "{}"), ({"x-league-version": "1"}, "<html>")], ids=["header", "body"])
+def test_another_kind_of_server_is_reported(connect: Connect, head: dict[str, str], body: str) -> None:
+    def add_headers(_: ServerConnection, __: Any, response: Any) -> None:
         response.headers.update(head)
 
-    def answered(connection: ServerConnection) -> None:
+    def respond(connection: ServerConnection) -> None:
         for _ in connection:
-            connection.send(said)
+            connection.send(body)
 
-    with serve(answered, "127.0.0.1", 0, process_response=greeted) as server:
+    with serve(respond, "127.0.0.1", 0, process_response=add_headers) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         url = f"http://127.0.0.1:{server.socket.getsockname()[1]}"
-        with pytest.raises(RemoteError, match=r"names no version|no JSON"), connect(url).stream("board") as stream:
+        with (
+            pytest.raises(RemoteError, match=r"contains no version|did not return JSON"),
+            connect(url).stream("board") as stream,
+        ):
             stream.act(BOARD)
         server.shutdown()
     thread.join()
 
 
-def test_an_action_that_is_cancelled_leaves_no_answer_behind(slow: tuple[Slow, str]) -> None:
+def test_a_cancelled_action_leaves_no_answer_behind(slow: tuple[Slow, str]) -> None:
     handler, url = slow
 
-    async def cancelled() -> list[int]:
+    async def cancel() -> list[int]:
         async with AsyncClient(url) as client, client.stream("board") as stream:
-            acting = asyncio.create_task(stream.act(BOARD))
-            while not handler.heard:
+            action = asyncio.create_task(stream.act(BOARD))
+            while not handler.received:
                 await asyncio.sleep(0.01)
-            acting.cancel()
-            handler.speak.set()
-            await asyncio.wait([acting])
-            assert acting.cancelled()
+            action.cancel()
+            handler.respond.set()
+            await asyncio.wait([action])
+            assert action.cancelled()
             return [await stream.act(BOARD) for _ in range(2)]
 
-    assert asyncio.run(cancelled()) == [2, 3]
+    assert asyncio.run(cancel()) == [2, 3]

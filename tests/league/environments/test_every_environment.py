@@ -1,11 +1,12 @@
-"""Every environment of PettingZoo 1.27 and mpe2 but the Atari games steps in lockstep, and its episodes follow from
-their seeds alone: not from the copy, its former episodes, or the company of others."""
+"""All environments of PettingZoo 1.27 and mpe2 except Atari run in lockstep, and their episodes depend only on their
+seeds: not on the environment's index, its earlier episodes, or the other environments.
+"""
 
 from typing import Any
 
 import pytest
 
-from league.config import EnvironmentConfig
+from league.environment_config import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import stepping
 from tests.conformance.stepping import Reports, assert_same_episode, lockstep
@@ -39,24 +40,24 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("entry_point", ENVIRONMENTS)
-def test_an_episode_follows_from_its_seed(entry_point: str) -> None:
+def test_an_episode_depends_on_its_seed_only(entry_point: str) -> None:
     config = EnvironmentConfig(entry_point=entry_point, kwargs=ENVIRONMENTS[entry_point])
     env = build(config)
     spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    copies = stepping(config, 2)
-    first = lockstep(copies, spaces, [3, 4], STEPS)
+    envs = stepping(config, 2)
+    first = lockstep(envs, spaces, [3, 4], STEPS)
     assert sum(len(reports) for reports in first[3].values()) > 2
 
-    again = lockstep(copies, spaces, [4, 3], STEPS)
+    again = lockstep(envs, spaces, [4, 3], STEPS)
     elsewhere = lockstep(stepping(config, 1), spaces, [3], STEPS)
     for seed, episode in again.items():
         assert_same_episode(episode, first[seed])
     assert_same_episode(elsewhere[3], first[3])
-    assert _moves(first[3]), "an agent whose observations never change learns nothing"
+    assert _observations_change(first[3]), "no observation changes"
 
 
-def _moves(episode: Reports) -> bool:
-    """Whether somebody sees something else at some time."""
+def _observations_change(episode: Reports) -> bool:
+    """Whether an observation of any agent changes."""
     return any(
         report[1][name].tobytes() != reports[0][1][name].tobytes()
         for reports in episode.values()

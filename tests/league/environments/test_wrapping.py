@@ -1,11 +1,11 @@
-"""SuperSuit's catalogue by name, for both of PettingZoo's APIs, and what is refused of it."""
+"""SuperSuit's wrappers by name, for both PettingZoo APIs, and those that are rejected."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 
-from league.config import EnvironmentConfig
+from league.environment_config import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import stepping
 from league.errors import ConfigError
@@ -14,7 +14,7 @@ from tests.conformance.stepping import lockstep
 HERE = __name__
 WALKER, SPREAD = "pettingzoo.sisl.multiwalker_v9", "mpe2.simple_spread_v3"
 ADVERSARY, PISTONBALL = "mpe2.simple_adversary_v3", "pettingzoo.butterfly.pistonball_v6"
-CATALOGUE: dict[str, tuple[str, dict[str, Any]]] = {
+WRAPPERS: dict[str, tuple[str, dict[str, Any]]] = {
     "action_lambda_v1": (SPREAD, {"change_action_fn": f"{HERE}:same", "change_space_fn": f"{HERE}:same_space"}),
     "agent_indicator_v0": (SPREAD, {}),
     "black_death_v3": (SPREAD, {}),
@@ -41,8 +41,8 @@ CATALOGUE: dict[str, tuple[str, dict[str, Any]]] = {
     "scale_actions_v0": (WALKER, {"scale": 0.5}),
     "sticky_actions_v0": (SPREAD, {"repeat_action_probability": 0.3}),
 }
-REFUSED = {"concat_vec_envs_v1", "vectorize_aec_env_v0", "gym_vec_env_v0", "pettingzoo_env_to_vec_env_v1"}
-REFUSED |= {"stable_baselines3_vec_env_v0", "stable_baselines_vec_env_v0"}
+REJECTED = {"concat_vec_envs_v1", "vectorize_aec_env_v0", "gym_vec_env_v0", "pettingzoo_env_to_vec_env_v1"}
+REJECTED |= {"stable_baselines3_vec_env_v0", "stable_baselines_vec_env_v0"}
 
 
 def same(action: Any, _space: Any) -> Any:
@@ -65,24 +65,24 @@ def config(entry_point: str, *wrappers: Any, **more: Any) -> EnvironmentConfig:
     return EnvironmentConfig(entry_point=entry_point, wrappers=wrappers, **more)
 
 
-def test_the_catalogue_is_supersuits() -> None:
+def test_the_wrappers_are_those_of_supersuit() -> None:
     import supersuit
 
     names = {name for name in dir(supersuit) if name[-3:-1] == "_v" and name[-1].isdigit()}
-    assert names == set(CATALOGUE) | REFUSED
+    assert names == set(WRAPPERS) | REJECTED
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("api", ["aec", "parallel"])
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", WRAPPERS)
 def test_each_wrapper_steps_in_lockstep_and_follows_the_seed(name: str, api: Any) -> None:
-    entry_point, arguments = CATALOGUE[name]
+    entry_point, arguments = WRAPPERS[name]
     kwargs = {"n_pistons": 3} if entry_point == PISTONBALL else {}
     wrapped = config(entry_point, {name: arguments}, api=api, kwargs=kwargs)
     env = build(wrapped)
     spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    copies = stepping(wrapped, 2)
-    first, again = (lockstep(copies, spaces, seeds, 6) for seeds in ([1, 2], [2, 1]))
+    envs = stepping(wrapped, 2)
+    first, again = (lockstep(envs, spaces, seeds, 6) for seeds in ([1, 2], [2, 1]))
     for seed in (1, 2):
         for agent, reports in first[seed].items():
             for one, other in zip(reports, again[seed][agent], strict=True):
@@ -90,31 +90,34 @@ def test_each_wrapper_steps_in_lockstep_and_follows_the_seed(name: str, api: Any
                 np.testing.assert_array_equal(one[1]["observation"], other[1]["observation"])
 
 
-@pytest.mark.parametrize("name", sorted(REFUSED))
-def test_vectors_are_refused_since_copies_are_the_leagues_own(name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"{name} makes a vector of environments"):
+@pytest.mark.parametrize("name", sorted(REJECTED))
+def test_vector_environments_are_rejected(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{name} creates a vector environment"):
         build(config(SPREAD, name))
 
 
 @pytest.mark.parametrize(
     ("wrappers", "message"),
     [
-        (["flatten_v0", {"resize_v1": {"x_size": 8, "y_size": 8}}], r"resize_v1 \(number 2\).*piston_0 observes Box"),
+        (
+            ["flatten_v0", {"resize_v1": {"x_size": 8, "y_size": 8}}],
+            r"resize_v1 \(number 2\).*piston_0 has observations Box",
+        ),
         ([{"color_reduction_v0": {"mode": "B"}}, "color_reduction_v0"], r"color_reduction_v0 \(number 2\).*3d image"),
         (["normalize_obs_v0"], r"normalize_obs_v0 \(number 1\)"),
         ([{"resize_v1": {"x": 8}}], r"resize_v1 \(number 1\).*'x'"),
         ([{"reshape_v0": {"shape": [3]}}], r"reshape_v0 \(number 1\).*as many elements"),
         (["frame_stack_v0"], "SuperSuit has no wrapper 'frame_stack_v0'.*use frame_stack_v1 instead"),
-        (["utils"], "'utils' is no wrapper"),
-        ([{"observation_lambda_v0": {"change_observation_fn": "no.such:thing"}}], "'no.such:thing' is no function"),
+        (["utils"], "'utils' of SuperSuit is not a wrapper"),
+        ([{"observation_lambda_v0": {"change_observation_fn": "no.such:thing"}}], "'no.such:thing' is not a function"),
     ],
 )
-def test_what_cannot_stand_is_refused_with_its_name_place_and_reason(wrappers: list[Any], message: str) -> None:
+def test_invalid_wrappers_are_rejected_with_name_position_and_reason(wrappers: list[Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build(config(PISTONBALL, *wrappers))
 
 
-def test_an_indicator_of_agents_that_observe_differently_is_refused_until_they_are_padded() -> None:
+def test_an_agent_indicator_requires_equal_observation_spaces() -> None:
     with pytest.raises(ConfigError, match=r"agent_indicator_v0 \(number 1\).*pad_observations"):
         build(config(ADVERSARY, "agent_indicator_v0"))
     build(config(ADVERSARY, "pad_observations_v0", "agent_indicator_v0"))

@@ -1,4 +1,4 @@
-"""Raw actions land inside their spaces, at the place that the table says."""
+"""Raw actions are mapped into their spaces."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,8 @@ from hypothesis.extra.numpy import arrays
 
 from league.errors import ConfigError
 from league.policies.actions import bounds, dist_inputs_size, to_environment
-from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space, from_gymnasium, to_gymnasium
+from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
+from league.spaces.conversion import from_gymnasium, to_gymnasium
 
 PAIRS = MultiDiscrete(nvec=[[2, 3], [4, 5]], start=[[0, 1], [2, 3]], shape=(2, 2))
 MIXED = Box(dtype="float32", shape=(2, 2), low=[[-1.0, 0.0], [None, None]], high=[[3.0, None], [5.0, None]])
@@ -18,11 +19,11 @@ MIXED = Box(dtype="float32", shape=(2, 2), low=[[-1.0, 0.0], [None, None]], high
     ("space", "size"),
     [(Discrete(n=5, start=2), 5), (PAIRS, 14), (MIXED, 8), (Box(dtype="float64", shape=(), low=0, high=1), 2)],
 )
-def test_the_size_of_a_distribution(space: Space, size: int) -> None:
+def test_the_size_of_the_distribution_inputs(space: Space, size: int) -> None:
     assert dist_inputs_size(space) == size
 
 
-def test_integers_begin_where_their_space_does() -> None:
+def test_integers_start_at_the_start_of_their_space() -> None:
     assert to_environment(np.array([0, 2]), Discrete(n=5, start=-1)).tolist() == [-1, 1]
     raw = np.array([[0, 0, 0, 0], [1, 2, 3, 4]])
     actions = to_environment(raw, PAIRS)
@@ -30,7 +31,7 @@ def test_integers_begin_where_their_space_does() -> None:
     assert actions.dtype == np.int64
 
 
-def test_each_number_is_spanned_or_clipped_by_its_own_bounds() -> None:
+def test_each_number_is_scaled_or_clipped_by_its_bounds() -> None:
     raw = np.array([[0.0, -2.0, 9.0, 100.0], [-1.0, 2.0, 4.0, -100.0], [7.0, 0.5, -8.0, 0.0]], np.float32)
     assert to_environment(raw, MIXED).tolist() == [
         [[1.0, 0.0], [5.0, 100.0]],
@@ -43,7 +44,7 @@ def test_each_number_is_spanned_or_clipped_by_its_own_bounds() -> None:
     arrays(np.float32, (3, 4), elements=st.floats(-1e6, 1e6, width=32)),
     st.sampled_from(["float16", "float32", "float64"]),
 )
-def test_actions_lie_inside_their_space(raw: np.ndarray, dtype: str) -> None:
+def test_actions_are_inside_their_space(raw: np.ndarray, dtype: str) -> None:
     largest = float(np.finfo(dtype).max)
     low, high = [[-largest, -0.1], [0.1, None]], [[largest, 0.3], [0.1, 7.0]]
     space = Box(dtype=dtype, shape=(2, 2), low=low, high=high)
@@ -68,7 +69,7 @@ def test_bounds_have_the_shape_of_the_space() -> None:
         DictSpace(spaces={"move": Discrete(n=2)}),
     ],
 )
-def test_other_actions_are_refused(space: Space) -> None:
+def test_unsupported_action_spaces_are_rejected(space: Space) -> None:
     with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):
         dist_inputs_size(space)
     with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):

@@ -1,4 +1,4 @@
-"""Random choices at the edges of what a generator gives."""
+"""Draws at the limits of the random number generator."""
 
 from typing import Any, cast
 
@@ -11,7 +11,7 @@ from league.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 
 class Fixed:
-    """A generator of one number."""
+    """A generator that always returns the same number."""
 
     def __init__(self, number: float) -> None:
         self._number = number
@@ -27,12 +27,12 @@ def fixed(*numbers: float) -> list[np.random.Generator]:
 LOWEST, HIGHEST = 0.0, 1 - 2**-53
 
 
-def test_the_least_and_the_greatest_number_choose_what_is_allowed() -> None:
+def test_extreme_random_numbers_choose_allowed_actions() -> None:
     allowed = np.array([[0, 0, 1, 1, 0]] * 4, np.int8)
     assert choose(allowed, np.array([LOWEST, 0.4999, 0.5, HIGHEST])).tolist() == [2, 2, 3, 3]
 
 
-def test_the_least_and_the_greatest_number_sample_what_is_possible() -> None:
+def test_extreme_random_numbers_sample_possible_actions() -> None:
     logits = np.array([[-1e9, 0.0, np.log(3.0), -1e9]] * 4, np.float32)
     assert sample(logits, Discrete(n=4), fixed(LOWEST, 0.2499, 0.2501, HIGHEST)).tolist() == [1, 1, 2, 2]
 
@@ -42,7 +42,7 @@ def test_huge_and_infinite_logits_are_sampled() -> None:
     assert sample(logits, Discrete(n=3), fixed(HIGHEST, LOWEST)).tolist() == [2, 1]
 
 
-def test_a_row_draws_from_its_own_generator() -> None:
+def test_each_row_draws_from_its_own_generator() -> None:
     assert draw(fixed(0.25, 0.75), 2).tolist() == [0.25, 0.75]
     assert draw(fixed(0.25, 0.75), 2, (2,)).tolist() == [[0.25, 0.25], [0.75, 0.75]]
     assert draw([], 0, (2,)).shape == (0, 2)
@@ -50,13 +50,13 @@ def test_a_row_draws_from_its_own_generator() -> None:
         draw(fixed(0.25, 0.75), 3)
 
 
-def test_each_element_of_an_action_has_a_distribution_of_its_own() -> None:
+def test_each_element_of_an_action_has_its_own_distribution() -> None:
     logits = np.array([[0.0, -1e9, -1e9, 0.0, 0.0]] * 3, np.float32)
     space = MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,))
     assert sample(logits, space, fixed(LOWEST, 0.4999, 0.5)).tolist() == [[0, 1], [0, 1], [0, 2]]
 
 
-def test_numbers_are_normal_with_their_means_and_deviations() -> None:
+def test_box_actions_are_normally_distributed() -> None:
     rows = 20_000
     inputs = np.tile(np.array([[3.0, -1.0, np.log(0.5), np.log(2.0)]], np.float32), (rows, 1))
     rng = [np.random.default_rng((7, row)) for row in range(rows)]
@@ -65,11 +65,13 @@ def test_numbers_are_normal_with_their_means_and_deviations() -> None:
     np.testing.assert_allclose(raw.mean(0), [3.0, -1.0], atol=5 * 2 / rows**0.5)
     np.testing.assert_allclose(raw.std(0), [0.5, 2.0], rtol=5 / (2 * rows) ** 0.5)
     assert abs(np.corrcoef(raw.T)[0, 1]) < 5 / rows**0.5
-    assert (sample(inputs[:5], Box(dtype="float32", shape=(2,), low=0, high=1), rng[:5]) != raw[:5]).all(), "drawn on"
+    assert (sample(inputs[:5], Box(dtype="float32", shape=(2,), low=0, high=1), rng[:5]) != raw[:5]).all(), (
+        "the generators advance"
+    )
     again = [np.random.default_rng((7, row)) for row in range(3, 5)]
     assert (sample(inputs[3:5], Box(dtype="float32", shape=(2,), low=0, high=1), again) == raw[3:5]).all()
 
 
-def test_a_space_without_a_distribution_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no policy has actions"):
+def test_an_unsupported_space_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="unsupported action space"):
         sample(np.zeros((1, 4), np.float32), MultiBinary(shape=(2,)), fixed(0.5))

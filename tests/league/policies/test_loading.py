@@ -1,4 +1,4 @@
-"""From a reference to something that acts, verified."""
+"""Loading a verified policy from a reference."""
 
 import subprocess
 import sys
@@ -21,8 +21,8 @@ from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.league.policies.graphs import masked_mlp
-from tests.league.registry.examples import LEAGUE, builder, interface, registered
+from tests.support.graphs import masked_mlp
+from tests.support.registries import LEAGUE, builder, interface, registered
 
 GRAPHS = [masked_mlp(shape=(3, 3, 2), actions=9, seed=seed) for seed in (1, 2)]
 BATCH = {
@@ -33,16 +33,16 @@ BATCH = {
 
 @pytest.fixture
 def registry(tmp_path: Path) -> Iterator[Registry]:
-    """A league of two versions that act differently; the second is the champion."""
+    """A league with two versions that act differently; the second is the champion."""
     registry = registered(Registry.open(Storage.at(tmp_path)))
     for i, graph in enumerate(GRAPHS):
-        registry.publish(LEAGUE, builder(graph=graph), source=f"run/{i}")
-    registry.set_alias(LEAGUE, "champion", 2, expected=None, actor="ann", reason="better")
+        registry.publisher.publish(LEAGUE, builder(graph=graph), source=f"run/{i}")
+    registry.aliases.set(LEAGUE, "champion", 2, expected=None, actor="ann", reason="better")
     yield registry
     registry.close()
 
 
-def test_references_load_what_they_name(registry: Registry) -> None:
+def test_references_load_the_policies_they_name(registry: Registry) -> None:
     expected = [OnnxPolicy(graph).act(BATCH).actions.tolist() for graph in GRAPHS]
     assert expected[0] != expected[1]
     for ref, actions in {"1": expected[0], "2": expected[1], "champion": expected[1]}.items():
@@ -52,7 +52,9 @@ def test_references_load_what_they_name(registry: Registry) -> None:
     assert named.act(BATCH).actions.tolist() == expected[0]
 
 
-def test_the_registry_is_that_of_the_environment(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_registry_is_that_of_the_environment_variables(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("LEAGUE_HOME", str(registry.storage.home))
     monkeypatch.delenv("LEAGUE_DATABASE_URL", raising=False)
     monkeypatch.delenv("LEAGUE_ARTIFACTS", raising=False)
@@ -60,7 +62,7 @@ def test_the_registry_is_that_of_the_environment(registry: Registry, monkeypatch
     assert league.policies.load("tictactoe@champion").act(BATCH).actions.tolist() == expected
 
 
-def test_what_cannot_be_loaded_is_named(registry: Registry) -> None:
+def test_unknown_policies_aliases_and_references_are_reported(registry: Registry) -> None:
     with pytest.raises(UnknownPolicy, match="tictactoe@1 has no policy 'white'; known: shared"):
         league.policies.load("tictactoe@1", "white", registry)
     with pytest.raises(UnknownAlias):
@@ -84,7 +86,7 @@ def test_a_contestant_acts_for_every_agent(registry: Registry) -> None:
     assert players["player_1"][1].act(BATCH).actions.tolist() == expected
 
 
-def test_a_script_is_a_contestant(registry: Registry) -> None:
+def test_a_script_can_be_a_contestant(registry: Registry) -> None:
     players = contestant("script:one_ply", registry, interface())
     rng = [np.random.default_rng(row) for row in range(18)]
     assert players["player_1"] == players["player_2"]
@@ -92,20 +94,20 @@ def test_a_script_is_a_contestant(registry: Registry) -> None:
     assert list(contestant("script:first", None, interface())) == ["player_1", "player_2"]
     with pytest.raises(InvalidInput, match="tictactoe@1 is a version: without a registry"):
         contestant("tictactoe@1", None, interface())
-    with pytest.raises(UnknownPolicy, match="no script 'minimax'"):
+    with pytest.raises(UnknownPolicy, match="unknown script 'minimax'"):
         contestant("script:minimax", registry, interface())
 
 
-def test_a_version_of_another_interface_is_no_contestant(registry: Registry) -> None:
-    with pytest.raises(EnvironmentMismatch, match="tictactoe@2 has other spaces"):
+def test_a_version_with_another_interface_is_rejected(registry: Registry) -> None:
+    with pytest.raises(EnvironmentMismatch, match="spaces or policies of tictactoe@2 differ"):
         contestant("tictactoe@champion", registry, interface(squares=4))
 
 
-def test_loading_needs_neither_an_environment_nor_a_trainer() -> None:
-    heavy = ("torch", "ray", "pettingzoo", "gymnasium", "supersuit", "alembic", "scipy", "onnx")
+def test_loading_imports_neither_environments_nor_training() -> None:
+    packages = ("torch", "ray", "pettingzoo", "gymnasium", "supersuit", "alembic", "scipy", "onnx")
     program = (
         "import sys; import league.policies.loading, league.results.ledger; "
-        f"print(sorted(set({heavy}) & set(sys.modules)))"
+        f"print(sorted(set({packages}) & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

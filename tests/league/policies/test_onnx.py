@@ -1,4 +1,4 @@
-"""A graph acts greedily or by its distribution, row by row, and says what is wrong with what it is given."""
+"""Greedy and sampled actions of a graph, and the errors for invalid inputs."""
 
 from pathlib import Path
 from statistics import NormalDist
@@ -12,16 +12,16 @@ from hypothesis.extra.numpy import arrays
 
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, InvalidInput, ObservationError
 from league.policies.onnx import OnnxPolicy
-from league.registry.manifest import Parity, PolicyManifest, Tensor
+from league.registry.storage.manifest import Parity, PolicyManifest, Tensor
 from league.spaces import Box, DictSpace, Discrete
-from tests.league.policies.graphs import continuous, counting, masked_mlp
+from tests.support.graphs import continuous, counting, masked_mlp
 
 GRAPH = masked_mlp()
 POLICY = OnnxPolicy(GRAPH)
 
 
 def manifest(**changes: Any) -> PolicyManifest:
-    """What `masked_mlp` must look like."""
+    """The manifest of `masked_mlp`."""
     board = Box(dtype="int8", shape=(6, 7, 2), low=0, high=1)
     mask = Box(dtype="int8", shape=(7,), low=0, high=1)
     fields: dict[str, Any] = {
@@ -52,7 +52,7 @@ def generators(rows: int, seed: int = 0) -> list[np.random.Generator]:
     return [np.random.default_rng((seed, row)) for row in range(rows)]
 
 
-def test_greedy_actions_are_the_legal_mode() -> None:
+def test_greedy_actions_are_the_mode_of_the_legal_actions() -> None:
     batch = observations(50)
     answer = POLICY.act(batch)
     logits = POLICY.act(batch, explore=True, rng=generators(50)).dist_inputs
@@ -62,14 +62,14 @@ def test_greedy_actions_are_the_legal_mode() -> None:
     assert len(set(answer.actions.tolist())) > 3
 
 
-def test_a_file_is_its_bytes(tmp_path: Path) -> None:
+def test_a_graph_can_be_a_path_or_bytes(tmp_path: Path) -> None:
     (tmp_path / "shared.onnx").write_bytes(GRAPH)
     batch = observations(9)
     for graph in (tmp_path / "shared.onnx", str(tmp_path / "shared.onnx")):
         assert OnnxPolicy(graph, manifest()).act(batch).actions.tolist() == POLICY.act(batch).actions.tolist()
 
 
-def test_a_row_is_answered_whatever_its_batch() -> None:
+def test_actions_do_not_depend_on_the_batch() -> None:
     batch = observations(20)
     together = POLICY.act(batch, explore=True, rng=generators(20)).actions
     for row in range(20):
@@ -85,19 +85,19 @@ def test_exploring_follows_the_distribution() -> None:
     weights = np.exp(answer.dist_inputs[0].astype(np.float64))
     probability = weights / weights.sum()
     share = np.bincount(answer.actions, minlength=7) / rows
-    assert (probability > 0.05).sum() > 2, "there is something to choose from"
+    assert (probability > 0.05).sum() > 2, "several actions are likely"
     assert (np.abs(share - probability) <= 5 * np.sqrt(probability * (1 - probability) / rows)).all()
 
 
 @given(arrays(np.int8, (4, 7), elements=st.integers(0, 1)), st.integers(0, 2**32))
-def test_what_is_illegal_is_never_chosen(mask: np.ndarray, seed: int) -> None:
+def test_illegal_actions_are_never_chosen(mask: np.ndarray, seed: int) -> None:
     mask[:, seed % 7] = 1
     batch = observations(4, seed) | {"action_mask": mask}
     for answer in (POLICY.act(batch), POLICY.act(batch, explore=True, rng=generators(4, seed))):
         assert mask[np.arange(4), answer.actions].all()
 
 
-def test_actions_start_where_their_space_does() -> None:
+def test_actions_start_at_the_start_of_their_space() -> None:
     policy = OnnxPolicy(masked_mlp(start=3), manifest(action=Discrete(n=7, start=3)))
     batch = observations(30)
     assert (policy.act(batch).actions == POLICY.act(batch).actions + 3).all()
@@ -105,7 +105,7 @@ def test_actions_start_where_their_space_does() -> None:
     assert (explored == POLICY.act(batch, explore=True, rng=generators(30)).actions + 3).all()
 
 
-def test_recurrent_state_goes_in_and_comes_out() -> None:
+def test_recurrent_state_is_passed_in_and_returned() -> None:
     policy = OnnxPolicy(counting())
     state = None
     for step, (expected, actions) in enumerate([([1, 2], [0, 0]), ([2, 4], [0, 1]), ([3, 6], [1, 1])]):
@@ -119,7 +119,7 @@ def test_recurrent_state_goes_in_and_comes_out() -> None:
     assert explored.dist_inputs is not None
 
 
-def test_a_vector_of_actions_is_explored_only_where_its_space_is_known() -> None:
+def test_exploring_vectors_requires_a_manifest() -> None:
     policy = OnnxPolicy(continuous())
     value = np.array([[0.25, -1.5]], np.float32)
     assert (policy.act({"observation": value}).actions == value).all()
@@ -127,8 +127,8 @@ def test_a_vector_of_actions_is_explored_only_where_its_space_is_known() -> None
         policy.act({"observation": value}, explore=True, rng=generators(1))
 
 
-def test_vectors_are_explored_inside_their_bounds_row_by_row() -> None:
-    """The graph's means and logarithms of deviations are both its observation, here 0.2 and -0.5."""
+def test_sampled_vectors_are_within_their_bounds() -> None:
+    """Means and log standard deviations are both the observation, here 0.2 and -0.5."""
     rows = 4000
     space = Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0])
     policy = OnnxPolicy(
@@ -149,7 +149,7 @@ def test_vectors_are_explored_inside_their_bounds_row_by_row() -> None:
     assert (answer.actions <= [1, 10]).all()
     assert answer.dist_inputs is not None
     assert answer.dist_inputs[0].tolist() == pytest.approx([0.2, -0.5, 0.2, -0.5])
-    # A normal number with mean μ and deviation σ is cut off at 1 with probability 1 − Φ((1 − μ) / σ).
+    # A normal variable with mean μ and standard deviation σ is clipped at 1 with probability 1 − Φ((1 − μ) / σ).
     cut = [1 - NormalDist(mean, np.exp(mean)).cdf(1) for mean in (0.2, -0.5)]
     np.testing.assert_allclose((answer.actions == [1, 10]).mean(0), cut, atol=0.04)
     alone = policy.act({"observation": batch["observation"][7:8]}, explore=True, rng=generators(8)[7:])
@@ -163,16 +163,16 @@ def test_vectors_are_explored_inside_their_bounds_row_by_row() -> None:
         ({"observation": np.zeros((1, 6, 7, 2))}, r"observation is float64 \[6, 7, 2\]: expected .* int8"),
         ({"observation": np.zeros((1, 6, 7), np.int8)}, r"observation is int8 \[6, 7\]: expected .*\[6, 7, 2\]"),
         ({"observation": np.zeros((2, 6, 7, 2), np.int8)}, r"rows differ: .*'observation': 2"),
-        ({"observation": [[0]]}, r"observation is no NumPy array"),
+        ({"observation": [[0]]}, r"observation is not a NumPy array"),
     ],
 )
-def test_what_does_not_fit_is_named(change: dict[str, Any], message: str) -> None:
+def test_an_observation_that_does_not_fit_is_rejected(change: dict[str, Any], message: str) -> None:
     batch = {name: array for name, array in (observations(1) | change).items() if array is not None}
     with pytest.raises(ObservationError, match=message):
         POLICY.act(batch)
 
 
-def test_a_state_that_does_not_fit_is_named() -> None:
+def test_a_state_that_does_not_fit_is_rejected() -> None:
     policy = OnnxPolicy(counting())
     batch = {"observation": np.zeros((1, 1), np.float32)}
     with pytest.raises(ObservationError, match=r"state_in_0 is float32 \[2\]"):
@@ -202,17 +202,17 @@ def test_exploring_needs_a_generator_for_each_row(rng: list[np.random.Generator]
         (
             GRAPH,
             {"action": Discrete(n=8)},
-            "action_dist_inputs of the graph has 7 values a row, but its actions need 8",
+            "action_dist_inputs of the graph has 7 values per row, but its action space requires 8",
         ),
     ],
 )
-def test_a_graph_that_is_not_the_manifest_s_is_refused(graph: bytes, changes: dict[str, Any], message: str) -> None:
+def test_a_graph_that_contradicts_its_manifest_is_rejected(graph: bytes, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ArtifactCorrupt, match=message) as caught:
         OnnxPolicy(graph, manifest(**changes))
     assert "\n" not in str(caught.value)
 
 
-def test_a_graph_must_have_the_outputs_of_a_policy() -> None:
+def test_a_graph_needs_the_outputs_of_a_policy() -> None:
     import onnx
 
     model = onnx.load_from_string(GRAPH)

@@ -1,4 +1,4 @@
-"""Probes come back as they went, and a graph that answers otherwise is told from one that does not."""
+"""Probes survive serialization, and detect a graph with other actions."""
 
 import io
 from dataclasses import replace
@@ -10,60 +10,51 @@ from league.errors import ArtifactCorrupt
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import Probes
 from league.spaces import Discrete
-from tests.league.policies.graphs import counting, masked_mlp
+from tests.support.graphs import counting, masked_mlp
+from tests.support.probes import probes
 
 SPACE = Discrete(n=7)
 
 
-def probes(seed: int = 0, rows: int = 16) -> Probes:
-    """What masked_mlp(seed) does on random boards."""
-    random = np.random.default_rng(0)
-    observations = {
-        "observation": random.integers(0, 2, (rows, 6, 7, 2), dtype=np.int8),
-        "action_mask": np.ones((rows, 7), np.int8),
-    }
-    return Probes(observations, {}, OnnxPolicy(masked_mlp(seed=seed)).act(observations).actions)
+def test_probes_survive_serialization() -> None:
+    original = probes()
+    restored = Probes.from_bytes(original.to_bytes(), "probes")
+    assert restored.observations.keys() == original.observations.keys()
+    for name, array in original.observations.items():
+        np.testing.assert_array_equal(restored.observations[name], array)
+        assert restored.observations[name].dtype == array.dtype
+    np.testing.assert_array_equal(restored.actions, original.actions)
+    assert restored.state == {}
 
 
-def test_they_come_back_as_they_went() -> None:
-    before = probes()
-    after = Probes.from_bytes(before.to_bytes(), "probes")
-    assert after.observations.keys() == before.observations.keys()
-    for name, array in before.observations.items():
-        np.testing.assert_array_equal(after.observations[name], array)
-        assert after.observations[name].dtype == array.dtype
-    np.testing.assert_array_equal(after.actions, before.actions)
-    assert after.state == {}
-
-
-def test_the_graph_that_they_were_recorded_of_answers_them() -> None:
+def test_probes_match_the_graph_that_recorded_them() -> None:
     probes().check(OnnxPolicy(masked_mlp(seed=0)), SPACE, "probes")
 
 
-def test_another_graph_is_told() -> None:
+def test_another_graph_is_detected() -> None:
     with pytest.raises(ArtifactCorrupt, match=r"\d+ of 16 probe observations of board@1"):
         probes().check(OnnxPolicy(masked_mlp(seed=1)), SPACE, "board@1")
 
 
-def test_state_is_probed_too() -> None:
+def test_recurrent_state_is_probed() -> None:
     policy = OnnxPolicy(counting())
     observations = {"observation": np.array([[1], [1]], np.float32)}
     state = {"state_in_0": np.array([[0], [5]], np.float32)}
     recorded = Probes(observations, state, policy.act(observations, state=state).actions)
-    again = Probes.from_bytes(recorded.to_bytes(), "probes")
-    assert again.state.keys() == {"state_in_0"}
-    again.check(policy, Discrete(n=2), "probes")
+    restored = Probes.from_bytes(recorded.to_bytes(), "probes")
+    assert restored.state.keys() == {"state_in_0"}
+    restored.check(policy, Discrete(n=2), "probes")
     with pytest.raises(ArtifactCorrupt, match="1 of 2"):
-        replace(again, state={"state_in_0": np.zeros((2, 1), np.float32)}).check(policy, Discrete(n=2), "probes")
+        replace(restored, state={"state_in_0": np.zeros((2, 1), np.float32)}).check(policy, Discrete(n=2), "probes")
 
 
-def test_probes_that_do_not_fit_the_graph_are_told() -> None:
-    wrong = replace(probes(), observations={"observation": np.zeros((16, 3), np.int8)})
+def test_probes_that_do_not_fit_the_graph_are_rejected() -> None:
+    wrong_observations = replace(probes(), observations={"observation": np.zeros((16, 3), np.int8)})
     with pytest.raises(ArtifactCorrupt, match="does not fit the graph"):
-        wrong.check(OnnxPolicy(masked_mlp()), SPACE, "probes")
-    shaped = replace(probes(), actions=np.zeros((16, 2), np.int64))
+        wrong_observations.check(OnnxPolicy(masked_mlp()), SPACE, "probes")
+    wrong_actions = replace(probes(), actions=np.zeros((16, 2), np.int64))
     with pytest.raises(ArtifactCorrupt, match="actions"):
-        shaped.check(OnnxPolicy(masked_mlp()), SPACE, "probes")
+        wrong_actions.check(OnnxPolicy(masked_mlp()), SPACE, "probes")
 
 
 def archive(**arrays: np.ndarray) -> bytes:
@@ -72,8 +63,8 @@ def archive(**arrays: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-class Trap:
-    """What a pickle would run."""
+class MaliciousPickle:
+    """Fails the test when it is unpickled."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return pytest.fail, ("a pickle was read",)
@@ -89,10 +80,10 @@ class Trap:
         archive(observation=np.zeros(2), action=np.zeros(3)),
         archive(observation=np.zeros(0), action=np.zeros(0)),
         archive(observation=np.zeros(1), action=np.float32(1)),
-        archive(observation=np.array([Trap()], dtype=object), action=np.zeros(1)),
+        archive(observation=np.array([MaliciousPickle()], dtype=object), action=np.zeros(1)),
     ],
-    ids=["empty", "no archive", "cut", "no actions", "lengths", "no rows", "a number", "pickle"],
+    ids=["empty", "not an archive", "truncated", "no actions", "lengths", "no rows", "scalar", "pickle"],
 )
-def test_what_is_no_probes_is_refused(content: bytes) -> None:
-    with pytest.raises(ArtifactCorrupt, match="the file holds no probes"):
+def test_invalid_probes_are_rejected(content: bytes) -> None:
+    with pytest.raises(ArtifactCorrupt, match="the file contains no probes"):
         Probes.from_bytes(content, "the file")

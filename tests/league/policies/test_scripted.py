@@ -1,4 +1,4 @@
-"""The baselines, against brute force on the real games."""
+"""The scripted policies, compared with brute force on the real games."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,29 +14,21 @@ from pettingzoo.classic.tictactoe.tictactoe import raw_env as tictactoe
 from league.errors import EnvironmentMismatch, IllegalMask, InvalidInput, UnknownPolicy
 from league.policies.policy import Policy
 from league.policies.scripted import script
-from league.spaces import (
-    Box,
-    DictSpace,
-    Discrete,
-    MultiBinary,
-    MultiDiscrete,
-    Space,
-    from_gymnasium,
-    tensors,
-    to_gymnasium,
-)
+from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
+from league.spaces.arrays import tensors
+from league.spaces.conversion import from_gymnasium, to_gymnasium
 
 GAMES = {"connect_four": connect_four, "tictactoe": tictactoe}
 DRAWS = 150
-"""Enough that each of nine equally likely actions is drawn: the chance that one is not is below 1e-6."""
+"""Enough draws for nine equally likely actions: the probability that one is missing is below 1e-6."""
 
 
 def generators(rows: int, seed: int = 0) -> list[np.random.Generator]:
     return [np.random.default_rng((seed, row)) for row in range(rows)]
 
 
-def after(game: str, moves: Sequence[int]) -> Any:
-    """A real environment after these moves."""
+def environment_after(game: str, moves: Sequence[int]) -> Any:
+    """An environment after these moves."""
     env = GAMES[game]()
     env.reset(seed=0)
     for move in moves:
@@ -44,10 +36,10 @@ def after(game: str, moves: Sequence[int]) -> Any:
     return env
 
 
-def position(game: str, seed: int, plies: int) -> list[int]:
-    """So many random legal moves, or fewer if the game would end."""
+def random_moves(game: str, seed: int, plies: int) -> list[int]:
+    """This number of random legal moves, or fewer if the game would end."""
     random, moves = np.random.default_rng(seed), list[int]()
-    env = after(game, moves)
+    env = environment_after(game, moves)
     for _ in range(plies):
         move = int(random.choice(legal(env)))
         env.step(move)
@@ -61,11 +53,11 @@ def legal(env: Any) -> list[int]:
     return np.flatnonzero(env.observe(env.agent_selection)["action_mask"]).tolist()
 
 
-def winning(game: str, moves: Sequence[int], own: bool) -> list[int]:
-    """The actions by which the player to move wins at once, or the other one would if it were to move."""
+def winning_moves(game: str, moves: Sequence[int], own: bool) -> list[int]:
+    """The actions with which the player to move wins immediately, or the opponent would if it were to move."""
     found = []
-    for action in legal(after(game, moves)):
-        env = after(game, moves)
+    for action in legal(environment_after(game, moves)):
+        env = environment_after(game, moves)
         if not own:
             env.agent_selection = env._agent_selector.next()
         player = env.agent_selection
@@ -80,7 +72,7 @@ def spaces(env: Any) -> tuple[Space, Space]:
     return from_gymnasium(env.observation_space(agent)), from_gymnasium(env.action_space(agent))
 
 
-def chosen(policy: Policy, env: Any) -> set[int]:
+def chosen_actions(policy: Policy, env: Any) -> set[int]:
     """All actions that a script takes in a position."""
     value = tensors(spaces(env)[0], env.observe(env.agent_selection))
     batch = {name: np.repeat(array[None], DRAWS, axis=0) for name, array in value.items()}
@@ -89,23 +81,23 @@ def chosen(policy: Policy, env: Any) -> set[int]:
 
 @settings(max_examples=120, deadline=None)
 @given(st.sampled_from(sorted(GAMES)), st.integers(0, 10_000), st.integers(0, 41))
-def test_one_ply_wins_else_blocks_else_plays_any_legal_move(game: str, seed: int, plies: int) -> None:
-    moves = position(game, seed, plies)
-    env = after(game, moves)
-    expected = winning(game, moves, own=True) or winning(game, moves, own=False) or legal(env)
-    assert chosen(script("one_ply", *spaces(env)), env) == set(expected)
+def test_one_ply_wins_or_blocks_or_plays_any_legal_move(game: str, seed: int, plies: int) -> None:
+    moves = random_moves(game, seed, plies)
+    env = environment_after(game, moves)
+    expected = winning_moves(game, moves, own=True) or winning_moves(game, moves, own=False) or legal(env)
+    assert chosen_actions(script("one_ply", *spaces(env)), env) == set(expected)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.sampled_from(sorted(GAMES)), st.integers(0, 10_000), st.integers(0, 41))
-def test_random_plays_every_legal_move_and_no_other(game: str, seed: int, plies: int) -> None:
-    env = after(game, position(game, seed, plies))
-    assert chosen(script("random", *spaces(env)), env) == set(legal(env))
+def test_random_plays_exactly_the_legal_moves(game: str, seed: int, plies: int) -> None:
+    env = environment_after(game, random_moves(game, seed, plies))
+    assert chosen_actions(script("random", *spaces(env)), env) == set(legal(env))
 
 
 @pytest.mark.parametrize("name", ["random", "one_ply"])
-def test_a_row_is_answered_whatever_its_batch(name: str) -> None:
-    envs = [after("connect_four", position("connect_four", seed, 3 * seed)) for seed in range(8)]
+def test_actions_do_not_depend_on_the_batch(name: str) -> None:
+    envs = [environment_after("connect_four", random_moves("connect_four", seed, 3 * seed)) for seed in range(8)]
     policy = script(name, *spaces(envs[0]))
     values = [tensors(spaces(env)[0], env.observe(env.agent_selection)) for env in envs]
     batch = {key: np.stack([value[key] for value in values]) for key in values[0]}
@@ -121,7 +113,7 @@ def masked(actions: int, start: int = 0) -> tuple[Space, Space]:
     return DictSpace(spaces={"observation": board, "action_mask": mask}), Discrete(n=actions, start=start)
 
 
-def test_random_is_uniform_over_what_is_legal() -> None:
+def test_random_is_uniform_over_legal_actions() -> None:
     rows = 20_000
     policy = script("random", *masked(5, start=10))
     mask = np.tile(np.array([0, 1, 1, 0, 1], np.int8), (rows, 1))
@@ -140,7 +132,7 @@ def test_random_is_uniform_over_what_is_legal() -> None:
         (Box(dtype="uint8", shape=(2,), low=3, high=5), 3, 5),
     ],
 )
-def test_random_without_a_mask_takes_every_value_of_the_space(action: Space, low: Any, high: Any) -> None:
+def test_random_without_a_mask_covers_the_space(action: Space, low: Any, high: Any) -> None:
     policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
     actions = policy.act({"observation": np.zeros((2000, 1), np.float32)}, rng=generators(2000)).actions
     assert not isinstance(action, DictSpace)
@@ -149,7 +141,7 @@ def test_random_without_a_mask_takes_every_value_of_the_space(action: Space, low
     assert (actions.max(axis=0) == high).all()
 
 
-def test_random_fills_a_continuous_space() -> None:
+def test_random_covers_a_continuous_space() -> None:
     action = Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0])
     policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
     actions = policy.act({"observation": np.zeros((5000, 1), np.float32)}, rng=generators(5000)).actions
@@ -162,7 +154,7 @@ def test_random_fills_a_continuous_space() -> None:
 PAIR = MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,))
 
 
-def test_random_heeds_the_mask_of_each_element() -> None:
+def test_random_applies_the_mask_of_each_element() -> None:
     rows = 9_000
     policy = script("random", masked(5)[0], PAIR)
     mask = np.tile(np.array([0, 1, 1, 0, 1], np.int8), (rows, 1))
@@ -184,7 +176,7 @@ def test_random_heeds_the_mask_of_each_element() -> None:
         (Box(dtype="float32", shape=(4,), low=[-2, 1, None, None], high=[5, 5, 5, -5]), [-2, 1, 0, -5]),
     ],
 )
-def test_first_takes_the_lowest_of_everything(action: Space, expected: Any) -> None:
+def test_first_takes_the_lowest_action(action: Space, expected: Any) -> None:
     policy = script("first", Discrete(n=4), action)
     actions = policy.act({"observation": np.zeros(3, np.int64)}).actions
     assert actions.tolist() == [expected] * 3
@@ -200,8 +192,8 @@ def test_first_takes_the_first_legal_action() -> None:
         script("first", *masked(5)).act(batch | {"action_mask": mask * 0})
 
 
-def test_mirror_repeats_the_opponent_s_last_move() -> None:
-    """In the real game: it begins with rock, and then plays what the other one played a round before."""
+def test_mirror_repeats_the_last_move_of_the_opponent() -> None:
+    """In the real game: it starts with rock, then plays the previous move of the opponent."""
     env = rps()
     env.reset(seed=0)
     agent = env.possible_agents[1]
@@ -215,8 +207,8 @@ def test_mirror_repeats_the_opponent_s_last_move() -> None:
     assert answers == [0, *moves[:-1]]
 
 
-def test_unknown_scripts_are_named_with_the_known_ones() -> None:
-    with pytest.raises(UnknownPolicy, match="no script 'minimax'; known: random, one_ply, first, mirror"):
+def test_unknown_scripts_are_reported_with_the_known_ones() -> None:
+    with pytest.raises(UnknownPolicy, match="unknown script 'minimax'; known: random, one_ply, first, mirror"):
         script("minimax", *masked(3))
 
 
@@ -236,13 +228,13 @@ def test_unknown_scripts_are_named_with_the_known_ones() -> None:
         ("random", Discrete(n=3), DictSpace(spaces={"move": Discrete(n=2)})),
     ],
 )
-def test_spaces_that_a_script_cannot_play_with_are_refused(name: str, observation: Space, action: Space) -> None:
+def test_unsupported_spaces_are_rejected(name: str, observation: Space, action: Space) -> None:
     with pytest.raises(EnvironmentMismatch, match=f"script:{name}"):
         script(name, observation, action)
 
 
 @pytest.mark.parametrize("name", ["random", "one_ply"])
-def test_faults_are_named(name: str) -> None:
+def test_missing_generators_and_empty_masks_are_reported(name: str) -> None:
     policy = script(name, *spaces(tictactoe()))
     batch = {"observation": np.zeros((2, 3, 3, 2), np.int8), "action_mask": np.ones((2, 9), np.int8)}
     with pytest.raises(InvalidInput, match="2 rows needs rng, one generator per row: got none"):

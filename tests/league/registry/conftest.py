@@ -5,7 +5,7 @@ import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.league.registry.examples import registered
+from tests.support.registries import registered
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def registry(empty: Registry) -> Registry:
 
 @pytest.fixture
 def local(tmp_path: Path) -> Iterator[Registry]:
-    """A registry on SQLite with one league, for what has nothing to do with the database."""
+    """A registry on SQLite with one league, for tests that do not depend on the database."""
     registry = Registry.open(Storage.at(tmp_path / "home"))
     yield registered(registry)
     registry.close()

@@ -1,4 +1,4 @@
-"""Many processes on one registry."""
+"""Several processes on one registry."""
 
 import multiprocessing
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ import pytest
 from league.errors import AliasMoved
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.league.registry.examples import LEAGUE, leftovers, publish, registered
+from tests.support.registries import LEAGUE, leftovers, publish, registered
 
 PROCESSES = 3
 
@@ -25,7 +25,7 @@ def _open(storage: Storage) -> int:
     registry = Registry.open(storage)
     registered(registry)
     registry.close()
-    return len(registry.leagues())
+    return len(registry.leagues.all())
 
 
 def _publish(storage: Storage, sources: list[str]) -> list[int]:
@@ -36,13 +36,13 @@ def _publish(storage: Storage, sources: list[str]) -> list[int]:
 
 
 def _promote(storage: Storage, actor: str, rounds: int) -> int:
-    """Race for each of `rounds` compare-and-sets; returns how many were won."""
+    """Attempt `rounds` compare-and-sets; returns how many succeeded."""
     registry, won = Registry.open(storage), 0
     for turn in range(rounds):
-        expected = registry.aliases(LEAGUE).get("champion")
+        expected = registry.aliases.current(LEAGUE).get("champion")
         version = 1 + (expected or 0) % 3
         try:
-            event = registry.set_alias(LEAGUE, "champion", version, expected=expected, actor=actor, reason=str(turn))
+            event = registry.aliases.set(LEAGUE, "champion", version, expected=expected, actor=actor, reason=str(turn))
         except AliasMoved:
             continue
         assert (event.actor, event.reason, event.version) == (actor, str(turn), version)
@@ -60,10 +60,10 @@ def test_publishers_never_share_a_number(processes: ProcessPoolExecutor, registr
     numbers = list(processes.map(_publish, [storage] * PROCESSES, sources))
     given = dict(zip(chain(*numbers), chain(*sources), strict=True))
     assert sorted(given) == list(range(1, 6 * PROCESSES + 1))
-    published = {version.number: version.source for version in registry.versions(LEAGUE)}
+    published = {version.number: version.source for version in registry.versions.all(LEAGUE)}
     assert published == given
     for number in published:
-        registry.fetch(LEAGUE, number)
+        registry.versions.fetch(LEAGUE, number)
 
 
 def test_publishers_of_the_same_checkpoints_publish_each_once(
@@ -72,7 +72,7 @@ def test_publishers_of_the_same_checkpoints_publish_each_once(
     sources = [f"run/{i}" for i in range(6)]
     numbers = list(processes.map(_publish, [storage] * PROCESSES, [sources] * PROCESSES))
     assert numbers == [numbers[0]] * PROCESSES
-    assert [version.source for version in registry.versions(LEAGUE)] == sources
+    assert [version.source for version in registry.versions.all(LEAGUE)] == sources
     assert leftovers(registry) == []
 
 
@@ -82,8 +82,8 @@ def test_each_compare_and_set_has_one_winner(
     registered(registry, versions=3)
     actors = [f"actor-{i}" for i in range(PROCESSES)]
     won = list(processes.map(_promote, [storage] * PROCESSES, actors, [15] * PROCESSES))
-    history = registry.history(LEAGUE)[::-1]
+    history = registry.aliases.history(LEAGUE)[::-1]
     assert len(history) == sum(won)
     assert [sum(event.actor == actor for event in history) for actor in actors] == won
     assert [event.previous for event in history] == [None, *(event.version for event in history[:-1])]
-    assert registry.aliases(LEAGUE) == {"champion": history[-1].version}
+    assert registry.aliases.current(LEAGUE) == {"champion": history[-1].version}

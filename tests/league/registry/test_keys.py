@@ -1,4 +1,4 @@
-"""API keys: made, shown once, kept as a digest, and void when they are revoked or have expired."""
+"""API keys: the token is shown once and stored as a digest; revoked and expired keys are invalid."""
 
 import re
 from datetime import UTC, datetime, timedelta
@@ -9,62 +9,62 @@ from sqlalchemy import text
 from league.errors import InvalidInput, InvalidReference, NameTaken, UnknownKey, UnknownLeague
 from league.registry.keys import SCOPES, TOKEN_LENGTH, digest
 from league.registry.registry import Registry
-from tests.league.registry.examples import LEAGUE
+from tests.support.registries import LEAGUE
 
 
-def test_a_key_is_shown_once_and_kept_as_a_digest(registry: Registry) -> None:
-    made, token = registry.create_key("bot", ["read", "act"], only_leagues=[LEAGUE], rate=10)
-    assert re.fullmatch(rf"plk_{made.id}_[0-9a-f]{{64}}", token)
+def test_a_token_is_returned_once_and_stored_as_a_digest(registry: Registry) -> None:
+    key, token = registry.keys.create("bot", ["read", "act"], only_leagues=[LEAGUE], rate=10)
+    assert re.fullmatch(rf"plk_{key.id}_[0-9a-f]{{64}}", token)
     assert len(token) == TOKEN_LENGTH
-    assert (made.name, made.scopes, made.leagues, made.rate) == ("bot", {"act", "read"}, {LEAGUE}, 10)
-    assert made.sha256 == digest(token.encode())
-    assert registry.api_keys() == [made]
+    assert (key.name, key.scopes, key.leagues, key.rate) == ("bot", {"act", "read"}, {LEAGUE}, 10)
+    assert key.sha256 == digest(token.encode())
+    assert registry.keys.all() == [key]
     with registry.database.engine.connect() as connection:
         assert token[-64:] not in str(connection.execute(text("SELECT * FROM api_keys")).all())
 
 
-def test_every_key_is_another(registry: Registry) -> None:
-    tokens = {registry.create_key(f"bot-{i}", SCOPES)[1] for i in range(20)}
+def test_tokens_are_unique(registry: Registry) -> None:
+    tokens = {registry.keys.create(f"bot-{i}", SCOPES)[1] for i in range(20)}
     assert len(tokens) == 20
-    assert [key.name for key in registry.api_keys()] == [f"bot-{i}" for i in range(20)]
+    assert [key.name for key in registry.keys.all()] == [f"bot-{i}" for i in range(20)]
 
 
-def test_a_revoked_key_is_void_and_its_name_is_not_used_again(registry: Registry) -> None:
-    made, _ = registry.create_key("bot", ["act"])
-    assert made.is_valid(datetime.now(UTC))
-    revoked = registry.revoke_key("bot")
+def test_a_revoked_key_is_invalid_and_its_name_is_not_reused(registry: Registry) -> None:
+    key, _ = registry.keys.create("bot", ["act"])
+    assert key.is_valid(datetime.now(UTC))
+    revoked = registry.keys.revoke("bot")
     assert not revoked.is_valid(datetime.now(UTC))
-    assert registry.revoke_key(made.id) == revoked, "twice is once"
-    assert registry.api_keys() == [revoked]
+    assert registry.keys.revoke(key.id) == revoked, "revoking twice has no effect"
+    assert registry.keys.all() == [revoked]
     with pytest.raises(NameTaken, match="'bot'"):
-        registry.create_key("bot", ["act"])
+        registry.keys.create("bot", ["act"])
 
 
-def test_a_name_that_is_anothers_id_is_still_that_name(registry: Registry) -> None:
-    first, _ = registry.create_key("bot", ["act"])
-    registry.create_key(first.id, ["act"])
-    assert registry.revoke_key(first.id).name == first.id
+def test_a_name_has_precedence_over_an_id(registry: Registry) -> None:
+    first, _ = registry.keys.create("bot", ["act"])
+    registry.keys.create(first.id, ["act"])
+    assert registry.keys.revoke(first.id).name == first.id
 
 
 def test_a_key_expires(registry: Registry) -> None:
     expires = datetime.now(UTC) + timedelta(days=1)
-    made, _ = registry.create_key("bot", ["act"], expires_at=expires)
-    assert made.is_valid(expires - timedelta(seconds=1))
-    assert not made.is_valid(expires)
+    key, _ = registry.keys.create("bot", ["act"], expires_at=expires)
+    assert key.is_valid(expires - timedelta(seconds=1))
+    assert not key.is_valid(expires)
 
 
-def test_what_cannot_be_a_key_is_refused(registry: Registry) -> None:
+def test_invalid_keys_are_rejected(registry: Registry) -> None:
     with pytest.raises(InvalidReference, match="'A B'"):
-        registry.create_key("A B", ["act"])
+        registry.keys.create("A B", ["act"])
     with pytest.raises(InvalidInput, match="'root' is unknown: expected some of act, read, evaluate, promote"):
-        registry.create_key("bot", ["act", "root"])
+        registry.keys.create("bot", ["act", "root"])
     with pytest.raises(InvalidInput, match="needs a scope"):
-        registry.create_key("bot", [])
+        registry.keys.create("bot", [])
     with pytest.raises(UnknownLeague, match="chess"):
-        registry.create_key("bot", ["act"], only_leagues=["chess"])
+        registry.keys.create("bot", ["act"], only_leagues=["chess"])
     for rate in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(InvalidInput, match="positive"):
-            registry.create_key("bot", ["act"], rate=rate)
-    assert registry.api_keys() == []
+            registry.keys.create("bot", ["act"], rate=rate)
+    assert registry.keys.all() == []
     with pytest.raises(UnknownKey, match="'bot'; known: none yet"):
-        registry.revoke_key("bot")
+        registry.keys.revoke("bot")

@@ -2,11 +2,11 @@ import pytest
 
 from league.errors import InterfaceChanged, UnknownLeague
 from league.registry.registry import Registry
-from tests.league.registry.examples import LEAGUE, config, interface, publish, registered
+from tests.support.registries import LEAGUE, config, interface, publish, registered
 
 
-def test_a_league_comes_back_as_it_was_registered(registry: Registry) -> None:
-    row = registry.league(LEAGUE)
+def test_a_league_is_stored_as_registered(registry: Registry) -> None:
+    row = registry.leagues.get(LEAGUE)
     assert row.config == config()
     assert row.interface == interface()
     assert row.interface_digest == interface().digest()
@@ -15,33 +15,33 @@ def test_a_league_comes_back_as_it_was_registered(registry: Registry) -> None:
 
 def test_leagues_are_listed_by_name(registry: Registry) -> None:
     registered(registry, "another")
-    assert [row.slug for row in registry.leagues()] == ["another", LEAGUE]
+    assert [row.slug for row in registry.leagues.all()] == ["another", LEAGUE]
 
 
-def test_registering_again_renews_the_configuration_and_keeps_the_versions(registry: Registry) -> None:
-    before = registry.league(LEAGUE)
+def test_registering_again_updates_the_configuration_and_keeps_the_versions(registry: Registry) -> None:
+    before = registry.leagues.get(LEAGUE)
     version = publish(registry, "run/1")
-    registry.register(config(kwargs={"screen_height": 500}), interface())
-    after = registry.league(LEAGUE)
+    registry.leagues.register(config(kwargs={"screen_height": 500}), interface())
+    after = registry.leagues.get(LEAGUE)
     assert after.config.environment.kwargs == {"screen_height": 500}
     assert after.environment_digest != before.environment_digest
     assert after.registered_at == before.registered_at
-    assert registry.versions(LEAGUE) == [version]
+    assert registry.versions.all(LEAGUE) == [version]
     assert publish(registry, "run/2").number == 2
 
 
-def test_an_interface_may_change_only_while_there_are_no_versions(registry: Registry) -> None:
-    registry.register(config(), interface(squares=4))
-    registry.register(config(), interface())
+def test_an_interface_can_change_only_without_versions(registry: Registry) -> None:
+    registry.leagues.register(config(), interface(squares=4))
+    registry.leagues.register(config(), interface())
     publish(registry, "run/1")
     with pytest.raises(InterfaceChanged, match=LEAGUE):
-        registry.register(config(), interface(squares=4))
-    assert registry.league(LEAGUE).interface == interface()
+        registry.leagues.register(config(), interface(squares=4))
+    assert registry.leagues.get(LEAGUE).interface == interface()
 
 
-def test_an_unknown_league_is_named_with_the_known_ones(empty: Registry) -> None:
+def test_an_unknown_league_is_reported_with_the_known_ones(empty: Registry) -> None:
     with pytest.raises(UnknownLeague, match="no league 'chess'; known: none yet"):
-        empty.league("chess")
+        empty.leagues.get("chess")
     registered(empty)
     with pytest.raises(UnknownLeague, match=f"no league 'chess'; known: {LEAGUE}"):
-        empty.versions("chess")
+        empty.versions.all("chess")

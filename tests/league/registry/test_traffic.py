@@ -1,4 +1,4 @@
-"""Settings of canary and shadow, what shadows have shown, and waiting for replicas to follow."""
+"""Settings of canary and shadow, shadow statistics, and waiting for replicas."""
 
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -9,12 +9,11 @@ from sqlalchemy import update
 from league.errors import Conflict, InvalidInput, KeyReused, NotReady, UnknownAlias, UnknownLeague, UnknownVersion
 from league.histograms import BOUNDS
 from league.registry.aliases import ANY
-from league.registry.following import await_traffic
-from league.registry.idempotency import Call
 from league.registry.registry import Registry
-from league.registry.rows import Portion, Shadowing, Traffic
-from league.registry.tables import Report
-from tests.league.registry.examples import LEAGUE, registered
+from league.registry.storage.idempotency import IdempotentCall
+from league.registry.storage.rows import Portion, ShadowCounts, Traffic
+from league.registry.storage.tables import ReplicaReportTable
+from tests.support.registries import LEAGUE, registered
 
 EMPTY = (0,) * (len(BOUNDS) + 1)
 
@@ -24,37 +23,42 @@ def versioned(registry: Registry) -> Registry:
     return registered(registry, LEAGUE, versions=3)
 
 
-def put(registry: Registry, **portions: Portion | None) -> Traffic:
-    return registry.set_traffic(LEAGUE, actor="ada", reason="test", **portions)
+def set_traffic(registry: Registry, **portions: Portion | None) -> Traffic:
+    return registry.traffic.set(LEAGUE, actor="ada", reason="test", **portions)
 
 
-def test_what_is_not_named_stays(versioned: Registry) -> None:
-    assert versioned.traffic(LEAGUE) == Traffic(LEAGUE)
-    put(versioned, canary=Portion(2, 0.05))
-    put(versioned, shadow=Portion(3, 1.0))
-    now = versioned.traffic(LEAGUE)
-    assert (now.canary, now.shadow, now.actor, now.reason) == (Portion(2, 0.05), Portion(3, 1.0), "ada", "test")
-    put(versioned, canary=None)
-    assert versioned.all_traffic() == {LEAGUE: versioned.traffic(LEAGUE)}
-    assert [(one.canary, one.shadow) for one in versioned.traffic_history(LEAGUE)] == [
+def test_settings_that_are_not_named_remain(versioned: Registry) -> None:
+    assert versioned.traffic.current(LEAGUE) == Traffic(LEAGUE)
+    set_traffic(versioned, canary=Portion(2, 0.05))
+    set_traffic(versioned, shadow=Portion(3, 1.0))
+    current = versioned.traffic.current(LEAGUE)
+    assert (current.canary, current.shadow, current.actor, current.reason) == (
+        Portion(2, 0.05),
+        Portion(3, 1.0),
+        "ada",
+        "test",
+    )
+    set_traffic(versioned, canary=None)
+    assert versioned.traffic.all() == {LEAGUE: versioned.traffic.current(LEAGUE)}
+    assert [(one.canary, one.shadow) for one in versioned.traffic.history(LEAGUE)] == [
         (None, Portion(3, 1.0)),
         (Portion(2, 0.05), Portion(3, 1.0)),
         (Portion(2, 0.05), None),
     ]
 
 
-def test_the_same_again_is_no_event(versioned: Registry) -> None:
-    first = put(versioned, canary=Portion(2, 0.05))
-    assert put(versioned, canary=Portion(2, 0.05)) == first
-    assert len(versioned.traffic_history(LEAGUE)) == 1
+def test_an_unchanged_setting_creates_no_event(versioned: Registry) -> None:
+    first = set_traffic(versioned, canary=Portion(2, 0.05))
+    assert set_traffic(versioned, canary=Portion(2, 0.05)) == first
+    assert len(versioned.traffic.history(LEAGUE)) == 1
 
 
-def test_an_alias_stays_one(versioned: Registry) -> None:
-    versioned.set_alias(LEAGUE, "candidate", 2, expected=ANY, actor="test", reason="test")
-    assert put(versioned, shadow=Portion("candidate", 1.0)).shadow == Portion("candidate", 1.0)
+def test_an_alias_is_stored_as_an_alias(versioned: Registry) -> None:
+    versioned.aliases.set(LEAGUE, "candidate", 2, expected=ANY, actor="test", reason="test")
+    assert set_traffic(versioned, shadow=Portion("candidate", 1.0)).shadow == Portion("candidate", 1.0)
 
 
-def test_only_versions_that_there_are_get_traffic(versioned: Registry) -> None:
+def test_only_existing_versions_get_traffic(versioned: Registry) -> None:
     for portion, error in (
         (Portion(9, 0.1), UnknownVersion),
         (Portion("candidate", 0.1), UnknownAlias),
@@ -63,67 +67,73 @@ def test_only_versions_that_there_are_get_traffic(versioned: Registry) -> None:
         (Portion(2, float("nan")), InvalidInput),
     ):
         with pytest.raises(error):
-            put(versioned, canary=portion)
+            set_traffic(versioned, canary=portion)
     with pytest.raises(UnknownLeague):
-        versioned.set_traffic("nobody", canary=None, actor="ada", reason="test")
-    assert versioned.traffic_history(LEAGUE) == []
+        versioned.traffic.set("nobody", canary=None, actor="ada", reason="test")
+    assert versioned.traffic.history(LEAGUE) == []
 
 
-def test_a_call_that_comes_again_gets_the_same_setting(versioned: Registry) -> None:
-    key, _ = versioned.create_key("bot", ["promote"])
-    call = Call(owner=key.id, key="first", digest="0" * 64)
+def test_a_repeated_call_gets_the_same_setting(versioned: Registry) -> None:
+    key, _ = versioned.keys.create("bot", ["promote"])
+    call = IdempotentCall(owner=key.id, key="first", digest="0" * 64)
 
-    def set_it(share: float, call: Call) -> Traffic:
-        return versioned.set_traffic(LEAGUE, canary=Portion(2, share), actor="bot", reason="test", call=call)
+    def set_canary(share: float, call: IdempotentCall) -> Traffic:
+        return versioned.traffic.set(LEAGUE, canary=Portion(2, share), actor="bot", reason="test", call=call)
 
-    first = set_it(0.1, call)
-    put(versioned, canary=None)
-    assert set_it(0.1, call) == first
-    assert versioned.traffic(LEAGUE).canary is None
+    first = set_canary(0.1, call)
+    set_traffic(versioned, canary=None)
+    assert set_canary(0.1, call) == first
+    assert versioned.traffic.current(LEAGUE).canary is None
     with pytest.raises(KeyReused):
-        set_it(0.2, replace(call, digest="1" * 64))
+        set_canary(0.2, replace(call, digest="1" * 64))
 
 
-def shadowing(candidate: int = 2, requests: int = 10, **counts: int) -> Shadowing:
-    whole = {"observations": 2 * requests, "agreed": requests, "failed": 0, "dropped": 0, "skipped": 0} | counts
+def shadow_counts(candidate: int = 2, requests: int = 10, **counts: int) -> ShadowCounts:
+    fields = {"observations": 2 * requests, "agreed": requests, "failed": 0, "dropped": 0, "skipped": 0} | counts
     latency = (requests, *EMPTY[1:])
-    return Shadowing(LEAGUE, candidate, 1, requests, **whole, latency=latency, ns=requests * 1000)
+    return ShadowCounts(LEAGUE, candidate, 1, requests, **fields, latency=latency, ns=requests * 1000)
 
 
-def test_what_replicas_have_seen_is_added_up_and_outlives_them(versioned: Registry) -> None:
-    versioned.report("replica-1", {}, [shadowing(requests=5)])
-    versioned.report("replica-1", {}, [shadowing(requests=10, dropped=3), shadowing(candidate=3)])
-    versioned.report("replica-2", {}, [shadowing(requests=20, failed=1)])
-    versioned.forget("replica-2")
-    first, second = versioned.shadowings(LEAGUE)
-    assert first == replace(shadowing(requests=30), dropped=3, failed=1)
+def test_shadow_counts_are_summed_and_outlive_their_replicas(versioned: Registry) -> None:
+    versioned.replicas.write_report("replica-1", {}, [shadow_counts(requests=5)])
+    versioned.replicas.write_report(
+        "replica-1", {}, [shadow_counts(requests=10, dropped=3), shadow_counts(candidate=3)]
+    )
+    versioned.replicas.write_report("replica-2", {}, [shadow_counts(requests=20, failed=1)])
+    versioned.replicas.remove("replica-2")
+    first, second = versioned.traffic.shadow_counts(LEAGUE)
+    assert first == replace(shadow_counts(requests=30), dropped=3, failed=1)
     assert (first.agreement, first.milliseconds(0.95)) == (0.5, BOUNDS[0] / 1000)
-    assert second == shadowing(candidate=3)
+    assert second == shadow_counts(candidate=3)
     assert replace(first, observations=0).agreement is None
 
 
-def test_reports_are_the_newest_of_replicas_that_live(versioned: Registry) -> None:
-    versioned.report("replica-1", {"a": 1})
-    versioned.report("replica-1", {"a": 2})
-    versioned.report("replica-2", {"b": 1})
-    versioned.report("replica-3", {"c": 1})
-    versioned.forget("replica-2")
+def test_reports_are_the_latest_of_live_replicas(versioned: Registry) -> None:
+    versioned.replicas.write_report("replica-1", {"a": 1})
+    versioned.replicas.write_report("replica-1", {"a": 2})
+    versioned.replicas.write_report("replica-2", {"b": 1})
+    versioned.replicas.write_report("replica-3", {"c": 1})
+    versioned.replicas.remove("replica-2")
     with versioned.database.write() as session:
         session.execute(
-            update(Report).filter_by(replica="replica-3").values(at=datetime.now(UTC) - timedelta(minutes=1))
+            update(ReplicaReportTable)
+            .filter_by(replica="replica-3")
+            .values(at=datetime.now(UTC) - timedelta(minutes=1))
         )
-    assert versioned.reports() == {"replica-1": {"a": 2}}
+    assert versioned.replicas.reports() == {"replica-1": {"a": 2}}
 
 
 def test_waiting_for_replicas_to_follow(versioned: Registry) -> None:
-    setting = put(versioned, canary=Portion(2, 0.05))
+    setting = set_traffic(versioned, canary=Portion(2, 0.05))
     with pytest.raises(NotReady, match="is a server running"):
-        await_traffic(versioned, setting, 0)
-    versioned.acknowledge("replica-1", LEAGUE, 1, "0" * 64, "2: shared.onnx was changed", {"champion": 1}, None)
+        versioned.changes.wait_for_traffic(setting, 0)
+    versioned.replicas.acknowledge(
+        "replica-1", LEAGUE, 1, "0" * 64, "2: shared.onnx was changed", {"champion": 1}, None
+    )
     with pytest.raises(NotReady, match=r"replica-1 2: shared\.onnx was changed"):
-        await_traffic(versioned, setting, 0)
-    versioned.acknowledge("replica-1", LEAGUE, 1, "0" * 64, None, {"champion": 1, "2": 2}, setting.id)
-    assert await_traffic(versioned, setting, 0) == ["replica-1"]
-    put(versioned, canary=None)
-    with pytest.raises(Conflict, match="set otherwise"):
-        await_traffic(versioned, setting, 0)
+        versioned.changes.wait_for_traffic(setting, 0)
+    versioned.replicas.acknowledge("replica-1", LEAGUE, 1, "0" * 64, None, {"champion": 1, "2": 2}, setting.id)
+    assert versioned.changes.wait_for_traffic(setting, 0) == ["replica-1"]
+    set_traffic(versioned, canary=None)
+    with pytest.raises(Conflict, match="was changed in the meantime"):
+        versioned.changes.wait_for_traffic(setting, 0)

@@ -1,4 +1,4 @@
-"""The ledger takes what its schedules ask for, each match once, and gives it back exactly."""
+"""The ledger accepts the matches of its schedules, each once, and returns them exactly."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -10,53 +10,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.errors import InvalidInput, LedgerRefusal, NotFound, UnknownLeague
+from league.errors import InvalidInput, LedgerConflict, NotFound, UnknownLeague
 from league.registry.registry import Registry
 from league.results import ledger as ledger_module
-from league.results.documents import dump_games, dump_schedule, load_games, load_schedule
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Entry, Forfeit, Game, Match, Schedule
-from league.settings import Storage
-from tests.league.registry.examples import LEAGUE, config, registered
-
-SCHEDULE = Schedule(
-    id="tictactoe-round_robin-1",
-    league=LEAGUE,
-    kind="round_robin",
-    seed=2**63 - 1,
-    environment_digest=config().environment.digest(),
-    sides=("player_1", "player_2"),
-    contestants=("tictactoe@1", "tictactoe@2", "script:random"),
-    pairings=((0, 1), (0, 2), (1, 2)),
-    length=9,
-    opening_plies=2,
+from league.results.records import (
+    BlockResult,
+    Forfeit,
+    Game,
+    LedgerEntry,
+    Match,
+    Schedule,
+    dump_games,
+    dump_schedule,
+    load_games,
+    load_schedule,
 )
-
-
-def game(schedule: Schedule, position: int, index: int) -> Game:
-    """A game that contestant 0 wins as first and draws as second, its moves different in each game."""
-    won = index == 0
-    return Game(
-        sides=(index, 1 - index),
-        seed=schedule.seed_at(position),
-        opening=(position, 1),
-        actions=(3, index, position),
-        returns=(1.0, -1.0) if won else (0.25, 0.25),
-        scores=(1.0, 0.0) if won else (0.5, 0.5),
-    )
-
-
-def played(schedule: Schedule, position: int) -> Match:
-    return Match(
-        id=schedule.match_id(position),
-        league=schedule.league,
-        schedule=schedule.id,
-        position=position,
-        contestants=schedule.contestants_at(position),
-        seed=schedule.seed_at(position),
-        environment_digest=schedule.environment_digest,
-        games=(game(schedule, position, 0), game(schedule, position, 1)),
-    )
+from league.settings import Storage
+from tests.support.ledger_matches import SCHEDULE, game, play_match
+from tests.support.registries import LEAGUE, registered
 
 
 @pytest.fixture
@@ -74,16 +46,16 @@ def test_a_schedule_is_stored_once(ledger: Ledger) -> None:
     assert ledger.schedules(LEAGUE) == [SCHEDULE, second]
 
 
-def test_a_schedule_of_an_unknown_league_is_refused(ledger: Ledger) -> None:
+def test_a_schedule_of_an_unknown_league_is_rejected(ledger: Ledger) -> None:
     with pytest.raises(UnknownLeague):
         ledger.open(replace(SCHEDULE, league="chess"))
 
 
-def test_matches_come_back_exactly_in_schedule_order(ledger: Ledger) -> None:
+def test_matches_are_returned_exactly_in_schedule_order(ledger: Ledger) -> None:
     ledger.open(SCHEDULE)
     for position in (4, 0, 2):
-        assert ledger.append(played(SCHEDULE, position)) is True
-    expected = [played(SCHEDULE, position) for position in (0, 2, 4)]
+        assert ledger.append(play_match(SCHEDULE, position)) is True
+    expected = [play_match(SCHEDULE, position) for position in (0, 2, 4)]
     assert ledger.matches(league=LEAGUE) == expected
     assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id) == expected
     assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id, after=0) == expected[1:]
@@ -92,9 +64,9 @@ def test_matches_come_back_exactly_in_schedule_order(ledger: Ledger) -> None:
     assert ledger.positions("another") == set()
 
 
-def test_twice_is_once(ledger: Ledger) -> None:
+def test_a_match_is_stored_once(ledger: Ledger) -> None:
     ledger.open(SCHEDULE)
-    match = played(SCHEDULE, 3)
+    match = play_match(SCHEDULE, 3)
     assert ledger.append(match) is True
     other_moves = replace(match, games=tuple(replace(game, actions=(8,)) for game in match.games))
     assert ledger.append(match) is False
@@ -102,22 +74,22 @@ def test_twice_is_once(ledger: Ledger) -> None:
     assert ledger.matches(league=LEAGUE) == [match]
 
 
-def test_many_are_stored_together_or_not_at_all(ledger: Ledger) -> None:
+def test_several_matches_are_stored_together_or_not_at_all(ledger: Ledger) -> None:
     ledger.open(SCHEDULE)
-    ledger.append(played(SCHEDULE, 1))
+    ledger.append(play_match(SCHEDULE, 1))
     assert ledger.extend([]) == 0
-    assert ledger.extend([played(SCHEDULE, position) for position in range(3)]) == 2
-    broken = replace(played(SCHEDULE, 4), seed=1)
-    with pytest.raises(LedgerRefusal):
-        ledger.extend([played(SCHEDULE, 3), broken])
+    assert ledger.extend([play_match(SCHEDULE, position) for position in range(3)]) == 2
+    broken = replace(play_match(SCHEDULE, 4), seed=1)
+    with pytest.raises(LedgerConflict):
+        ledger.extend([play_match(SCHEDULE, 3), broken])
     assert ledger.positions(SCHEDULE.id) == {0, 1, 2}
 
 
-def test_results_are_the_sums_of_the_blocks(ledger: Ledger) -> None:
+def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
     other = replace(SCHEDULE, id="of another environment", environment_digest="0" * 64)
     for schedule in (other, SCHEDULE):
         ledger.open(schedule)
-        ledger.extend([played(schedule, position) for position in (2, 1)])
+        ledger.extend([play_match(schedule, position) for position in (2, 1)])
     mine = [
         BlockResult(SCHEDULE.id, 1, ("tictactoe@1", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
         BlockResult(SCHEDULE.id, 2, ("tictactoe@2", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
@@ -129,9 +101,9 @@ def test_results_are_the_sums_of_the_blocks(ledger: Ledger) -> None:
         ledger.results("chess")
 
 
-def test_a_block_with_a_forfeit_has_scores_and_no_returns(ledger: Ledger) -> None:
+def test_a_block_with_a_forfeit_has_scores_but_no_returns(ledger: Ledger) -> None:
     ledger.open(SCHEDULE)
-    first, second = played(SCHEDULE, 0).games
+    first, second = play_match(SCHEDULE, 0).games
     lost = replace(first, scores=(0.0, 1.0), forfeits=(Forfeit(0, "player_1", "illegal_action"),))
     match = SCHEDULE.match(0, (lost, second))
     ledger.append(match)
@@ -142,50 +114,50 @@ def test_a_block_with_a_forfeit_has_scores_and_no_returns(ledger: Ledger) -> Non
 
 
 def entry(schedule: Schedule, position: int) -> tuple[str, BlockResult, str]:
-    return schedule.match_id(position), played(schedule, position).result(), schedule.kind
+    return schedule.match_id(position), play_match(schedule, position).result(), schedule.kind
 
 
-def listed(entries: list[Entry]) -> list[tuple[str, BlockResult, str]]:
+def summarized(entries: list[LedgerEntry]) -> list[tuple[str, BlockResult, str]]:
     return [(entry.id, entry.result, entry.kind) for entry in entries]
 
 
-def test_matches_are_listed_as_they_were_played_newest_first(ledger: Ledger) -> None:
+def test_matches_are_listed_newest_first(ledger: Ledger) -> None:
     other = replace(SCHEDULE, id="a-gauntlet", kind="gauntlet")
     for schedule in (SCHEDULE, other):
         ledger.open(schedule)
     order = [(other, 4), (SCHEDULE, 0), (other, 1), (SCHEDULE, 7), (SCHEDULE, 2)]
     for schedule, position in order:
-        ledger.append(played(schedule, position))
+        ledger.append(play_match(schedule, position))
     expected = [entry(*each) for each in reversed(order)]
     page = ledger.page(LEAGUE, limit=2)
-    assert listed(page) == expected[:2]
+    assert summarized(page) == expected[:2]
     assert page[0].played_at > page[1].played_at
     assert not page[0].is_purged
-    assert listed(ledger.page(LEAGUE, before=page[-1].id)) == expected[2:]
+    assert summarized(ledger.page(LEAGUE, before=page[-1].id)) == expected[2:]
     assert ledger.page(LEAGUE, before=expected[-1][0]) == []
     ledger.purge([other.id])
     assert [entry.is_purged for entry in ledger.page(LEAGUE)] == [False, False, True, False, True]
 
 
-def test_matches_of_two_are_listed_whichever_is_named_first(ledger: Ledger) -> None:
-    turned = replace(SCHEDULE, id="turned", contestants=SCHEDULE.contestants[::-1])
-    for schedule in (SCHEDULE, turned):
+def test_matches_of_a_pair_are_listed_in_either_order(ledger: Ledger) -> None:
+    reverse = replace(SCHEDULE, id="turned", contestants=SCHEDULE.contestants[::-1])
+    for schedule in (SCHEDULE, reverse):
         ledger.open(schedule)
-        ledger.extend([played(schedule, position) for position in range(9)])
-    # Of the pairings (0, 1), (0, 2), (1, 2) versions 1 and 2 are the first, and turned round the last.
-    expected = [entry(turned, position) for position in (8, 5, 2)] + [entry(SCHEDULE, at) for at in (6, 3, 0)]
+        ledger.extend([play_match(schedule, position) for position in range(9)])
+    # Of the pairings (0, 1), (0, 2), (1, 2), versions 1 and 2 are the first one, and the last one in reverse order.
+    expected = [entry(reverse, position) for position in (8, 5, 2)] + [entry(SCHEDULE, at) for at in (6, 3, 0)]
     assert {each[1].contestants for each in expected} == {
         ("tictactoe@1", "tictactoe@2"),
         ("tictactoe@2", "tictactoe@1"),
     }
     for first, second in (("tictactoe@1", "tictactoe@2"), ("tictactoe@2", "tictactoe@1")):
-        assert listed(ledger.page(LEAGUE, contestants=(first, second))) == expected
+        assert summarized(ledger.page(LEAGUE, contestants=(first, second))) == expected
         page = ledger.page(LEAGUE, contestants=(first, second), before="turned/5", limit=2)
-        assert listed(page) == expected[2:4]
+        assert summarized(page) == expected[2:4]
     assert ledger.page(LEAGUE, contestants=("tictactoe@1", "tictactoe@1")) == []
 
 
-def test_one_who_played_in_a_team_with_itself_is_listed_once(ledger: Ledger) -> None:
+def test_a_contestant_that_plays_with_itself_is_listed_once(ledger: Ledger) -> None:
     schedule = replace(SCHEDULE, id="team", kind="cross_play", scoring="team", pairings=((0, 0), (0, 1), (1, 1)))
     ledger.open(schedule)
     for position in range(3):
@@ -195,19 +167,19 @@ def test_one_who_played_in_a_team_with_itself_is_listed_once(ledger: Ledger) -> 
     assert (found.id, found.result.contestants) == ("team/2", ("tictactoe@2", "tictactoe@2"))
 
 
-def test_a_schedule_is_walked_through_a_few_matches_at_a_time(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_schedule_is_read_in_strides(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ledger_module, "STRIDE", 3)
     for schedule in (SCHEDULE, replace(SCHEDULE, id="another")):
         ledger.open(schedule)
-    for played_already in ([], [0, 1, 3], [0, 1, 3, 4, 5, 6, 8]):
-        ledger.extend([played(SCHEDULE, position) for position in played_already])
-        assert list(ledger.walk(SCHEDULE)) == [played(SCHEDULE, position) for position in played_already]
+    for positions in ([], [0, 1, 3], [0, 1, 3, 4, 5, 6, 8]):
+        ledger.extend([play_match(SCHEDULE, position) for position in positions])
+        assert list(ledger.walk(SCHEDULE)) == [play_match(SCHEDULE, position) for position in positions]
     assert ledger.counts(LEAGUE) == {SCHEDULE.id: 7}
 
 
-def test_one_match_is_found_without_its_moves(ledger: Ledger) -> None:
+def test_a_match_is_found_without_its_moves(ledger: Ledger) -> None:
     ledger.open(SCHEDULE)
-    ledger.append(played(SCHEDULE, 1))
+    ledger.append(play_match(SCHEDULE, 1))
     assert ledger.page(LEAGUE) == [ledger.entry(SCHEDULE.match_id(1))]
     for name in (SCHEDULE.match_id(2), "nothing/1", "nothing", f"{SCHEDULE.id}/{10**30}", f"{SCHEDULE.id}/-1"):
         with pytest.raises(NotFound):
@@ -220,8 +192,8 @@ def test_one_match_is_found_without_its_moves(ledger: Ledger) -> None:
         ledger.page("chess")
 
 
-def alone(schedule: Schedule, position: int, *returns: float) -> Match:
-    """A block in which each contestant plays a game by itself."""
+def solo_match(schedule: Schedule, position: int, *returns: float) -> Match:
+    """A block in which each contestant plays a game alone."""
     first, second = returns
     score = 1.0 if first > second else 0.0
     games = (
@@ -231,33 +203,33 @@ def alone(schedule: Schedule, position: int, *returns: float) -> Match:
     return schedule.match(position, games)
 
 
-def test_where_each_plays_alone_a_block_is_one_comparison(ledger: Ledger) -> None:
+def test_a_block_of_solo_games_is_one_comparison(ledger: Ledger) -> None:
     schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
     ledger.open(schedule)
-    ledger.extend([alone(schedule, 0, 3.5, 2.0), alone(schedule, 1, 3.5, 4.0)])
+    ledger.extend([solo_match(schedule, 0, 3.5, 2.0), solo_match(schedule, 1, 3.5, 4.0)])
     won, lost = ledger.matches(league=LEAGUE)
-    assert (won, lost) == (alone(schedule, 0, 3.5, 2.0), alone(schedule, 1, 3.5, 4.0))
+    assert (won, lost) == (solo_match(schedule, 0, 3.5, 2.0), solo_match(schedule, 1, 3.5, 4.0))
     assert (won.score(0), won.score(1), lost.score(0)) == (1.0, 0.0, 0.0)
     assert (won.mean_return(0), won.mean_return(1)) == (3.5, 2.0)
     assert ledger.results(LEAGUE) == [won.result(), lost.result()]
     assert won.result() == BlockResult(schedule.id, 0, won.contestants, 1, (1.0, 0.0), (3.5, 2.0))
 
 
-def test_who_did_not_play_has_no_return(ledger: Ledger) -> None:
+def test_a_contestant_that_did_not_play_has_no_return(ledger: Ledger) -> None:
     schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
     ledger.open(schedule)
-    match = alone(schedule, 0, 3.5, 2.0)
+    match = solo_match(schedule, 0, 3.5, 2.0)
     both = replace(match.games[0], returns=(3.5, 2.0), scores=(1.0, 0.0))
-    with pytest.raises(LedgerRefusal, match="finite return of each contestant that played"):
+    with pytest.raises(LedgerConflict, match="finite return of each contestant that played"):
         ledger.append(replace(match, games=(both, match.games[1])))
 
 
-def _of_game(change: Callable[[Game], Game]) -> Callable[[Match], Match]:
+def _change_second_game(change: Callable[[Game], Game]) -> Callable[[Match], Match]:
     return lambda match: replace(match, games=(match.games[0], change(match.games[1])))
 
 
 CRASH = Forfeit(0, "player_2", "crashed")
-REFUSED: dict[str, tuple[Callable[[Match], Match], str]] = {
+REJECTED: dict[str, tuple[Callable[[Match], Match], str]] = {
     "beyond the schedule": (lambda match: replace(match, position=9), "ends before position 9"),
     "before the schedule": (lambda match: replace(match, position=-1), "ends before position 9"),
     "another id": (lambda match: replace(match, id="x/1"), "its id is 'x/1'"),
@@ -279,57 +251,72 @@ REFUSED: dict[str, tuple[Callable[[Match], Match], str]] = {
     "odd games": (lambda match: replace(match, games=match.games[:1]), "has 1 games"),
     "too many games": (lambda match: replace(match, games=match.games * 2), "has 4 games"),
     "sides not rotated": (
-        _of_game(lambda game: replace(game, sides=(0, 1))),
+        _change_second_game(lambda game: replace(game, sides=(0, 1))),
         "game 1 has its sides played by .0, 1., expected .1, 0.",
     ),
-    "a game of another seed": (_of_game(lambda game: replace(game, seed=5)), "game 1 has the seed 5"),
-    "another opening": (_of_game(lambda game: replace(game, opening=(0, 1))), "game 1 has another opening"),
-    "a short opening": (_of_game(lambda game: replace(game, opening=(1,))), "game 1 has another opening"),
+    "a game of another seed": (_change_second_game(lambda game: replace(game, seed=5)), "game 1 has the seed 5"),
+    "another opening": (_change_second_game(lambda game: replace(game, opening=(0, 1))), "game 1 has another opening"),
+    "a short opening": (_change_second_game(lambda game: replace(game, opening=(1,))), "game 1 has another opening"),
     "short openings": (
         lambda match: replace(match, games=tuple(replace(game, opening=(1,)) for game in match.games)),
         "game 0 has another opening than the block's 2 steps",
     ),
     "an infinite return": (
-        _of_game(lambda game: replace(game, returns=(math.inf, 0.0))),
+        _change_second_game(lambda game: replace(game, returns=(math.inf, 0.0))),
         "game 1 needs a finite return",
     ),
-    "a return too few": (_of_game(lambda game: replace(game, returns=(1.0,))), "game 1 needs a finite"),
-    "a return of nobody": (_of_game(lambda game: replace(game, returns=(None, 0.25))), "game 1 needs a finite"),
-    "the other one wins": (_of_game(lambda game: replace(game, scores=(1.0, 0.0))), r"returns say \(0\.5, 0\.5\)"),
-    "both win": (_of_game(lambda game: replace(game, scores=(1.0, 1.0))), "game 1 has the scores .* its returns say"),
-    "a score out of range": (_of_game(lambda game: replace(game, scores=(2.0, -1.0))), "game 1 has the scores"),
-    "a forfeit that wins": (_of_game(lambda game: replace(game, forfeits=(CRASH,))), r"forfeits say \(0\.0, 1\.0\)"),
+    "a return too few": (_change_second_game(lambda game: replace(game, returns=(1.0,))), "game 1 needs a finite"),
+    "a return of nobody": (
+        _change_second_game(lambda game: replace(game, returns=(None, 0.25))),
+        "game 1 needs a finite",
+    ),
+    "the other one wins": (
+        _change_second_game(lambda game: replace(game, scores=(1.0, 0.0))),
+        r"returns say \(0\.5, 0\.5\)",
+    ),
+    "both win": (
+        _change_second_game(lambda game: replace(game, scores=(1.0, 1.0))),
+        "game 1 has the scores .* its returns say",
+    ),
+    "a score out of range": (
+        _change_second_game(lambda game: replace(game, scores=(2.0, -1.0))),
+        "game 1 has the scores",
+    ),
+    "a forfeit that wins": (
+        _change_second_game(lambda game: replace(game, forfeits=(CRASH,))),
+        r"forfeits say \(0\.0, 1\.0\)",
+    ),
     "two forfeits of one": (
-        _of_game(lambda game: replace(game, forfeits=(CRASH, CRASH), scores=(0.0, 1.0))),
-        "game 1 is forfeited twice",
+        _change_second_game(lambda game: replace(game, forfeits=(CRASH, CRASH), scores=(0.0, 1.0))),
+        "game 1 has two forfeits",
     ),
     "a forfeit of nobody": (
-        _of_game(lambda game: replace(game, forfeits=(replace(CRASH, contestant=2),))),
-        "forfeited by contestant 2, who did not play it",
+        _change_second_game(lambda game: replace(game, forfeits=(replace(CRASH, contestant=2),))),
+        "forfeited by contestant 2, which did not play it",
     ),
     "a forfeit for no reason": (
-        _of_game(lambda game: replace(game, forfeits=(replace(CRASH, reason="tired"),), scores=(0.0, 1.0))),
-        "reason that there is not: 'tired'",
+        _change_second_game(lambda game: replace(game, forfeits=(replace(CRASH, reason="tired"),), scores=(0.0, 1.0))),
+        "unknown reason: 'tired'",
     ),
-    "no number": (_of_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 has the scores"),
+    "no number": (_change_second_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 has the scores"),
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_match_that_breaks_its_schedule_is_refused(name: str, tmp_path: Path) -> None:
-    change, message = REFUSED[name]
+@pytest.mark.parametrize("name", REJECTED)
+def test_a_match_that_contradicts_its_schedule_is_rejected(name: str, tmp_path: Path) -> None:
+    change, message = REJECTED[name]
     registry = registered(Registry.open(Storage.at(tmp_path)))
     ledger = Ledger(registry)
     ledger.open(SCHEDULE)
-    with pytest.raises(LedgerRefusal, match=message):
-        ledger.append(change(played(SCHEDULE, 1)))
+    with pytest.raises(LedgerConflict, match=message):
+        ledger.append(change(play_match(SCHEDULE, 1)))
     assert ledger.matches(league=LEAGUE) == []
     registry.close()
 
 
-def test_a_match_of_no_schedule_is_refused(ledger: Ledger) -> None:
-    with pytest.raises(NotFound, match="no schedule 'tictactoe-round_robin-1' was opened"):
-        ledger.append(played(SCHEDULE, 0))
+def test_a_match_without_a_schedule_is_rejected(ledger: Ledger) -> None:
+    with pytest.raises(NotFound, match="there is no schedule 'tictactoe-round_robin-1'"):
+        ledger.append(play_match(SCHEDULE, 0))
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
@@ -360,11 +347,11 @@ def blocks(draw: Any) -> tuple[Game, ...]:
 
 
 @given(blocks())
-def test_games_are_kept_exactly(games: tuple[Game, ...]) -> None:
+def test_games_survive_serialization(games: tuple[Game, ...]) -> None:
     assert load_games(dump_games(games)) == games
 
 
 @given(st.integers(0, 2**63 - 1))
-def test_schedules_are_kept_exactly(seed: int) -> None:
+def test_schedules_survive_serialization(seed: int) -> None:
     schedule = replace(SCHEDULE, seed=seed)
     assert load_schedule(dump_schedule(schedule)) == schedule

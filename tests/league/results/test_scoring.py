@@ -15,13 +15,13 @@ scorings: st.SearchStrategy[Scoring] = st.sampled_from(["game", "side"])
     [
         ([(1.0, -1.0), (0.0, 0.0)], "game", [(1.0, 0.0), (0.5, 0.5)]),
         ([(3.0, 5.0), (5.0, 3.0)], "game", [(0.0, 1.0), (1.0, 0.0)]),
-        # Contestant 0 is the better adversary (-1 against -2), and as good as the other one at working against it.
+        # Contestant 0 is the better adversary (-1 against -2), and equally good against the adversary.
         ([(-1.0, 4.0), (4.0, -2.0)], "side", [(1.0, 0.5), (0.5, 0.0)]),
         ([(7.0, None), (None, 6.5)], "side", [(1.0, None), (None, 0.0)]),
         ([(7.0, None), (None, 7.0)], "side", [(0.5, None), (None, 0.5)]),
     ],
 )
-def test_scores_go_by_returns(returns: list[Values], scoring: Scoring, expected: list[Values]) -> None:
+def test_scores_follow_the_returns(returns: list[Values], scoring: Scoring, expected: list[Values]) -> None:
     assert scores(returns, scoring) == expected
 
 
@@ -36,39 +36,39 @@ def test_scores_go_by_returns(returns: list[Values], scoring: Scoring, expected:
         ([(9.0, None), (None, 6.5)], "side", [{0}, {1}], [(0.5, None), (None, 0.5)]),
     ],
 )
-def test_who_forfeits_loses_whatever_it_got(
+def test_a_forfeit_loses_whatever_the_return(
     returns: list[Values], scoring: Scoring, forfeits: list[set[int]], expected: list[Values]
 ) -> None:
     assert scores(returns, scoring, forfeits) == expected
 
 
-broken = st.tuples(*[st.sets(st.sampled_from([0, 1]))] * 2)
+forfeit_sets = st.tuples(*[st.sets(st.sampled_from([0, 1]))] * 2)
 
 
-@given(st.tuples(pairs, pairs), scorings, broken)
-def test_what_one_gains_the_other_loses(
+@given(st.tuples(pairs, pairs), scorings, forfeit_sets)
+def test_scores_are_zero_sum(
     returns: tuple[Values, Values], scoring: Scoring, forfeits: tuple[set[int], set[int]]
 ) -> None:
     points = scores(returns, scoring, forfeits)
     assert sum(points[0]) + sum(points[1]) == 2  # type: ignore[arg-type]
 
 
-@given(st.tuples(pairs, pairs), scorings, broken)
-def test_contestants_that_change_places_change_scores(
+@given(st.tuples(pairs, pairs), scorings, forfeit_sets)
+def test_exchanging_the_contestants_exchanges_the_scores(
     returns: tuple[Values, Values], scoring: Scoring, forfeits: tuple[set[int], set[int]]
 ) -> None:
-    """Exchanged, a block's games come in the other order, each with the contestants exchanged."""
+    """When contestants are exchanged, the games of a block come in reverse order."""
     exchanged = [tuple(reversed(game)) for game in reversed(returns)]
-    other = [{1 - contestant for contestant in by} for by in reversed(forfeits)]
+    exchanged_forfeits = [{1 - contestant for contestant in by} for by in reversed(forfeits)]
     expected = [tuple(reversed(game)) for game in reversed(scores(returns, scoring, forfeits))]
-    assert scores(exchanged, scoring, other) == expected
+    assert scores(exchanged, scoring, exchanged_forfeits) == expected
 
 
-@given(st.tuples(pairs, pairs), scorings, broken, st.sampled_from([0, 1]), pairs)
-def test_a_forfeit_gains_nothing(
+@given(st.tuples(pairs, pairs), scorings, forfeit_sets, st.sampled_from([0, 1]), pairs)
+def test_a_forfeit_never_increases_the_score(
     returns: tuple[Values, Values], scoring: Scoring, forfeits: tuple[set[int], set[int]], by: int, collected: Values
 ) -> None:
-    """Whatever else happened in the block, and whatever the game had brought until then."""
+    """Whatever else happened in the block, and whatever the return until then."""
     before = scores(returns, scoring, forfeits)
     after = scores([collected, returns[1]], scoring, [forfeits[0] | {by}, forfeits[1]])
     assert sum(game[by] or 0.0 for game in after) <= sum(game[by] or 0.0 for game in before)

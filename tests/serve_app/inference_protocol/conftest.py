@@ -1,42 +1,19 @@
-"""A replica's application behind real sockets, HTTP and gRPC, in a thread: what stock clients need. No Ray."""
+"""A replica's application on real sockets, HTTP and gRPC, in a thread, for unmodified clients; without Ray."""
 
-import asyncio
-import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 
-import grpc
 import pytest
-import uvicorn
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.app import Server
-from serve_app.inference_protocol import grpc_handlers
-from tests.serve_app.conftest import QUICK
-from tests.serve_app.inference_protocol.leagues import every_kind
-
-SETTINGS = QUICK.model_copy(update={"max_body": 512 * 1024})
-
-
-@dataclass(frozen=True)
-class Address:
-    """Where a server listens, as `tritonclient` wants it."""
-
-    http: str
-    grpc: str
-
-
-@dataclass(frozen=True)
-class InProcess(Address):
-    """A server of this process, which tests may look into."""
-
-    server: Server
+from serve_app.app import Replica
+from tests.support.protocol_leagues import every_kind
+from tests.support.protocol_servers import SETTINGS, InProcess, Listening
 
 
 @pytest.fixture(scope="session")
 def leagues(tmp_path_factory: pytest.TempPathFactory) -> Storage:
-    """Leagues of every kind, for tests that change nothing."""
+    """Leagues of each kind, for tests that do not change them."""
     storage = Storage.at(tmp_path_factory.mktemp("inference"))
     every_kind(storage).close()
     return storage
@@ -44,46 +21,7 @@ def leagues(tmp_path_factory: pytest.TempPathFactory) -> Storage:
 
 @pytest.fixture(scope="session")
 def replica(leagues: Storage) -> Iterator[InProcess]:
-    """A replica that listens for HTTP and gRPC on the loopback."""
-    server = Server(Registry.open(leagues), SETTINGS, "replica-1")
+    """A replica that serves HTTP and gRPC on the loopback interface."""
+    server = Replica(Registry.open(leagues), SETTINGS, "replica-1")
     with Listening(server) as address:
         yield address
-
-
-class Listening:
-    """Runs a server's event loop in a thread while the context lasts."""
-
-    def __init__(self, server: Server) -> None:
-        self._server = server
-        self._http = uvicorn.Server(
-            uvicorn.Config(server.application(), host="127.0.0.1", port=0, log_level="warning", ws="none")
-        )
-        self._listens = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
-        self._grpc_port = 0
-
-    def __enter__(self) -> InProcess:
-        self._thread.start()
-        assert self._listens.wait(30)
-        (listener,) = self._http.servers
-        port = listener.sockets[0].getsockname()[1]
-        return InProcess(f"127.0.0.1:{port}", f"127.0.0.1:{self._grpc_port}", self._server)
-
-    def __exit__(self, *_: object) -> None:
-        self._http.should_exit = True
-        self._thread.join()
-
-    async def _run(self) -> None:
-        former = grpc_handlers._service  # a process has one, but a test may start a second replica for a while
-        grpc_handlers.offer(self._server.inference_service)
-        rpc = grpc.aio.server()
-        grpc_handlers.add_service(None, rpc)
-        self._grpc_port = rpc.add_insecure_port("[::]:0")  # as Ray Serve does
-        await rpc.start()
-        serving = asyncio.create_task(self._http.serve())
-        while not self._http.started and not serving.done():
-            await asyncio.sleep(0.01)
-        self._listens.set()
-        await serving
-        await rpc.stop(None)
-        grpc_handlers._service = former

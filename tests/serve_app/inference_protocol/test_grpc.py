@@ -1,4 +1,4 @@
-"""gRPC without a client library: tensors in the fields of their datatype, and every way to get a message wrong."""
+"""gRPC without a client library: tensors in the fields of their datatype, and invalid messages."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from league.settings import Storage
 from serve_app.inference_protocol import grpc_handlers
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from serve_app.inference_protocol.grpc_messages import CONTENTS
-from tests.serve_app.inference_protocol.conftest import InProcess
-from tests.serve_app.inference_protocol.leagues import DTYPES
-from tests.serve_app.inference_protocol.observations import observations, policy_of
+from serve_app.inference_protocol.grpc_service import CONTENTS
+from tests.support.protocol_leagues import DTYPES
+from tests.support.protocol_observations import observations, policy_of
+from tests.support.protocol_servers import InProcess
 
 Call = Callable[[str, Any], Any]
 Input = messages.ModelInferRequest.InferInputTensor
-CLIENTS_FAULT = {
+CLIENT_ERRORS = {
     grpc.StatusCode.INVALID_ARGUMENT,
     grpc.StatusCode.NOT_FOUND,
     grpc.StatusCode.RESOURCE_EXHAUSTED,
@@ -29,7 +29,7 @@ CLIENTS_FAULT = {
 
 @pytest.fixture(scope="module")
 def call(replica: InProcess) -> Iterator[Call]:
-    """Call by name, with a message or its bytes."""
+    """Call an RPC by name, with a message or its bytes."""
     with grpc.insecure_channel(replica.grpc) as channel:
 
         def call(rpc: str, request: Any) -> Any:
@@ -40,24 +40,24 @@ def call(replica: InProcess) -> Iterator[Call]:
         yield call
 
 
-def refused(call: Call, request: Any, rpc: str = "ModelInfer") -> str:
+def error_of(call: Call, request: Any, rpc: str = "ModelInfer") -> str:
     with pytest.raises(grpc.RpcError) as caught:
         call(rpc, request)
-    assert caught.value.code() in CLIENTS_FAULT, caught.value  # type: ignore[attr-defined]
+    assert caught.value.code() in CLIENT_ERRORS, caught.value  # type: ignore[attr-defined]
     return str(caught.value.details())  # type: ignore[attr-defined]
 
 
 def vector(**changes: Any) -> messages.ModelInferRequest:
-    """A good request, with another input."""
+    """A valid request, with changes to its input."""
     tensor = {"name": "observation", "datatype": "FP32", "shape": [1, 2], "contents": {"fp32_contents": [0.5, -1]}}
     inputs = [Input(**{key: value for key, value in (tensor | changes).items() if value is not None})]
     return messages.ModelInferRequest(model_name="vector", inputs=inputs)
 
 
-def test_numbers_in_the_field_of_their_datatype(call: Call, leagues: Storage) -> None:
+def test_tensors_in_the_field_of_their_datatype(call: Call, leagues: Storage) -> None:
     policy, signature = policy_of(leagues, "kinds")
     arrays = observations(signature, 2)
-    # FP16 has no field, and without bytes for all there are bytes for none.
+    # FP16 has no field, and raw contents must be given for all inputs or for none.
     without = [name for name in arrays if signature.inputs[name].datatype != "FP16"]
     assert len(without) == len(DTYPES) - 1
     inputs = [
@@ -71,9 +71,9 @@ def test_numbers_in_the_field_of_their_datatype(call: Call, leagues: Storage) ->
     ]
     half = Input(name="observation.float16", datatype="FP16", shape=[2, 2, 3])
     request = messages.ModelInferRequest(model_name="kinds", inputs=[*inputs, half])
-    assert "send it as bytes" in refused(call, request)
+    assert "send it as bytes" in error_of(call, request)
     del request.inputs[-1]
-    assert "input observation.float16 is missing" in refused(call, request)
+    assert "input observation.float16 is missing" in error_of(call, request)
     for tensor in request.inputs:
         tensor.ClearField("contents")
     request.inputs.append(half)
@@ -86,7 +86,7 @@ def test_numbers_in_the_field_of_their_datatype(call: Call, leagues: Storage) ->
     )
 
 
-def test_an_answer_is_in_bytes(call: Call) -> None:
+def test_outputs_are_raw_contents(call: Call) -> None:
     request = vector()
     request.id = "tick"
     answer = call("ModelInfer", request)
@@ -99,7 +99,7 @@ def test_an_answer_is_in_bytes(call: Call) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "message"),
     [
         ({"contents": {"fp32_contents": [1]}}, "has 1 elements, expected 2"),
         ({"contents": {"fp64_contents": [1, 2]}}, "has 0 elements, expected 2"),
@@ -108,37 +108,39 @@ def test_an_answer_is_in_bytes(call: Call) -> None:
         ({"datatype": ""}, "datatype ''"),
         ({"shape": [2]}, "has shape [2], expected [batch, 2]"),
         ({"shape": [-1, 2]}, "has shape [-1, 2]"),
-        ({"name": "other"}, "no input 'other'"),
+        ({"name": "other"}, "unknown input 'other'"),
         ({"contents": {"fp32_contents": [float("nan"), 0]}}, "finite"),
     ],
 )
-def test_a_bad_tensor_is_refused(call: Call, changes: dict[str, Any], words: str) -> None:
-    assert words in refused(call, vector(**changes))
+def test_an_invalid_tensor_is_rejected(call: Call, changes: dict[str, Any], message: str) -> None:
+    assert message in error_of(call, vector(**changes))
 
 
-def test_bytes_are_for_all_inputs_or_for_none(call: Call) -> None:
+def test_raw_contents_are_for_all_inputs_or_for_none(call: Call) -> None:
     request = vector()
     request.raw_input_contents.append(bytes(8))
-    assert "contents as well as raw_input_contents" in refused(call, request)
+    assert "both contents and raw_input_contents" in error_of(call, request)
     request.inputs[0].ClearField("contents")
     request.raw_input_contents.append(bytes(8))
-    assert "2 raw_input_contents for 1 inputs" in refused(call, request)
+    assert "2 raw_input_contents for 1 inputs" in error_of(call, request)
     del request.raw_input_contents[:]
     request.raw_input_contents.append(bytes(7))
-    assert "has 7 bytes, expected 8" in refused(call, request)
+    assert "has 7 bytes, expected 8" in error_of(call, request)
 
 
-def test_a_large_message_is_refused(call: Call, replica: InProcess) -> None:
+def test_a_large_message_is_rejected(call: Call, replica: InProcess) -> None:
     request = messages.ModelInferRequest(model_name="vector", raw_input_contents=[bytes(600 * 1024)])
-    assert "larger than 524288 bytes" in refused(call, request)
+    assert "larger than 524288 bytes" in error_of(call, request)
 
 
-def test_too_many_calls_at_once_are_told_so(call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_concurrent_calls_is_limited(
+    call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(replica.server.inference, "in_flight", 10**6)
-    assert "in progress here already" in refused(call, vector())
+    assert "in progress in this replica" in error_of(call, vector())
 
 
-def test_a_call_that_is_not_there(call: Call) -> None:
+def test_unknown_models_and_missing_champions_are_reported(call: Call) -> None:
     with pytest.raises(grpc.RpcError) as caught:
         call("ModelStatistics", messages.ModelStatisticsRequest(name="nobody"))
     assert caught.value.code() == grpc.StatusCode.NOT_FOUND  # type: ignore[attr-defined]
@@ -147,26 +149,28 @@ def test_a_call_that_is_not_there(call: Call) -> None:
     assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
 
 
-def test_calls_from_elsewhere_are_refused(replica: InProcess) -> None:
-    """The port listens on all interfaces, as Ray Serve's does; this replica takes itself to be known as 127.0.0.1."""
-    outward, port = own_address(), replica.grpc.rpartition(":")[2]
-    if outward is None:
-        pytest.skip("this machine has no address but the loopback's")
-    with grpc.insecure_channel(f"{outward}:{port}") as channel:
+def test_remote_calls_are_rejected(replica: InProcess) -> None:
+    """The port listens on all interfaces, like Ray Serve's; this replica is known as 127.0.0.1."""
+    external, port = external_address(), replica.grpc.rpartition(":")[2]
+    if external is None:
+        pytest.skip("this machine has only the loopback address")
+    with grpc.insecure_channel(f"{external}:{port}") as channel:
         live = channel.unary_unary(f"/{grpc_handlers.SERVICE}/ServerLive")
-        with pytest.raises(grpc.RpcError, match="from its own machine alone") as caught:
+        with pytest.raises(grpc.RpcError, match="from their own machine only") as caught:
             live(b"", timeout=10)
     assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
 
 
-def test_a_process_without_a_replica_says_so(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_without_a_replica_is_unavailable(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grpc_handlers, "_service", None)
-    with pytest.raises(grpc.RpcError, match="no replica answers here") as caught:
+    with pytest.raises(grpc.RpcError, match="this process has no replica") as caught:
         call("ServerLive", messages.ServerLiveRequest())
     assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
 
 
-def test_a_bug_is_told_to_the_log_alone(call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_exception_is_only_logged(
+    call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail() -> None:
         raise ZeroDivisionError("secret")
 
@@ -177,11 +181,11 @@ def test_a_bug_is_told_to_the_log_alone(call: Call, replica: InProcess, monkeypa
     assert "secret" not in caught.value.details()  # type: ignore[attr-defined]
 
 
-def own_address() -> str | None:
-    """An address of this machine that is not the loopback's."""
+def external_address() -> str | None:
+    """An address of this machine other than the loopback address."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing: it asks for the route
+            probe.connect(("192.0.2.1", 9))  # sends nothing, but selects the route
         except OSError:
             return None
         address = str(probe.getsockname()[0])
@@ -222,10 +226,10 @@ requests = st.builds(
 
 @settings(max_examples=300, deadline=None)
 @given(request=requests | st.binary(max_size=60))
-def test_no_message_is_the_server_s_fault(call: Call, request: Any) -> None:
+def test_no_message_causes_a_server_error(call: Call, request: Any) -> None:
     failure = None
     try:
         call("ModelInfer", request)
     except grpc.RpcError as error:
         failure = error
-    assert failure is None or failure.code() in CLIENTS_FAULT, failure  # type: ignore[attr-defined]
+    assert failure is None or failure.code() in CLIENT_ERRORS, failure  # type: ignore[attr-defined]

@@ -1,10 +1,11 @@
-"""REST without a client library: the protocol's documents to the letter, and every way to get a body wrong."""
+"""REST without a client library: exact documents of the protocol, and invalid bodies."""
 
 import asyncio
 import gzip
 import json
 import zlib
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from typing import Any
 
 import httpx
@@ -17,11 +18,14 @@ from starlette.testclient import TestClient
 
 from league.errors import StorageError
 from league.registry.registry import Registry
+from league.registry.versions import VersionRepository
 from league.settings import Storage
-from serve_app.app import Server
-from tests.serve_app.conftest import replica as application
-from tests.serve_app.inference_protocol.conftest import SETTINGS
-from tests.serve_app.leagues import everything, promote
+from serve_app.app import Replica
+from tests.support.protocol_servers import SETTINGS
+from tests.support.replicas import QUICK
+from tests.support.replicas import replica as application
+from tests.support.served_leagues import everything, promote
+from tests.support.waiting import until
 
 LENGTH = "Inference-Header-Content-Length"
 VECTOR = {"name": "observation", "datatype": "FP32", "shape": [1, 2], "data": [0.5, -1]}
@@ -44,33 +48,33 @@ DURATION = {
 DURATIONS = ("success", "fail", "queue", "compute_input", "compute_infer", "compute_output", "cache_hit", "cache_miss")
 
 
-def closed(**properties: Any) -> dict[str, Any]:
-    """The schema of an object with these properties, no other, and none left out."""
+def exact(**properties: Any) -> dict[str, Any]:
+    """The schema of an object with exactly these properties."""
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
 SCHEMAS: dict[str, dict[str, Any]] = {
-    "/v2": closed(name=NAME, version=NAME, extensions={"type": "array", "items": NAME}),
-    "/v2/health/live": closed(live={"const": True}),
-    "/v2/health/ready": closed(ready={"const": True}),
-    "/v2/models/board/ready": closed(name={"const": "board"}, ready={"const": True}),
-    "/v2/models/board": closed(
+    "/v2": exact(name=NAME, version=NAME, extensions={"type": "array", "items": NAME}),
+    "/v2/health/live": exact(live={"const": True}),
+    "/v2/health/ready": exact(ready={"const": True}),
+    "/v2/models/board/ready": exact(name={"const": "board"}, ready={"const": True}),
+    "/v2/models/board": exact(
         name={"const": "board"},
         versions={"type": "array", "items": NAME},
         platform={"const": "onnxruntime_onnx"},
         inputs=TENSORS,
         outputs=TENSORS,
     ),
-    "/v2/models/stats": closed(
+    "/v2/models/stats": exact(
         model_stats={
             "type": "array",
-            "items": closed(
+            "items": exact(
                 name=NAME,
                 version=NAME,
                 last_inference={"type": "integer"},
                 inference_count={"type": "integer"},
                 execution_count={"type": "integer"},
-                inference_stats=closed(**dict.fromkeys(DURATIONS, DURATION)),
+                inference_stats=exact(**dict.fromkeys(DURATIONS, DURATION)),
             ),
         }
     ),
@@ -82,13 +86,13 @@ SCHEMAS |= {
     "/v2/models/board/stats": SCHEMAS["/v2/models/stats"],
     "/v2/models/board/versions/3/stats": SCHEMAS["/v2/models/stats"],
 }
-REPLY = closed(
+REPLY = exact(
     model_name={"const": "vector"},
     model_version={"const": "1"},
     id={"const": "tick"},
     outputs={
         "type": "array",
-        "items": closed(
+        "items": exact(
             name=NAME,
             datatype=NAME,
             shape={"type": "array", "items": {"type": "integer"}},
@@ -96,7 +100,7 @@ REPLY = closed(
         ),
     },
 )
-ERROR = closed(error={"type": "string", "minLength": 1})
+ERROR = exact(error={"type": "string", "minLength": 1})
 
 
 @pytest.fixture(scope="module")
@@ -110,21 +114,21 @@ def infer(client: TestClient, body: Any, model: str = "vector", **headers: str) 
     return client.post(f"/v2/models/{model}/infer", content=content, headers=headers)
 
 
-def refused(reply: httpx.Response, status: int = 400) -> str:
+def error_of(reply: httpx.Response, status: int = 400) -> str:
     assert reply.status_code == status, reply.text
     jsonschema.validate(reply.json(), ERROR)
     return str(reply.json()["error"])
 
 
 @pytest.mark.parametrize("path", SCHEMAS)
-def test_documents_are_the_protocol_s(client: TestClient, path: str) -> None:
+def test_documents_follow_the_protocol(client: TestClient, path: str) -> None:
     assert infer(client, {"inputs": [VECTOR]}).status_code == 200
     reply = client.get(path)
     assert reply.status_code == 200
     jsonschema.validate(reply.json(), SCHEMAS[path])
 
 
-def test_an_inference_is_answered_as_the_protocol_has_it(client: TestClient) -> None:
+def test_an_inference_response_follows_the_protocol(client: TestClient) -> None:
     reply = infer(client, {"id": "tick", "inputs": [VECTOR], "outputs": [{"name": "action"}]})
     jsonschema.validate(reply.json(), REPLY)
     assert reply.json()["outputs"] == [{"name": "action", "datatype": "FP32", "shape": [1, 2], "data": [0.5, -1]}]
@@ -132,7 +136,7 @@ def test_an_inference_is_answered_as_the_protocol_has_it(client: TestClient) -> 
     assert LENGTH not in reply.headers
 
 
-def test_no_id_gets_none_back(client: TestClient) -> None:
+def test_without_an_id_the_response_has_none(client: TestClient) -> None:
     assert infer(client, {"inputs": [VECTOR]}).json().keys() == {"model_name", "model_version", "outputs"}
 
 
@@ -140,7 +144,7 @@ def test_no_id_gets_none_back(client: TestClient) -> None:
     ("overall", "own", "is_binary"),
     [(None, None, False), (True, None, True), (False, True, True), (True, False, False), (None, True, True)],
 )
-def test_an_output_s_own_wish_goes_first(
+def test_the_setting_of_an_output_has_precedence(
     client: TestClient, overall: bool | None, own: bool | None, is_binary: bool
 ) -> None:
     output: dict[str, Any] = {"name": "action"} | ({} if own is None else {"parameters": {"binary_data": own}})
@@ -159,14 +163,14 @@ def test_an_output_s_own_wish_goes_first(
         assert reply.headers["content-type"] == "application/octet-stream"
 
 
-def test_nested_data_counts_in_row_major_order(client: TestClient) -> None:
+def test_nested_data_is_in_row_major_order(client: TestClient) -> None:
     flat = infer(client, {"inputs": [VECTOR | {"shape": [2, 2], "data": [1, 2, 3, 4]}]})
     nested = infer(client, {"inputs": [VECTOR | {"shape": [2, 2], "data": [[1, 2], [3, 4]]}]})
     assert flat.json() == nested.json()
     assert flat.json()["outputs"][0]["data"] == [1, 2, 3, 4]
 
 
-def test_a_tensor_may_begin_anywhere_in_the_body(client: TestClient) -> None:
+def test_a_tensor_can_start_at_any_offset(client: TestClient) -> None:
     tensor = {"name": "observation", "datatype": "FP32", "shape": [1, 2], "parameters": {"binary_data_size": 8}}
     for padding in range(8):
         head = json.dumps({"inputs": [tensor]}).encode() + b" " * padding
@@ -174,7 +178,7 @@ def test_a_tensor_may_begin_anywhere_in_the_body(client: TestClient) -> None:
         assert reply.json()["outputs"][0]["data"] == [3, 4]
 
 
-def test_whole_floats_are_integers_and_integers_are_floats(client: TestClient) -> None:
+def test_integral_floats_are_integers_and_integers_are_floats(client: TestClient) -> None:
     reply = infer(
         client, {"inputs": [{"name": "observation", "datatype": "INT64", "shape": [2], "data": [1.0, 3]}]}, "choice"
     )
@@ -209,11 +213,11 @@ BAD_BODIES: dict[str, tuple[Any, str]] = {
     "too little data": ({"inputs": [VECTOR | {"data": [1]}]}, "has 1 elements, expected 2"),
     "too much data": ({"inputs": [VECTOR | {"data": [1, 2, 3]}]}, "has 3 elements, expected 2"),
     "ragged data": ({"inputs": [VECTOR | {"data": [[1], 2]}]}, "unequal depth"),
-    "strings": ({"inputs": [VECTOR | {"data": ["1", "2"]}]}, "something other than FP32"),
-    "long strings": ({"inputs": [VECTOR | {"data": ["x" * 20_000] + [""] * 10_000}]}, "something other than FP32"),
-    "null": ({"inputs": [VECTOR | {"data": [1, None]}]}, "something other than FP32"),
-    "booleans": ({"inputs": [VECTOR | {"data": [True, False]}]}, "something other than FP32"),
-    "objects": ({"inputs": [VECTOR | {"data": [{}, {}]}]}, "something other than FP32"),
+    "strings": ({"inputs": [VECTOR | {"data": ["1", "2"]}]}, "values other than FP32"),
+    "long strings": ({"inputs": [VECTOR | {"data": ["x" * 20_000] + [""] * 10_000}]}, "values other than FP32"),
+    "null": ({"inputs": [VECTOR | {"data": [1, None]}]}, "values other than FP32"),
+    "booleans": ({"inputs": [VECTOR | {"data": [True, False]}]}, "values other than FP32"),
+    "objects": ({"inputs": [VECTOR | {"data": [{}, {}]}]}, "values other than FP32"),
     "deep": (b'{"inputs": [{"data": ' + b"[" * 20_000 + b"]" * 20_000 + b"}]}", "not JSON"),
     "less deep": ({"inputs": [VECTOR | {"data": json.loads("[" * 500 + "]" * 500)}]}, "has 0 elements"),
     "overflow": (
@@ -227,36 +231,36 @@ BAD_BODIES: dict[str, tuple[Any, str]] = {
                 {"name": "observation", "datatype": "FP32", "shape": [1, 2], "parameters": {"binary_data_size": 8}}
             ]
         },
-        "the inputs name 8",
+        "the inputs declare 8",
     ),
-    "both": ({"inputs": [VECTOR | {"parameters": {"binary_data_size": 8}}]}, "without data beside it"),
+    "both": ({"inputs": [VECTOR | {"parameters": {"binary_data_size": 8}}]}, "and data must be absent"),
     "a negative size": ({"inputs": [VECTOR | {"parameters": {"binary_data_size": -8}}]}, "must be a number of bytes"),
 }
 
 
 @pytest.mark.parametrize("name", BAD_BODIES)
-def test_a_bad_body_is_refused_in_a_sentence(client: TestClient, name: str) -> None:
-    body, words = BAD_BODIES[name]
+def test_an_invalid_body_is_rejected(client: TestClient, name: str) -> None:
+    body, message = BAD_BODIES[name]
     reply = infer(client, body)
-    assert words in refused(reply, 413 if "at most" in words else 400)
+    assert message in error_of(reply, 413 if "at most" in message else 400)
 
 
 @pytest.mark.parametrize(
-    ("datatype", "data", "words"),
+    ("datatype", "data", "message"),
     [
         ("INT64", [0.5], "fractions"),
-        ("INT64", [2**63], "does not fit INT64"),
+        ("INT64", [2**63], "out of range for INT64"),
         ("INT64", [1e300], "must be between"),
         ("INT64", [-1], "between 0 and 3"),
     ],
 )
-def test_integers_are_whole_and_fit(client: TestClient, datatype: str, data: list[Any], words: str) -> None:
+def test_integers_are_integral_and_in_range(client: TestClient, datatype: str, data: list[Any], message: str) -> None:
     tensor = {"name": "observation", "datatype": datatype, "shape": [1], "data": data}
-    assert words in refused(infer(client, {"inputs": [tensor]}, "choice"))
+    assert message in error_of(infer(client, {"inputs": [tensor]}, "choice"))
 
 
 @pytest.mark.parametrize(
-    ("length", "words"),
+    ("length", "message"),
     [
         ("x", "number of bytes"),
         ("-1", "number of bytes"),
@@ -265,8 +269,8 @@ def test_integers_are_whole_and_fit(client: TestClient, datatype: str, data: lis
         ("99999", "the body has"),
     ],
 )
-def test_a_header_length_that_is_none(client: TestClient, length: str, words: str) -> None:
-    assert words in refused(infer(client, {"inputs": [VECTOR]}, **{LENGTH: length}))
+def test_an_invalid_header_length_is_rejected(client: TestClient, length: str, message: str) -> None:
+    assert message in error_of(infer(client, {"inputs": [VECTOR]}, **{LENGTH: length}))
 
 
 def test_bytes_of_a_boolean_are_0_and_1(client: TestClient) -> None:
@@ -274,9 +278,9 @@ def test_bytes_of_a_boolean_are_0_and_1(client: TestClient) -> None:
     mask = {"name": "action_mask", "datatype": "INT8", "shape": [1, 4672], "data": [1] * 4672}
     head = json.dumps({"inputs": [planes | {"parameters": {"binary_data_size": 7104}}, mask]}).encode()
     reply = infer(client, head + b"\x02" * 7104, "chess", **{LENGTH: str(len(head))})
-    assert "bytes other than 0 and 1" in refused(reply)
+    assert "bytes other than 0 and 1" in error_of(reply)
     numbers = {"inputs": [planes | {"data": [1] * 7104}, mask]}
-    assert "something other than BOOL" in refused(infer(client, numbers, "chess"))
+    assert "values other than BOOL" in error_of(infer(client, numbers, "chess"))
 
 
 @pytest.mark.parametrize(
@@ -296,27 +300,27 @@ def test_bytes_of_a_boolean_are_0_and_1(client: TestClient) -> None:
         ("GET", "/v2/repository/index", 405),
     ],
 )
-def test_errors_have_the_protocol_s_form(client: TestClient, method: str, path: str, status: int) -> None:
+def test_errors_have_the_format_of_the_protocol(client: TestClient, method: str, path: str, status: int) -> None:
     reply = client.request(method, path)
-    refused(reply, status)
+    error_of(reply, status)
     assert ("retry-after" in reply.headers) == (status == 503)
 
 
-def test_the_index_can_be_of_what_is_in_memory(client: TestClient) -> None:
+def test_the_index_can_be_limited_to_loaded_models(client: TestClient) -> None:
     index = client.post("/v2/repository/index").json()
     ready = client.post("/v2/repository/index", json={"ready": True}).json()
     assert {model["state"] for model in ready} == {"READY"}
     assert [model for model in index if model["state"] == "READY"] == ready
     assert {"name": "board", "version": "1", "state": "READY"} in ready
-    refused(client.post("/v2/repository/index", json={"ready": 1}))
-    refused(client.post("/v2/repository/index", content=b"["))
+    error_of(client.post("/v2/repository/index", json={"ready": 1}))
+    error_of(client.post("/v2/repository/index", content=b"["))
 
 
 @pytest.mark.parametrize(
     ("encoding", "compress"),
     [("gzip", gzip.compress), ("x-gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)],
 )
-def test_a_compressed_body(client: TestClient, encoding: str, compress: Any) -> None:
+def test_a_compressed_body_is_accepted(client: TestClient, encoding: str, compress: Any) -> None:
     tensor = {"name": "observation", "datatype": "FP32", "shape": [1, 2], "parameters": {"binary_data_size": 8}}
     head = json.dumps({"inputs": [tensor]}).encode()
     body = compress(head + np.array([3, 4], "<f4").tobytes())
@@ -328,17 +332,19 @@ def test_a_compressed_body(client: TestClient, encoding: str, compress: Any) -> 
     ("encoding", "body", "status"),
     [
         ("gzip", b"no gzip", 400),
-        ("gzip", gzip.compress(b"{}")[:-4], 400),
-        ("gzip", gzip.compress(b"{}") + b"more", 400),
-        ("deflate", gzip.compress(b"{}"), 400),
+        ("gzip", gzip.compress(b"{}", mtime=0)[:-4], 400),
+        ("gzip", gzip.compress(b"{}", mtime=0) + b"more", 400),
+        ("deflate", gzip.compress(b"{}", mtime=0), 400),
         ("br", b"{}", 415),
-        ("gzip, gzip", gzip.compress(gzip.compress(b"{}")), 415),
-        ("gzip", gzip.compress(b" " * (SETTINGS.max_body + 1)), 413),
+        ("gzip, gzip", gzip.compress(gzip.compress(b"{}", mtime=0), mtime=0), 415),
+        ("gzip", gzip.compress(b" " * (SETTINGS.max_body + 1), mtime=0), 413),
         ("deflate", zlib.compress(b" " * 100 * 2**20), 413),
     ],
 )
-def test_a_body_that_cannot_be_decompressed(client: TestClient, encoding: str, body: bytes, status: int) -> None:
-    refused(infer(client, body, **{"Content-Encoding": encoding}), status)
+def test_a_body_that_cannot_be_decompressed_is_rejected(
+    client: TestClient, encoding: str, body: bytes, status: int
+) -> None:
+    error_of(infer(client, body, **{"Content-Encoding": encoding}), status)
 
 
 @pytest.mark.parametrize(
@@ -352,9 +358,7 @@ def test_a_body_that_cannot_be_decompressed(client: TestClient, encoding: str, b
         ("", None),
     ],
 )
-def test_a_large_reply_is_compressed_if_that_is_accepted(
-    client: TestClient, accepted: str, encoding: str | None
-) -> None:
+def test_a_large_response_is_compressed_if_accepted(client: TestClient, accepted: str, encoding: str | None) -> None:
     body = {
         "inputs": [
             {"name": "observation", "datatype": "BOOL", "shape": [1, 8, 8, 111], "data": [False] * 7104},
@@ -368,19 +372,19 @@ def test_a_large_reply_is_compressed_if_that_is_accepted(
     assert "content-encoding" not in small.headers
 
 
-def test_a_large_body_is_refused(client: TestClient) -> None:
-    assert "larger than" in refused(infer(client, b" " * (SETTINGS.max_body + 1)), 413)
+def test_a_large_body_is_rejected(client: TestClient) -> None:
+    assert "larger than" in error_of(infer(client, b" " * (SETTINGS.max_body + 1)), 413)
     in_parts = (b" " * 2**16 for _ in range(SETTINGS.max_body // 2**16 + 1))
-    assert "larger than" in refused(client.post("/v2/models/vector/infer", content=in_parts), 413)
+    assert "larger than" in error_of(client.post("/v2/models/vector/infer", content=in_parts), 413)
 
 
 @pytest.mark.anyio
-async def test_too_many_requests_at_once_are_told_to_come_back(leagues: Storage) -> None:
-    server = Server(Registry.open(leagues), SETTINGS.model_copy(update={"max_in_flight": 2}), "replica-1")
-    body_comes = asyncio.Event()
+async def test_the_number_of_concurrent_requests_is_limited(leagues: Storage) -> None:
+    server = Replica(Registry.open(leagues), SETTINGS.model_copy(update={"max_in_flight": 2}), "replica-1")
+    resume = asyncio.Event()
 
     async def body() -> AsyncIterator[bytes]:
-        await body_comes.wait()
+        await resume.wait()
         yield json.dumps({"inputs": [VECTOR]}).encode()
 
     path = "/v2/models/vector/infer"
@@ -390,32 +394,37 @@ async def test_too_many_requests_at_once_are_told_to_come_back(leagues: Storage)
         while server.inference.in_flight < 2:
             await asyncio.sleep(0)
         reply = await client.post(path, json={"inputs": [VECTOR]})
-        refused(reply, 429)
+        error_of(reply, 429)
         assert reply.headers["retry-after"] == "1"
-        body_comes.set()
+        resume.set()
         assert [(await each).status_code for each in slow] == [200, 200]
         assert (await client.post(path, json={"inputs": [VECTOR]})).status_code == 200
 
 
-def test_metadata_without_a_database_names_what_answers(leagues: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_metadata_without_a_database_lists_the_loaded_versions(
+    leagues: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with application(leagues, SETTINGS) as client:
 
-        def gone(*_: object) -> None:
+        def fail(*_: object) -> None:
             raise StorageError("the database is gone")
 
-        monkeypatch.setattr(Registry, "version_numbers", gone)
+        monkeypatch.setattr(VersionRepository, "numbers", fail)
         assert client.get("/v2/models/board").json()["versions"] == ["1"]
         assert infer(client, {"inputs": [VECTOR]}).status_code == 200
-        assert "the database is gone" in refused(client.post("/v2/repository/index"), 503)
+        assert "the database is gone" in error_of(client.post("/v2/repository/index"), 503)
 
 
 def test_a_promotion_is_followed(tmp_path_factory: pytest.TempPathFactory) -> None:
     registry = everything(Storage.at(tmp_path_factory.mktemp("promoted")))
-    with application(registry.storage, SETTINGS) as client:
+    with application(registry.storage, QUICK) as client:
+
+        def is_served(version: str) -> bool:
+            return client.get("/v2/models/board/stats").json()["model_stats"][-1]["version"] == version
+
         for version in ("2", "3", "1"):
             promote(registry, "board", int(version))
-            while client.get("/v2/models/board/stats").json()["model_stats"][-1]["version"] != version:
-                pass
+            until(partial(is_served, version))
     registry.close()
 
 
@@ -469,7 +478,7 @@ VALID = {
     model=st.sampled_from(["board", "vector", "nested", "memory", "duo", "duo.left", "chess"]),
     version=st.sampled_from(["1", "champion", "99", "0", "x y"]),
 )
-def test_no_frame_is_the_server_s_fault(
+def test_no_request_causes_a_server_error(
     client: TestClient,
     document: Any,
     rest: bytes,
@@ -481,17 +490,17 @@ def test_no_frame_is_the_server_s_fault(
 ) -> None:
     head = json.dumps(document, allow_nan=True).encode()
     body = head + rest
-    packed = {"gzip": gzip.compress, "deflate": zlib.compress}.get(encoding, bytes)(body)
+    compressed_body = {"gzip": gzip.compress, "deflate": zlib.compress}.get(encoding, bytes)(body)
     headers = {LENGTH: str(len(head) + shift), "Content-Encoding": encoding, "Accept-Encoding": accept}
-    reply = client.post(f"/v2/models/{model}/versions/{version}/infer", content=packed, headers=headers)
+    reply = client.post(f"/v2/models/{model}/versions/{version}/infer", content=compressed_body, headers=headers)
     assert reply.status_code < 500
     if reply.status_code != 200:
-        refused(reply, reply.status_code)
+        error_of(reply, reply.status_code)
 
 
 @settings(max_examples=200, deadline=None)
 @given(body=st.binary(max_size=200), length=st.none() | st.integers(0, 220))
-def test_no_bytes_are_the_server_s_fault(client: TestClient, body: bytes, length: int | None) -> None:
+def test_no_body_causes_a_server_error(client: TestClient, body: bytes, length: int | None) -> None:
     reply = infer(client, body, **({} if length is None else {LENGTH: str(length)}))
-    refused(reply, reply.status_code)
+    error_of(reply, reply.status_code)
     assert reply.status_code == 400

@@ -1,8 +1,8 @@
-"""The real thing: Ray Serve, HAProxy and two replicas, asked by the stock client over HTTP and gRPC."""
+"""A real server with Ray Serve, HAProxy and two replicas, called by the unmodified client over HTTP and gRPC."""
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,61 +10,60 @@ import tritonclient.grpc
 from tritonclient.utils import InferenceServerException
 
 from league.registry.registry import Registry
-from league.settings import Storage
-from serve_app import haproxy
-from serve_app.launch import running
-from tests.serve_app.inference_protocol.conftest import Address
-from tests.serve_app.inference_protocol.leagues import every_kind
-from tests.serve_app.inference_protocol.observations import observations, policy_of
-from tests.serve_app.inference_protocol.triton import FORMS, Triton, same
-from tests.serve_app.leagues import promote
-from tests.serve_app.test_server import load, processes, serving, until
+from tests.support.protocol_observations import observations, policy_of
+from tests.support.protocol_servers import Address
+from tests.support.served_leagues import promote
+from tests.support.servers import RayServer, load, processes, serving
+from tests.support.triton import FORMS, Triton, assert_same
+from tests.support.waiting import until
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
-    registry = every_kind(Storage.at(tmp_path_factory.mktemp("served")))
-    yield registry
-    registry.close()
+def served(ray_server: RayServer) -> Registry:
+    return ray_server.registry
 
 
 @pytest.fixture(scope="module")
-def address(served: Registry) -> Iterator[Address]:
-    (port,) = haproxy.free_ports(1, "127.0.0.1")
-    with running(served.storage, replicas=2, grpc_port=port) as url:
-        until(lambda: serving(served, 1) == 2)
-        yield Address(url.removeprefix("http://"), f"127.0.0.1:{port}")
+def address(ray_server: RayServer) -> Address:
+    promote(ray_server.registry, "board", 1)
+    until(lambda: serving(ray_server.registry, 1) >= 2)
+    return Address(ray_server.url.removeprefix("http://"), ray_server.grpc)
 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("model", ["board", "pistons", "chess", "vector", "choice"])
-def test_every_form_of_the_client_is_answered(address: Address, served: Registry, form: str, model: str) -> None:
+def test_each_form_of_the_client_is_answered(address: Address, served: Registry, form: str, model: str) -> None:
     policy, signature = policy_of(served.storage, model)
     arrays = observations(signature, 4)
     with Triton(form, address) as triton:
-        assert triton.ask("is_server_live")
-        assert triton.ask("is_server_ready")
-        assert triton.ask("is_model_ready", model, "champion")
-        same(triton.infer(model, arrays).as_numpy("action"), policy.act(arrays).actions)
+        assert triton.call("is_server_live")
+        assert triton.call("is_server_ready")
+        assert triton.call("is_model_ready", model, "champion")
+        assert_same(triton.infer(model, arrays).as_numpy("action"), policy.act(arrays).actions)
 
 
-def test_calls_of_one_channel_reach_every_replica(address: Address) -> None:
-    """HAProxy balances calls, not connections: the two replicas' statistics differ."""
+def test_calls_on_one_channel_reach_all_replicas(address: Address) -> None:
+    """HAProxy balances calls, not connections."""
     with Triton("grpc", address) as triton:
-        for _ in range(20):
+        wait_for_both_replicas(triton)
+
+
+def wait_for_both_replicas(triton: Triton) -> None:
+    """The statistics of the two replicas differ once both have answered."""
+
+    def nanoseconds() -> str | None:
+        (entry,) = triton.document("get_inference_statistics", "vector")["model_stats"]
+        return entry["inference_stats"]["success"].get("ns")  # absent on a replica without calls
+
+    def have_answered() -> bool:
+        for _ in range(4):
             triton.infer("vector", {"observation": np.zeros((1, 2), np.float32)})
-        found = set()
+        return len({nanoseconds() for _ in range(4)} - {None}) == 2
 
-        def both() -> bool:
-            (entry,) = triton.document("get_inference_statistics", "vector")["model_stats"]
-            success = entry["inference_stats"]["success"]
-            found.add(success["ns"])  # there is none where nothing was answered
-            return len(found) == 2
-
-        until(both)
+    until(have_answered)
 
 
-def test_a_promotion_reaches_both_protocols(address: Address, served: Registry) -> None:
+def test_a_promotion_applies_to_both_protocols(address: Address, served: Registry) -> None:
     with Triton("http", address) as http, Triton("grpc", address) as rpc:
         for version in (2, 3, 1):
             promote(served, "board", version)
@@ -76,8 +75,11 @@ def test_a_promotion_reaches_both_protocols(address: Address, served: Registry) 
                 assert found == str(version)
 
 
-def test_the_death_of_a_replica_costs_no_call_that_is_repeated(address: Address, served: Registry) -> None:
+@pytest.mark.slow
+def test_retried_calls_survive_the_death_of_a_replica(address: Address, served: Registry) -> None:
     arrays = {"observation": np.zeros((1, 2), np.float32)}
+    with Triton("grpc", address) as triton:
+        wait_for_both_replicas(triton)
     victim = processes(served.storage, "PolicyServer")[0]
 
     def caller() -> Callable[[], int]:

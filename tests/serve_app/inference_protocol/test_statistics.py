@@ -1,9 +1,9 @@
-"""What is counted, and for how long it is kept."""
+"""What statistics count, and for how long they are kept."""
 
-from serve_app.inference_protocol.statistics import KEPT, Statistics
+from serve_app.inference_protocol.statistics import MAX_ENTRIES, Statistics
 
 
-def test_times_are_of_the_parts_of_a_request() -> None:
+def test_durations_are_of_the_parts_of_a_request() -> None:
     entry = Statistics().entry("board", 1)
     entry.succeed(3, begun=0, found=1, read=10, ran=100, done=1000)
     entry.succeed(2, begun=0, found=0, read=1, ran=2, done=3)
@@ -22,14 +22,14 @@ def test_times_are_of_the_parts_of_a_request() -> None:
     }
 
 
-def test_what_was_not_asked_for_longest_is_forgotten() -> None:
+def test_the_least_recently_used_entry_is_evicted() -> None:
     statistics = Statistics()
-    for version in range(1, KEPT + 1):
+    for version in range(1, MAX_ENTRIES + 1):
         statistics.entry("board", version)
     statistics.entry("board", 1).fail(1)
-    statistics.entry("board", KEPT + 1)
+    statistics.entry("board", MAX_ENTRIES + 1)
     kept = statistics.documents("board")
-    assert len(kept) == KEPT
+    assert len(kept) == MAX_ENTRIES
     assert [document["version"] for document in kept[:2]] == ["1", "3"]
     assert statistics.documents("duo") == []
     assert [document["version"] for document in statistics.documents("board", 7)] == ["7"]

@@ -1,4 +1,4 @@
-"""The stock client of the protocol works unmodified: HTTP and gRPC, sync and asyncio, for every tensor type."""
+"""The unmodified client of the protocol: HTTP and gRPC, synchronous and asyncio, with each tensor type."""
 
 import zlib
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ import pytest
 from tritonclient.utils import InferenceServerException
 
 from league.settings import Storage
-from tests.serve_app.inference_protocol.conftest import Address
-from tests.serve_app.inference_protocol.observations import observations, policy_of
-from tests.serve_app.inference_protocol.triton import FORMS, Triton, answered, same
+from tests.support.protocol_observations import observations, policy_of
+from tests.support.protocol_servers import Address
+from tests.support.triton import FORMS, Triton, assert_same, outputs_of
 
 MODELS = ("board", "board.shared", "duo.left", "vector", "nested", "choice", "chess", "pistons", "kinds")
 OUTPUTS = ("action", "action_dist_inputs")
@@ -39,8 +39,8 @@ def over_grpc(request: pytest.FixtureRequest, clients: dict[str, Triton]) -> Tri
     return clients[request.param]
 
 
-def refused(triton: Triton, *arguments: Any, **options: Any) -> str:
-    """The sentence that an inference is refused with, which is never the server's fault."""
+def error_of(triton: Triton, *arguments: Any, **options: Any) -> str:
+    """The message with which an inference is rejected; fails on a server error."""
     with pytest.raises(InferenceServerException) as caught:
         triton.infer(*arguments, **options)
     assert not caught.value.status().startswith("5")
@@ -51,14 +51,14 @@ def refused(triton: Triton, *arguments: Any, **options: Any) -> str:
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("rows", [1, 3])
 @pytest.mark.parametrize("binary", [True, False], ids=["binary", "json"])
-def test_every_tensor_type(triton: Triton, leagues: Storage, model: str, rows: int, binary: bool) -> None:
+def test_each_tensor_type(triton: Triton, leagues: Storage, model: str, rows: int, binary: bool) -> None:
     policy, signature = policy_of(leagues, model)
     arrays = observations(signature, rows)
     expected = policy.distribution(arrays)
     assert expected.dist_inputs is not None
     result = triton.infer(model, arrays, outputs=OUTPUTS, binary=binary)
-    same(result.as_numpy("action"), expected.actions)
-    same(result.as_numpy("action_dist_inputs"), expected.dist_inputs)
+    assert_same(result.as_numpy("action"), expected.actions)
+    assert_same(result.as_numpy("action_dist_inputs"), expected.dist_inputs)
 
 
 @pytest.mark.parametrize(("version", "number"), [("", 1), ("1", 1), ("2", 2), ("3", 3), ("champion", 1)])
@@ -66,29 +66,29 @@ def test_a_version_by_number_or_alias(triton: Triton, leagues: Storage, version:
     policy, signature = policy_of(leagues, "board", number)
     arrays = observations(signature, 8)
     result = triton.infer("board", arrays, version=version, request_id="tick 7")
-    same(result.as_numpy("action"), policy.act(arrays).actions)
+    assert_same(result.as_numpy("action"), policy.act(arrays).actions)
     response = result.get_response() if triton.is_http else result.get_response(as_json=True)
     assert (response["model_name"], response["model_version"], response["id"]) == ("board", str(number), "tick 7")
 
 
-def test_without_names_every_output_is_answered(triton: Triton, leagues: Storage) -> None:
+def test_by_default_all_outputs_are_returned(triton: Triton, leagues: Storage) -> None:
     _, signature = policy_of(leagues, "board")
     result = triton.infer("board", observations(signature, 2))
-    assert all(array is not None for array in answered(result, OUTPUTS).values())
+    assert all(array is not None for array in outputs_of(result, OUTPUTS).values())
 
 
-@pytest.mark.parametrize("wanted", [["action"], ["action_dist_inputs"], ["action_dist_inputs", "action"]])
+@pytest.mark.parametrize("requested", [["action"], ["action_dist_inputs"], ["action_dist_inputs", "action"]])
 @pytest.mark.parametrize("binary", [True, False], ids=["binary", "json"])
-def test_an_output_may_be_left_out(triton: Triton, leagues: Storage, wanted: list[str], binary: bool) -> None:
+def test_outputs_can_be_selected(triton: Triton, leagues: Storage, requested: list[str], binary: bool) -> None:
     _, signature = policy_of(leagues, "board")
-    result = triton.infer("board", observations(signature, 2), outputs=wanted, binary=binary)
-    found = answered(result, OUTPUTS)
-    assert [name for name in OUTPUTS if found[name] is not None] == sorted(wanted)
+    result = triton.infer("board", observations(signature, 2), outputs=requested, binary=binary)
+    found = outputs_of(result, OUTPUTS)
+    assert [name for name in OUTPUTS if found[name] is not None] == sorted(requested)
     response = result.get_response() if triton.is_http else result.get_response(as_json=True)
-    assert [output["name"] for output in response["outputs"]] == wanted
+    assert [output["name"] for output in response["outputs"]] == requested
 
 
-def test_recurrent_state_goes_round(triton: Triton) -> None:
+def test_recurrent_state_is_an_input_and_an_output(triton: Triton) -> None:
     ones, state = np.ones((2, 1), np.float32), {}
     actions = []
     for _ in range(4):
@@ -96,36 +96,36 @@ def test_recurrent_state_goes_round(triton: Triton) -> None:
         state = {"state_in_0": result.as_numpy("state_out_0")}
         actions.append(result.as_numpy("action").tolist())
     assert actions == [[0, 0], [0, 0], [1, 1], [1, 1]]
-    same(state["state_in_0"], np.full((2, 1), 4, np.float32))
-    assert "state_in_<i>" in refused(triton, "memory", {"observation": ones}, sequence_id=7, sequence_start=True)
+    assert_same(state["state_in_0"], np.full((2, 1), 4, np.float32))
+    assert "state_in_<i>" in error_of(triton, "memory", {"observation": ones}, sequence_id=7, sequence_start=True)
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "deflate"])
 @pytest.mark.parametrize("binary", [True, False], ids=["binary", "json"])
-def test_compressed_both_ways(over_http: Triton, leagues: Storage, encoding: str, binary: bool) -> None:
+def test_both_directions_can_be_compressed(over_http: Triton, leagues: Storage, encoding: str, binary: bool) -> None:
     policy, signature = policy_of(leagues, "chess")
     arrays = observations(signature, 2)
     expected = policy.distribution(arrays).dist_inputs
-    # The asyncio client of tritonclient 2.41 fails when it compresses: it does not import gzip.
-    both = {} if over_http.is_async else {"request_compression_algorithm": encoding}
+    # The asyncio client of tritonclient 2.41 cannot compress requests: it does not import gzip.
+    options = {} if over_http.is_async else {"request_compression_algorithm": encoding}
     result = over_http.infer(
-        "chess", arrays, outputs=OUTPUTS, binary=binary, response_compression_algorithm=encoding, **both
+        "chess", arrays, outputs=OUTPUTS, binary=binary, response_compression_algorithm=encoding, **options
     )
     assert expected is not None
-    same(result.as_numpy("action_dist_inputs"), expected)
+    assert_same(result.as_numpy("action_dist_inputs"), expected)
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "deflate"])
-def test_compressed_calls(over_grpc: Triton, leagues: Storage, encoding: str) -> None:
+def test_calls_can_be_compressed(over_grpc: Triton, leagues: Storage, encoding: str) -> None:
     policy, signature = policy_of(leagues, "pistons")
     arrays = observations(signature, 2)
     result = over_grpc.infer("pistons", arrays, compression_algorithm=encoding)
-    same(result.as_numpy("action"), policy.act(arrays).actions)
+    assert_same(result.as_numpy("action"), policy.act(arrays).actions)
 
 
 def test_health(triton: Triton) -> None:
-    assert triton.ask("is_server_live")
-    assert triton.ask("is_server_ready")
+    assert triton.call("is_server_live")
+    assert triton.call("is_server_ready")
     for model, version, is_ready in [
         ("board", "", True),
         ("board", "3", True),
@@ -138,16 +138,16 @@ def test_health(triton: Triton) -> None:
         ("duo", "", False),
         ("duo.right", "", True),
     ]:
-        assert triton.ask("is_model_ready", model, version) is is_ready, (model, version)
+        assert triton.call("is_model_ready", model, version) is is_ready, (model, version)
 
 
-def test_the_server_says_what_it_is(triton: Triton) -> None:
+def test_the_server_has_metadata(triton: Triton) -> None:
     metadata = triton.document("get_server_metadata")
     assert metadata["name"] == "policy-league"
     assert {"binary_tensor_data", "statistics"} <= set(metadata["extensions"])
 
 
-def test_a_model_s_metadata_and_configuration(triton: Triton) -> None:
+def test_a_model_has_metadata_and_a_configuration(triton: Triton) -> None:
     metadata = triton.document("get_model_metadata", "board", "champion")
     assert (metadata["name"], metadata["versions"]) == ("board", ["1", "2", "3"])
     shapes = [
@@ -167,7 +167,7 @@ def test_a_model_s_metadata_and_configuration(triton: Triton) -> None:
     ]
 
 
-def test_the_index_lists_every_version(triton: Triton) -> None:
+def test_the_index_lists_all_versions(triton: Triton) -> None:
     index = triton.document("get_model_repository_index")
     models = index if triton.is_http else index["models"]
     found = {(model["name"], model["version"]): model["state"] for model in models}
@@ -181,18 +181,21 @@ def test_statistics_count_rows_and_runs(triton: Triton, leagues: Storage) -> Non
         (entry,) = triton.document("get_inference_statistics", "vector", "1")["model_stats"]
         inferred = entry["inference_stats"]
         numbers = [entry.get("inference_count", 0), entry.get("execution_count", 0)]
-        return [int(number) for number in (*numbers, *(inferred[of].get("count", 0) for of in ("success", "fail")))]
+        return [
+            int(number)
+            for number in (*numbers, *(inferred[outcome].get("count", 0) for outcome in ("success", "fail")))
+        ]
 
     _, signature = policy_of(leagues, "vector")
     before = count()
     for rows in (1, 5):
         triton.infer("vector", observations(signature, rows))
-    refused(triton, "vector", {"observation": np.zeros((1, 3), np.float32)})
+    error_of(triton, "vector", {"observation": np.zeros((1, 3), np.float32)})
     assert [after - earlier for after, earlier in zip(count(), before, strict=True)] == [6, 2, 2, 1]
 
 
 @pytest.mark.parametrize(
-    ("model", "version", "words"),
+    ("model", "version", "message"),
     [
         ("nobody", "", "nobody"),
         ("Board", "", "must consist of"),
@@ -200,19 +203,19 @@ def test_statistics_count_rows_and_runs(triton: Triton, leagues: Storage) -> Non
         ("duo", "", "several policies"),
         ("board", "99", "no version 99"),
         ("board", "rival", "no alias 'rival'"),
-        ("empty", "", "no champion yet"),
+        ("empty", "", "has no champion"),
     ],
 )
-def test_a_model_that_is_not_there(triton: Triton, leagues: Storage, model: str, version: str, words: str) -> None:
+def test_an_unknown_model_is_reported(triton: Triton, leagues: Storage, model: str, version: str, message: str) -> None:
     _, signature = policy_of(leagues, "board")
     with pytest.raises(InferenceServerException) as caught:
         triton.infer(model, observations(signature, 1), version=version)
-    assert words in caught.value.message()
+    assert message in caught.value.message()
 
 
 BAD_TENSORS: dict[str, tuple[dict[str, Any], str]] = {
     "a missing input": ({"action_mask": None}, "input action_mask is missing"),
-    "another name": ({"action_mask": None, "mask": np.ones((2, 7), np.int8)}, "no input 'mask'"),
+    "another name": ({"action_mask": None, "mask": np.ones((2, 7), np.int8)}, "unknown input 'mask'"),
     "another datatype": ({"action_mask": np.ones((2, 7), np.float32)}, "has datatype FP32, expected INT8"),
     "a half for a byte": ({"action_mask": np.ones((2, 7), np.float16)}, "has datatype FP16, expected INT8"),
     "strings": ({"action_mask": np.full((2, 7), b"1", object)}, "has datatype BYTES, expected INT8"),
@@ -228,45 +231,45 @@ BAD_TENSORS: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", BAD_TENSORS)
 @pytest.mark.parametrize("binary", [True, False], ids=["binary", "json"])
-def test_bad_tensors_are_refused_in_a_sentence(triton: Triton, leagues: Storage, name: str, binary: bool) -> None:
-    changes, words = BAD_TENSORS[name]
+def test_invalid_tensors_are_rejected(triton: Triton, leagues: Storage, name: str, binary: bool) -> None:
+    changes, message = BAD_TENSORS[name]
     _, signature = policy_of(leagues, "board")
     arrays = {of: array for of, array in (observations(signature, 2) | changes).items() if array is not None}
-    assert words in refused(triton, "board", arrays, binary=binary)
+    assert message in error_of(triton, "board", arrays, binary=binary)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_are_finite(triton: Triton, value: float) -> None:
-    assert "finite" in refused(triton, "vector", {"observation": np.array([[0, value]], np.float32)})
+def test_numbers_must_be_finite(triton: Triton, value: float) -> None:
+    assert "finite" in error_of(triton, "vector", {"observation": np.array([[0, value]], np.float32)})
 
 
-def test_a_discrete_observation_stays_in_its_range(triton: Triton) -> None:
-    assert "between 0 and 3" in refused(triton, "choice", {"observation": np.array([4])})
+def test_a_discrete_observation_must_be_in_range(triton: Triton) -> None:
+    assert "between 0 and 3" in error_of(triton, "choice", {"observation": np.array([4])})
 
 
-def test_an_unknown_output_is_refused(triton: Triton, leagues: Storage) -> None:
+def test_an_unknown_output_is_rejected(triton: Triton, leagues: Storage) -> None:
     _, signature = policy_of(leagues, "board")
     arrays = observations(signature, 1)
-    assert "no output 'value', expected action" in refused(triton, "board", arrays, outputs=["value"])
-    assert "asked for twice" in refused(triton, "board", arrays, outputs=["action", "action"])
+    assert "unknown output 'value', expected action" in error_of(triton, "board", arrays, outputs=["value"])
+    assert "requested twice" in error_of(triton, "board", arrays, outputs=["action", "action"])
 
 
-def test_a_bomb_is_not_blown_up(clients: dict[str, Triton]) -> None:
+def test_a_decompression_bomb_is_rejected(clients: dict[str, Triton]) -> None:
     limit = 512 * 1024
     huge = np.zeros((8, limit // 2), np.int8)
-    message = refused(clients["http"], "board", {"observation": huge}, request_compression_algorithm="gzip")
-    assert f"larger than {limit} bytes when it is decompressed" in message
+    message = error_of(clients["http"], "board", {"observation": huge}, request_compression_algorithm="gzip")
+    assert f"decompressed body is larger than {limit} bytes" in message
     assert len(zlib.compress(huge.tobytes())) < limit // 50
 
 
-def test_what_is_not_offered_is_refused(triton: Triton, leagues: Storage) -> None:
+def test_unsupported_features_are_rejected(triton: Triton, leagues: Storage) -> None:
     tensor = triton.module.InferInput("observation", [1, 2], "FP32")
     tensor.set_shared_memory("region", 8)
-    with pytest.raises(InferenceServerException, match="shared_memory_region, which this server does not offer"):
-        triton.ask("infer", "vector", [tensor])
+    with pytest.raises(InferenceServerException, match="shared_memory_region, which this server does not support"):
+        triton.call("infer", "vector", [tensor])
     classes = triton.module.InferRequestedOutput("action", class_count=2)
     _, signature = policy_of(leagues, "vector")
     tensor = triton.module.InferInput("observation", [1, 2], "FP32")
     tensor.set_data_from_numpy(observations(signature, 1)["observation"])
-    with pytest.raises(InferenceServerException, match="classification, which this server does not offer"):
-        triton.ask("infer", "vector", [tensor], outputs=[classes])
+    with pytest.raises(InferenceServerException, match="classification, which this server does not support"):
+        triton.call("infer", "vector", [tensor], outputs=[classes])

@@ -1,4 +1,4 @@
-"""The description is a valid OpenAPI document, of the routes that there are, with the errors that they have."""
+"""The OpenAPI document is valid and describes all routes with their scopes and error codes."""
 
 import re
 from collections.abc import Iterator
@@ -13,11 +13,11 @@ from starlette.testclient import TestClient
 
 from league.errors import LeagueError
 from league.registry.registry import Registry
-from serve_app.app import Server
-from serve_app.error_handlers import CODES, status_of
+from serve_app.access.errors import CODES, status_of
+from serve_app.access.permissions import for_request
+from serve_app.app import Replica
 from serve_app.openapi.document import document
-from serve_app.permissions import of_request
-from tests.serve_app.conftest import QUICK
+from tests.support.replicas import QUICK
 
 ROOT = Path(__file__).parents[3]
 NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion", "evaluation": "1", "game": "0"}
@@ -25,59 +25,59 @@ NAMES |= {"verdict": "v", "schedule": "s", "position": "0", "run": "r"}
 
 
 @pytest.fixture(scope="module")
-def described() -> dict[str, Any]:
-    """What a stranger is told."""
+def openapi() -> dict[str, Any]:
+    """The document without examples of served policies."""
     return document(QUICK, [])
 
 
-def operations(described: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    for path, item in described["paths"].items():
+def operations(openapi: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for path, item in openapi["paths"].items():
         for method in item.keys() - {"parameters"}:
             yield path, method.upper(), item[method]
 
 
-def resolved(described: dict[str, Any], node: Any) -> Any:
+def resolved(openapi: dict[str, Any], node: Any) -> Any:
     while "$ref" in node:
-        target = described
+        target = openapi
         for part in node["$ref"].removeprefix("#/").split("/"):
             target = target[part]
         node = target
     return node
 
 
-def test_it_is_valid(described: dict[str, Any]) -> None:
-    OpenAPIV31SpecValidator(described).validate()
+def test_it_is_valid(openapi: dict[str, Any]) -> None:
+    OpenAPIV31SpecValidator(openapi).validate()
 
 
-def test_it_describes_every_route_and_no_other(described: dict[str, Any], registry: Registry) -> None:
+def test_it_describes_exactly_the_routes(openapi: dict[str, Any], registry: Registry) -> None:
     routes = set()
-    for route in Server(registry, QUICK, "replica-1").application().routes:
+    for route in Replica(registry, QUICK, "replica-1").application().routes:
         assert isinstance(route, Route | WebSocketRoute)
         if not getattr(route, "include_in_schema", True):
-            continue  # the pages, which are for people
+            continue  # web pages
         methods = {"GET"} if isinstance(route, WebSocketRoute) else (route.methods or set()) - {"HEAD"}
         routes |= {(route.path, method) for method in methods}
-    assert {(path, method) for path, method, _ in operations(described)} == routes
+    assert {(path, method) for path, method, _ in operations(openapi)} == routes
 
 
-def test_it_names_the_scope_that_each_request_needs(described: dict[str, Any]) -> None:
-    for path, method, operation in operations(described):
+def test_it_names_the_required_scope_of_each_operation(openapi: dict[str, Any]) -> None:
+    for path, method, operation in operations(openapi):
         kind = "websocket" if "101" in operation["responses"] else "http"
-        need = of_request(kind, method, path.format(**NAMES))
+        need = for_request(kind, method, path.format(**NAMES))
         assert operation.get("x-scope") == need.scope, path
-        security = operation.get("security", described["security"])
+        security = operation.get("security", openapi["security"])
         assert security == ([] if need.scope is None else security), path
         assert ({} not in security and bool(security)) == need.is_change, path
 
 
-def test_parameters_are_those_of_the_path(described: dict[str, Any]) -> None:
-    for path, item in described["paths"].items():
-        named = [resolved(described, each) for each in item.get("parameters", [])]
+def test_parameters_are_those_of_the_path(openapi: dict[str, Any]) -> None:
+    for path, item in openapi["paths"].items():
+        named = [resolved(openapi, each) for each in item.get("parameters", [])]
         assert [each["name"] for each in named] == re.findall(r"{(\w+)}", path)
 
 
-def codes_of(described: dict[str, Any], response: Any) -> list[str]:
-    schema = resolved(described, response).get("content", {}).get("application/json", {}).get("schema", {})
+def codes_of(openapi: dict[str, Any], response: Any) -> list[str]:
+    schema = resolved(openapi, response).get("content", {}).get("application/json", {}).get("schema", {})
     parts = [part for part in schema.get("allOf", []) if "code" in part.get("properties", {})]
     return parts[0]["properties"]["code"]["enum"] if parts else []
 
@@ -88,62 +88,62 @@ def subclasses(error: type[LeagueError]) -> Iterator[type[LeagueError]]:
         yield from subclasses(each)
 
 
-def test_each_code_stands_under_its_status(described: dict[str, Any]) -> None:
+def test_each_code_is_listed_under_its_status(openapi: dict[str, Any]) -> None:
     statuses = {each.code: status_of(each()) for each in subclasses(LeagueError) if each.__init__ is Exception.__init__}
     statuses |= {code: status for status, code in CODES.items()} | {"internal_error": 500, "rate_limited": 429}
-    told = set()
-    for path, _, operation in operations(described):
+    documented = set()
+    for path, _, operation in operations(openapi):
         for status, response in operation["responses"].items():
-            for code in codes_of(described, response):
+            for code in codes_of(openapi, response):
                 assert statuses[code] == int(status), (path, code)
-                told.add(code)
-    serving = {error.code for error in subclasses(LeagueError) if error.__module__ == "serve_app.error_handlers"}
-    assert serving <= told
-    assert {"invalid_state", "version_retired", "overloaded", "rate_limited", "alias_moved"} <= told
+                documented.add(code)
+    serving = {error.code for error in subclasses(LeagueError) if error.__module__ == "serve_app.access.errors"}
+    assert serving <= documented
+    assert {"invalid_state", "version_retired", "overloaded", "rate_limited", "alias_moved"} <= documented
 
 
-def test_general_examples_fit_their_schemas(described: dict[str, Any]) -> None:
-    """Whether a policy takes them is another question: they are of no league."""
-    seen = 0
-    for _, _, operation in operations(described):
+def test_general_examples_fit_their_schemas(openapi: dict[str, Any]) -> None:
+    """These examples belong to no league, so that they are only checked against the schemas."""
+    count = 0
+    for _, _, operation in operations(openapi):
         content = operation.get("requestBody", {}).get("content", {}).get("application/json")
         for example in (content or {}).get("examples", {}).values():
-            schema = content["schema"] | {"components": described["components"]}
+            schema = content["schema"] | {"components": openapi["components"]}
             Draft202012Validator(schema).validate(example["value"])
-            seen += 1
-    assert seen > 8
+            count += 1
+    assert count > 8
 
 
-def test_examples_of_answers_fit_their_schemas(described: dict[str, Any]) -> None:
-    seen = 0
-    for _, _, operation in operations(described):
+def test_examples_of_responses_fit_their_schemas(openapi: dict[str, Any]) -> None:
+    count = 0
+    for _, _, operation in operations(openapi):
         content = operation["responses"].get("200", {}).get("content", {}).get("application/json", {})
         for example in content.get("examples", {}).values():
-            schema = content["schema"] | {"components": described["components"]}
-            Draft202012Validator(schema).validate(resolved(described, example)["value"])
-            seen += 1
-    assert seen > 8
+            schema = content["schema"] | {"components": openapi["components"]}
+            Draft202012Validator(schema).validate(resolved(openapi, example)["value"])
+            count += 1
+    assert count > 8
 
 
-def test_it_says_the_limits(described: dict[str, Any]) -> None:
-    assert f"{QUICK.max_body:,} bytes and {QUICK.max_batch} observations" in described["info"]["description"]
-    batch = described["components"]["schemas"]["ActionRequest"]["properties"]["observations"]
+def test_it_contains_the_limits(openapi: dict[str, Any]) -> None:
+    assert f"{QUICK.max_body:,} bytes and {QUICK.max_batch} observations" in openapi["info"]["description"]
+    batch = openapi["components"]["schemas"]["ActionRequest"]["properties"]["observations"]
     assert batch["maxItems"] == QUICK.max_batch
 
 
-def test_what_is_described_once_is_not_changed(described: dict[str, Any], unchanging: TestClient) -> None:
-    assert unchanging.get("/openapi.json").json() != described
-    assert document(QUICK, []) == described
+def test_the_cached_source_is_not_modified(openapi: dict[str, Any], read_only_client: TestClient) -> None:
+    assert read_only_client.get("/openapi.json").json() != openapi
+    assert document(QUICK, []) == openapi
 
 
-def test_the_page_on_http_has_the_same_codes(described: dict[str, Any]) -> None:
+def test_docs_http_md_lists_the_same_codes(openapi: dict[str, Any]) -> None:
     text = (ROOT / "docs" / "http.md").read_text()
     rows = re.findall(r"^\| (\d{3}) \| (.*) \|$", text, flags=re.M)
     written = {(int(status), code) for status, codes in rows for code in re.findall(r"`([a-z_]+)`", codes)}
-    told = {
+    documented = {
         (int(status), code)
-        for _, _, operation in operations(described)
+        for _, _, operation in operations(openapi)
         for status, response in operation["responses"].items()
-        for code in codes_of(described, response)
+        for code in codes_of(openapi, response)
     }
-    assert written == told | {(405, "method_not_allowed")}
+    assert written == documented | {(405, "method_not_allowed")}

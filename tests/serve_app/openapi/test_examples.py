@@ -1,4 +1,4 @@
-"""The examples of the policies that are served are answered by them."""
+"""The generated examples are valid requests for the served policies."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,10 +9,10 @@ from starlette.testclient import TestClient
 
 from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
-from serve_app.observations import ObservationReader
-from serve_app.openapi.examples import observation
-from tests.serve_app.conftest import QUICK, replica
-from tests.serve_app.inference_protocol.leagues import every_kind
+from serve_app.codecs.observation_codec import ObservationReader
+from serve_app.openapi.document import observation
+from tests.support.protocol_leagues import every_kind
+from tests.support.replicas import QUICK, replica
 
 
 @pytest.fixture(scope="module")
@@ -29,25 +29,25 @@ def examples(client: TestClient, path: str) -> dict[str, Any]:
     return {each["x-model"]: each["value"] for each in every if "x-model" in each}
 
 
-def test_every_policy_that_is_served_has_an_example_which_it_answers(kinds: TestClient) -> None:
-    shown = examples(kinds, "/v1/policies/{model}/action")
-    assert set(shown) == {
+def test_each_served_policy_has_a_valid_action_example(kinds: TestClient) -> None:
+    found = examples(kinds, "/v1/policies/{model}/action")
+    assert set(found) == {
         *("board", "memory", "vector", "nested", "kinds", "chess", "pistons", "choice", "duo.left", "duo.right")
     }
-    for model, body in shown.items():
+    for model, body in found.items():
         reply = kinds.post(f"/v1/policies/{model}/action", json=body)
         assert reply.status_code == 200, (model, reply.text)
-    assert "png" in shown["pistons"]["observation"]
-    assert "b64" in shown["chess"]["observation"]["observation"]
-    assert "state" in shown["memory"]
+    assert "png" in found["pistons"]["observation"]
+    assert "b64" in found["chess"]["observation"]["observation"]
+    assert "state" in found["memory"]
 
 
 @pytest.mark.parametrize("at", ["", "/versions/{version}"])
-def test_so_does_inference_where_a_person_can_read_it(kinds: TestClient, at: str) -> None:
-    shown = examples(kinds, "/v2/models/{model}" + at + "/infer")
-    assert {"board", "kinds", "duo.left"} <= set(shown)
-    assert not {"chess", "pistons"} & set(shown)
-    for model, body in shown.items():
+def test_policies_with_small_inputs_have_a_valid_inference_example(kinds: TestClient, at: str) -> None:
+    found = examples(kinds, "/v2/models/{model}" + at + "/infer")
+    assert {"board", "kinds", "duo.left"} <= set(found)
+    assert not {"chess", "pistons"} & set(found)
+    for model, body in found.items():
         reply = kinds.post("/v2/models/" + model + at.format(version=1) + "/infer", json=body)
         assert reply.status_code == 200, (model, reply.text)
 

@@ -1,4 +1,4 @@
-"""DQN in this process: it learns what can be learned, with each of its parts, and goes on exactly where it was."""
+"""DQN in this process: it learns, with each of its parts, and continues exactly from its checkpoint."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,34 +14,35 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
-from tests.training.environments import ROUNDS
-from tests.training.leagues import by_values, solvable
-from training import parity
-from training.algorithms.dispatch import algorithm_config, module_spec
+from tests.support.training_environments import ROUNDS
+from tests.support.training_leagues import solvable, solvable_by_dqn
 from training.algorithms.off_policy import OffPolicy
-from training.export import export_policy
+from training.algorithms.setup import algorithm_config, module_spec
+from training.export import parity
+from training.export.onnx_export import export_policy
 from training.learners import dqn as learning
-from training.learners.q_targets import next_actions
-from training.modules.acting import MASKED
-from training.sampling.closed import TERMINATED, TRUNCATED, OwnTransitions
+from training.learners.off_policy import next_actions
+from training.modules.policy_module import MASKED_LOGIT
+from training.replay_buffer import ReplayBuffer
+from training.sampling.closed_transitions import TERMINATED, TRUNCATED, PolicyTransitions
 
 pytestmark = pytest.mark.usefixtures("ray_session")
 RETURN = 1 / (1 - 0.9)
-EVERYTHING = {"n_step": 3, "priorities": {}, "noisy": True, "distributional": {"low": -1, "high": 5}}
+ALL_EXTENSIONS = {"n_step": 3, "priorities": {}, "noisy": True, "distributional": {"low": -1, "high": 5}}
 
 
-def built(league: LeagueConfig) -> OffPolicy:
+def build(league: LeagueConfig) -> OffPolicy:
     algorithm = algorithm_config(league, interface(league)).build_algo()
-    algorithm.begin_anew(0)
+    algorithm.reset_episodes(0)
     return algorithm
 
 
-def trained(league: LeagueConfig, updates: int, look: Callable[[OffPolicy, dict[str, Any]], Any]) -> Any:
-    algorithm = built(league)
+def train(league: LeagueConfig, updates: int, inspect_algorithm: Callable[[OffPolicy, dict[str, Any]], Any]) -> Any:
+    algorithm = build(league)
     try:
         for _ in range(updates):
             result = algorithm.train()
-        return look(algorithm, result)
+        return inspect_algorithm(algorithm, result)
     finally:
         algorithm.stop()
 
@@ -52,33 +53,39 @@ def returns(_: OffPolicy, result: dict[str, Any]) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"double": False, "dueling": False}, EVERYTHING, {"target_every": 1, "target_rate": 0.02}],
-    ids=["plain", "single", "all parts", "Polyak"],
+    [
+        pytest.param({}, marks=pytest.mark.slow, id="plain"),
+        pytest.param({"double": False, "dueling": False}, marks=pytest.mark.slow, id="single"),
+        pytest.param(ALL_EXTENSIONS, id="all extensions"),
+        pytest.param({"target_every": 1, "target_rate": 0.02}, marks=pytest.mark.slow, id="Polyak"),
+    ],
 )
-def test_it_learns(settings: dict[str, Any]) -> None:
-    assert trained(by_values("discrete", **settings), 9, returns)["shared"] > 0.9 * ROUNDS
+def test_dqn_learns(settings: dict[str, Any]) -> None:
+    assert train(solvable_by_dqn("discrete", **settings), 9, returns)["shared"] > 0.9 * ROUNDS
 
 
-def test_independent_policies_learn_each_its_own() -> None:
-    league = by_values("discrete", {"agents": 2, "opposed": True}, {"a": ["player_0"], "b": ["player_1"]})
-    found = trained(league, 10, returns)
-    assert found["a"] > 0.85 * ROUNDS
-    assert found["b"] > -0.15 * ROUNDS
+@pytest.mark.slow
+def test_independent_policies_learn_opposed_tasks() -> None:
+    league = solvable_by_dqn("discrete", {"agents": 2, "opposed": True}, {"a": ["player_0"], "b": ["player_1"]})
+    means = train(league, 10, returns)
+    assert means["a"] > 0.85 * ROUNDS
+    assert means["b"] > -0.15 * ROUNDS
 
 
 def values_of(algorithm: OffPolicy, _: Any) -> NDArray:
-    """What the only state is worth by each action, masked."""
+    """The masked values of the actions in the only state."""
     module = algorithm.learner_group._learner.module["shared"]
-    seen = {"observation": torch.ones(1, 1), "action_mask": torch.tensor([[1, 0, 1]])}
-    return module.forward_inference({"obs": seen})["action_dist_inputs"].numpy()[0]
+    observation = {"observation": torch.ones(1, 1), "action_mask": torch.tensor([[1, 0, 1]])}
+    return module.forward_inference({"obs": observation})["action_dist_inputs"].numpy()[0]
 
 
 def check_values(n_step: int = 1) -> None:
-    """An agent that is truncated could have gone on: the state is worth what it is worth for ever, and an illegal
-    action that seems to be worth a million counts for nothing."""
-    league = by_values("masked", gamma=0.9, n_step=n_step, exploration={"initial": 0.5, "final": 0.5})
+    """The value of the state is that of an endless episode, as truncation is bootstrapped. The large value of an
+    illegal action is ignored.
+    """
+    league = solvable_by_dqn("masked", gamma=0.9, n_step=n_step, exploration={"initial": 0.5, "final": 0.5})
 
-    def look(algorithm: OffPolicy, _: Any) -> NDArray:
+    def inspect_algorithm(algorithm: OffPolicy, _: Any) -> NDArray:
         learner = algorithm.learner_group._learner
         for network in (learner.module["shared"], learner.targets["shared"]):
             with torch.no_grad():
@@ -87,42 +94,42 @@ def check_values(n_step: int = 1) -> None:
             result = algorithm.train()
         return values_of(algorithm, result)
 
-    found = trained(league, 1, look)
-    assert found[1] == MASKED
+    found = train(league, 1, inspect_algorithm)
+    assert found[1] == MASKED_LOGIT
     np.testing.assert_allclose(found[[0, 2]], RETURN, rtol=0.1)
 
 
-@pytest.mark.parametrize("n_step", [1, 3])
-def test_values_are_those_of_legal_play_that_goes_on(n_step: int) -> None:
+@pytest.mark.parametrize("n_step", [pytest.param(1, marks=pytest.mark.slow), 3])
+def test_values_bootstrap_truncation_and_ignore_illegal_actions(n_step: int) -> None:
     check_values(n_step)
 
 
-def test_the_check_sees_truncation_taken_for_termination(monkeypatch: pytest.MonkeyPatch) -> None:
-    cut = OwnTransitions.cut
+def test_the_check_detects_truncation_treated_as_termination(monkeypatch: pytest.MonkeyPatch) -> None:
+    cut = PolicyTransitions.cut
 
-    def as_terminated(self: OwnTransitions) -> Any:
+    def as_terminated(self: PolicyTransitions) -> Any:
         blocks = cut(self)
         for block in blocks.values():
             block.rows[TERMINATED] = block.rows[TERMINATED] | block.rows[TRUNCATED]
         return blocks
 
-    monkeypatch.setattr(OwnTransitions, "cut", as_terminated)
+    monkeypatch.setattr(PolicyTransitions, "cut", as_terminated)
     with pytest.raises(AssertionError):
         check_values()
 
 
-def test_the_check_sees_targets_without_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_check_detects_targets_without_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "next_actions", lambda online, target, _: next_actions(online, target, None))
     with pytest.raises(AssertionError):
         check_values()
 
 
-def test_what_begins_anew_at_the_same_step_goes_on_alike(tmp_path: Path) -> None:
-    """One that went on from its checkpoint, and one that was restored from it: weights, targets, and what is kept."""
-    league = by_values("discrete", **EVERYTHING, replay_capacity=900)
+def test_a_restored_algorithm_continues_identically(tmp_path: Path) -> None:
+    """Compares an algorithm that continues after its checkpoint with a restored one: weights, targets and buffer."""
+    league = solvable_by_dqn("discrete", **ALL_EXTENSIONS, replay_capacity=900)
 
-    def after(algorithm: OffPolicy) -> list[NDArray]:
-        algorithm.begin_anew(2048)
+    def state_after(algorithm: OffPolicy) -> list[NDArray]:
+        algorithm.reset_episodes(2048)
         for _ in range(2):
             algorithm.train()
         learner = algorithm.learner_group._learner
@@ -132,24 +139,24 @@ def test_what_begins_anew_at_the_same_step_goes_on_alike(tmp_path: Path) -> None
 
     def save(algorithm: OffPolicy, _: Any) -> list[NDArray]:
         algorithm.save_to_path(str(tmp_path / "checkpoint"))
-        return after(algorithm)
+        return state_after(algorithm)
 
-    expected = trained(league, 2, save)
+    expected = train(league, 2, save)
     torch.manual_seed(77)
-    restored = built(league)
+    restored = build(league)
     try:
         restored.restore_from_path(str(tmp_path / "checkpoint"))
-        found = after(restored)
+        found = state_after(restored)
     finally:
         restored.stop()
     for before, now in zip(expected, found, strict=True):
         np.testing.assert_array_equal(before, now)
 
 
-def test_a_buffer_that_is_left_out_begins_empty(tmp_path: Path) -> None:
-    league = by_values("discrete", replay_in_checkpoint=False)
-    trained(league, 1, lambda algorithm, _: algorithm.save_to_path(str(tmp_path / "checkpoint")))
-    restored = built(league)
+def test_a_buffer_that_is_not_saved_is_empty_after_restoring(tmp_path: Path) -> None:
+    league = solvable_by_dqn("discrete", replay_in_checkpoint=False)
+    train(league, 1, lambda algorithm, _: algorithm.save_to_path(str(tmp_path / "checkpoint")))
+    restored = build(league)
     try:
         restored.restore_from_path(str(tmp_path / "checkpoint"))
         assert (len(restored.replays["shared"]), restored.steps) == (0, 1024)
@@ -157,10 +164,10 @@ def test_a_buffer_that_is_left_out_begins_empty(tmp_path: Path) -> None:
         restored.stop()
 
 
-def test_a_buffer_of_another_capacity_is_refused(tmp_path: Path) -> None:
-    league = by_values("discrete")
-    trained(league, 1, lambda algorithm, _: algorithm.save_to_path(str(tmp_path / "checkpoint")))
-    restored = built(league.with_training(replay_capacity=5000))
+def test_a_buffer_of_another_capacity_is_rejected(tmp_path: Path) -> None:
+    league = solvable_by_dqn("discrete")
+    train(league, 1, lambda algorithm, _: algorithm.save_to_path(str(tmp_path / "checkpoint")))
+    restored = build(league.with_training(replay_capacity=5000))
     try:
         with pytest.raises(
             ConfigError, match=r"training\.replay_capacity: the checkpoint's buffer has 100000, got 5000"
@@ -170,31 +177,47 @@ def test_a_buffer_of_another_capacity_is_refused(tmp_path: Path) -> None:
         restored.stop()
 
 
-def test_exploration_and_priorities_follow_their_schedules() -> None:
-    league = by_values("discrete", steps=4096, priorities={"beta": 0.4}, exploration={"steps": 2048, "final": 0.1})
+def test_exploration_and_priorities_follow_their_schedules(monkeypatch: pytest.MonkeyPatch) -> None:
+    league = solvable_by_dqn(
+        "discrete", steps=4096, priorities={"beta": 0.4}, exploration={"steps": 2048, "final": 0.1}
+    )
 
-    def look(algorithm: OffPolicy, result: dict[str, Any]) -> tuple[float, float, float]:
+    def inspect_algorithm(algorithm: OffPolicy, result: dict[str, Any]) -> tuple[float, float, float]:
         return algorithm.steps, result["exploration"], algorithm._beta
 
-    assert trained(league, 1, look) == (1024, pytest.approx(0.55), pytest.approx(0.55))
-    assert trained(league, 3, look) == (3072, pytest.approx(0.1), pytest.approx(0.85))
+    betas: list[float] = []
+    sample = ReplayBuffer.sample
+
+    def record_beta(self: ReplayBuffer, *arguments: Any, beta: float = 1.0, **options: Any) -> Any:
+        betas.append(beta)
+        return sample(self, *arguments, beta=beta, **options)
+
+    monkeypatch.setattr(ReplayBuffer, "sample", record_beta)
+    assert train(league, 1, inspect_algorithm) == (1024, pytest.approx(0.55), pytest.approx(0.55))
+    assert betas == sorted(betas)
+    assert 0.4 < betas[0] < 0.5 < betas[-1] == pytest.approx(0.55)
+    assert train(league, 3, inspect_algorithm) == (3072, pytest.approx(0.1), pytest.approx(0.85))
 
 
-@pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["plain", "all parts"])
-def test_the_graph_acts_as_the_module_does_without_its_noise(settings: dict[str, Any], tmp_path: Path) -> None:
-    league = by_values("masked", **settings)
-    described = interface(league)
-    module = module_spec(league.training, described).build()["shared"]
-    export_policy(module, described.of_policy("shared"), tmp_path / "shared.onnx")
-    met = parity.gather(league.environment, described, {"shared": module}, seed=1)["shared"]
-    proof = parity.prove(tmp_path / "shared.onnx", "shared", module, met, described.of_policy("shared").action)
+@pytest.mark.parametrize("settings", [{}, ALL_EXTENSIONS], ids=["plain", "all extensions"])
+def test_the_graph_equals_the_module_without_noise(settings: dict[str, Any], tmp_path: Path) -> None:
+    league = solvable_by_dqn("masked", **settings)
+    interface_of_league = interface(league)
+    module = module_spec(league.training, interface_of_league).build()["shared"]
+    export_policy(module, interface_of_league.of_policy("shared"), tmp_path / "shared.onnx")
+    observed = parity.collect_observations(league.environment, interface_of_league, {"shared": module}, seed=1)[
+        "shared"
+    ]
+    proof = parity.check_parity(
+        tmp_path / "shared.onnx", "shared", module, observed, interface_of_league.of_policy("shared").action
+    )
     assert (proof.mismatches, proof.max_difference < 1e-5) == (0, True)
-    graph = OnnxPolicy(tmp_path / "shared.onnx").distribution(met[0].observations)
-    assert (graph.dist_inputs[:, 1] == np.float32(MASKED)).all()
+    graph = OnnxPolicy(tmp_path / "shared.onnx").distribution(observed[0].observations)
+    assert (graph.dist_inputs[:, 1] == np.float32(MASKED_LOGIT)).all()
     assert (graph.actions != 1).all()
 
 
-def test_actions_that_have_no_values_are_refused_with_what_to_do() -> None:
+def test_actions_without_values_are_rejected() -> None:
     league = solvable("numbers")
     with pytest.raises(ConfigError, match=r"policies\.shared: dqn needs Discrete actions, got .*: train it with"):
-        algorithm_config(by_values("numbers"), interface(league))
+        algorithm_config(solvable_by_dqn("numbers"), interface(league))

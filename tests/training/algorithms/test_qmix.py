@@ -1,4 +1,4 @@
-"""QMIX in this process: it finds what a sum of values cannot say, remembers, and goes on exactly where it was."""
+"""QMIX in this process: it solves what a sum of values cannot represent, and continues exactly from its checkpoint."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,41 +15,41 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
-from tests.training.environments import ROUNDS
-from tests.training.leagues import by_values
-from training import parity
-from training.algorithms.dispatch import algorithm_config, module_spec
+from tests.support.training_environments import ROUNDS
+from tests.support.training_leagues import solvable_by_dqn
 from training.algorithms.off_policy import OffPolicy
-from training.export import export_policy, graph_tensors, state_names
+from training.algorithms.setup import algorithm_config, module_spec
+from training.export import parity
+from training.export.onnx_export import export_policy, graph_tensors, state_names
 from training.learners import qmix as learning
-from training.learners.q_targets import next_actions
-from training.modules.acting import ACTED, MASKED
-from training.modules.mixer import MonotonicMixer
-from training.sampling.closed import JOINT, PRESENT, STATE, TERMINATED, TRUNCATED, JointTransitions
+from training.learners.off_policy import next_actions
+from training.modules.policy_module import MASKED_LOGIT, PREVIOUS_ACTION
+from training.modules.qmix import MonotonicMixer
+from training.sampling.closed_transitions import JOINT, PRESENT, STATE, TERMINATED, TRUNCATED, JointTransitions
 
 pytestmark = pytest.mark.usefixtures("ray_session")
 MEMORY = {"recurrence": {"width": 16, "sequence": 3}, "batch_size": 32, "hidden": [16]}
-Look = Callable[[OffPolicy, dict[str, Any]], Any]
+Inspect = Callable[[OffPolicy, dict[str, Any]], Any]
 
 
-def mixed(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
-    """One of `tests.training.environments`, all agents on one team."""
+def qmix_league(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
+    """An environment of `tests.support.training_environments`, with all agents in one team."""
     settings = {"algorithm": "qmix", "groups": {"team": ["*"]}, "mixing_width": 8}
-    return by_values(name, kwargs, policies, **(settings | training))
+    return solvable_by_dqn(name, kwargs, policies, **(settings | training))
 
 
-def built(league: LeagueConfig) -> OffPolicy:
+def build(league: LeagueConfig) -> OffPolicy:
     algorithm = algorithm_config(league, interface(league)).build_algo()
-    algorithm.begin_anew(0)
+    algorithm.reset_episodes(0)
     return algorithm
 
 
-def trained(league: LeagueConfig, updates: int, look: Look) -> Any:
-    algorithm = built(league)
+def train(league: LeagueConfig, updates: int, inspect_algorithm: Inspect) -> Any:
+    algorithm = build(league)
     try:
         for _ in range(updates):
             result = algorithm.train()
-        return look(algorithm, result)
+        return inspect_algorithm(algorithm, result)
     finally:
         algorithm.stop()
 
@@ -58,70 +58,77 @@ def returns(_: OffPolicy, result: dict[str, Any]) -> dict[str, float]:
     return result[ENV_RUNNER_RESULTS][EPISODE_MODULE_RETURN_MEAN]
 
 
+@pytest.mark.slow
 def test_the_two_step_game_is_solved_exactly() -> None:
-    """`benchmarks.learning two_step_game`, one seed."""
+    """One seed of `benchmarks.learning two_step_game`."""
     learned = two_step.learn("qmix", seed=0)
     assert learned.returned == 8
     assert learned.error(gamma=0.99) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mixer", ["vdn", "none"])
-def test_what_cannot_say_it_takes_the_safe_game(mixer: str) -> None:
-    """The negative controls: with sums, and alone, both agents forgo the game that could bring 8."""
+def test_additive_and_independent_values_choose_the_safe_game(mixer: str) -> None:
+    """Negative controls: additive and independent values do not choose the game with the return 8."""
     learned = two_step.learn(mixer, seed=0, steps=12_000)
     assert learned.returned == 7
     assert learned.error(gamma=0.99) > 1
 
 
-@pytest.mark.parametrize("mixer", ["qmix", "vdn", "none"])
-def test_agents_of_one_team_with_networks_of_their_own_learn(mixer: str) -> None:
+@pytest.mark.parametrize(
+    "mixer", ["qmix", pytest.param("vdn", marks=pytest.mark.slow), pytest.param("none", marks=pytest.mark.slow)]
+)
+def test_agents_of_a_team_with_separate_networks_learn(mixer: str) -> None:
     policies = {"a": ["player_0"], "b": ["player_1"]}
-    found = trained(mixed("discrete", {"agents": 2}, policies, mixer=mixer), 14, returns)
-    assert min(found.values()) > 0.85 * ROUNDS
+    means = train(qmix_league("discrete", {"agents": 2}, policies, mixer=mixer), 14, returns)
+    assert min(means.values()) > 0.85 * ROUNDS
 
 
-def test_teams_that_compete_learn_each_its_own() -> None:
+@pytest.mark.slow
+def test_competing_teams_learn_opposed_tasks() -> None:
     groups = {"one": ["player_0"], "other": ["player_1", "player_2"]}
-    league = mixed("discrete", {"agents": 3, "opposed": True}, {"a": ["player_0"], "b": ["*"]}, groups=groups)
-    found = trained(league, 14, returns)
-    assert found["a"] > 0.85 * ROUNDS
-    assert found["b"] > -0.15 * ROUNDS
+    league = qmix_league("discrete", {"agents": 3, "opposed": True}, {"a": ["player_0"], "b": ["*"]}, groups=groups)
+    means = train(league, 14, returns)
+    assert means["a"] > 0.85 * ROUNDS
+    assert means["b"] > -0.15 * ROUNDS
 
 
-def test_a_memory_learns_what_is_to_be_remembered_and_no_memory_cannot() -> None:
-    settings = {"gamma": 0.99, "copies": 8, "exploration": {"steps": 8000}}
-    assert trained(mixed("remembering", **settings, **MEMORY), 14, returns)["shared"] > 0.8
-    assert trained(mixed("remembering", **settings), 14, returns)["shared"] < 0.5
+@pytest.mark.slow
+def test_remembering_requires_recurrence() -> None:
+    settings = {"gamma": 0.99, "num_envs": 8, "exploration": {"steps": 8000}}
+    assert train(qmix_league("remembering", **settings, **MEMORY), 14, returns)["shared"] > 0.8
+    assert train(qmix_league("remembering", **settings), 14, returns)["shared"] < 0.5
 
 
-def test_the_memory_holds_the_actions_that_were_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While exploring they are not the greedy ones."""
-    algorithm = built(mixed("discrete", exploration={"initial": 1.0, "final": 1.0}, copies=4, **MEMORY))
+def test_the_recurrent_state_has_the_drawn_actions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While exploring, drawn actions differ from the greedy ones."""
+    algorithm = build(qmix_league("discrete", exploration={"initial": 1.0, "final": 1.0}, num_envs=4, **MEMORY))
     play = algorithm.env_runner_group.local_env_runner._play
-    drawn, remembered = [], []
+    drawn, stored = [], []
     act = play.recorder.act
 
-    def watch(policy: str, raw: NDArray, log_p: NDArray, dist_inputs: NDArray, state: Any) -> None:
+    def record(policy: str, raw: NDArray, log_p: NDArray, dist_inputs: NDArray, state: Any) -> None:
         drawn.append(raw.tolist())
-        remembered.append(state[ACTED].ravel().tolist())
+        stored.append(state[PREVIOUS_ACTION].ravel().tolist())
         act(policy, raw, log_p, dist_inputs, state)
 
     try:
-        monkeypatch.setattr(play.recorder, "act", watch)
+        monkeypatch.setattr(play.recorder, "act", record)
         algorithm.train()
     finally:
         algorithm.stop()
     assert len({tuple(row) for row in drawn}) > 10
-    for step, rows in enumerate(remembered):
+    for step, rows in enumerate(stored):
         assert rows == ([0.0] * 4 if step % ROUNDS == 0 else [action + 1.0 for action in drawn[step - 1]])
 
 
 def check_values(gamma: float = 0.9, **settings: Any) -> None:
-    """An agent that is truncated could have gone on: the state is worth what it is worth for ever, and an illegal
-    action that seems to be worth a million counts for nothing."""
-    league = mixed("masked", gamma=gamma, exploration={"initial": 0.5, "final": 0.5}, mixer="vdn", **settings)
+    """The value of the state is that of an endless episode, as truncation is bootstrapped. The large value of an
+    illegal action is ignored.
+    """
+    league = qmix_league("masked", gamma=gamma, exploration={"initial": 0.5, "final": 0.5}, mixer="vdn", **settings)
 
-    def look(algorithm: OffPolicy, _: Any) -> NDArray:
+    def inspect_algorithm(algorithm: OffPolicy, _: Any) -> NDArray:
         learner = algorithm.learner_group._learner
         for network in (learner.module["shared"], learner.targets["shared"]):
             with torch.no_grad():
@@ -133,17 +140,26 @@ def check_values(gamma: float = 0.9, **settings: Any) -> None:
         state = {key: torch.as_tensor(value)[None] for key, value in module.get_initial_state().items()}
         return module.forward_inference({"obs": seen, "state_in": state})["action_dist_inputs"].numpy()[0]
 
-    found = trained(league, 1, look)
-    assert found[1] == MASKED
+    found = train(league, 1, inspect_algorithm)
+    assert found[1] == MASKED_LOGIT
     np.testing.assert_allclose(found[[0, 2]], 1 / (1 - gamma), rtol=0.1)
 
 
-@pytest.mark.parametrize("settings", [{}, {"n_step": 3}, {"double": False}, {"gamma": 0.5} | MEMORY], ids=str)
-def test_values_are_those_of_legal_play_that_goes_on(settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"n_step": 3},
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"double": False}, marks=pytest.mark.slow),
+        pytest.param({"gamma": 0.5} | MEMORY, marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_values_bootstrap_truncation_and_ignore_illegal_actions(settings: dict[str, Any]) -> None:
     check_values(**settings)
 
 
-def test_the_check_sees_truncation_taken_for_termination(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_check_detects_truncation_treated_as_termination(monkeypatch: pytest.MonkeyPatch) -> None:
     cut = JointTransitions.cut
 
     def as_terminated(self: JointTransitions) -> Any:
@@ -157,19 +173,21 @@ def test_the_check_sees_truncation_taken_for_termination(monkeypatch: pytest.Mon
         check_values()
 
 
-def test_the_check_sees_targets_without_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_check_detects_targets_without_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "next_actions", lambda online, target, _: next_actions(online, target, None))
     with pytest.raises(AssertionError):
         check_values()
 
 
 @pytest.mark.parametrize("settings", [{"normalize_observations": True}, MEMORY], ids=["normalised", "memory"])
-def test_what_begins_anew_at_the_same_step_goes_on_alike(settings: dict[str, Any], tmp_path: Path) -> None:
-    """One that went on from its checkpoint, and one that was restored from it: agents, mixers, targets, the buffer."""
-    league = mixed("discrete", {"agents": 2}, replay_capacity=700, **settings)
+def test_a_restored_algorithm_continues_identically(settings: dict[str, Any], tmp_path: Path) -> None:
+    """Compares an algorithm that continues after its checkpoint with a restored one: agents, mixers, targets and
+    buffer.
+    """
+    league = qmix_league("discrete", {"agents": 2}, replay_capacity=700, **settings)
 
-    def after(algorithm: OffPolicy) -> list[NDArray]:
-        algorithm.begin_anew(2048)
+    def state_after(algorithm: OffPolicy) -> list[NDArray]:
+        algorithm.reset_episodes(2048)
         for _ in range(2):
             algorithm.train()
         learner = algorithm.learner_group._learner
@@ -180,14 +198,14 @@ def test_what_begins_anew_at_the_same_step_goes_on_alike(settings: dict[str, Any
 
     def save(algorithm: OffPolicy, _: Any) -> list[NDArray]:
         algorithm.save_to_path(str(tmp_path / "checkpoint"))
-        return after(algorithm)
+        return state_after(algorithm)
 
-    expected = trained(league, 2, save)
+    expected = train(league, 2, save)
     torch.manual_seed(77)
-    restored = built(league)
+    restored = build(league)
     try:
         restored.restore_from_path(str(tmp_path / "checkpoint"))
-        found = after(restored)
+        found = state_after(restored)
     finally:
         restored.stop()
     for before, now in zip(expected, found, strict=True):
@@ -195,33 +213,33 @@ def test_what_begins_anew_at_the_same_step_goes_on_alike(settings: dict[str, Any
 
 
 @pytest.mark.parametrize("settings", [{}, MEMORY], ids=["feed-forward", "memory"])
-def test_what_is_exported_sees_its_own_observation_alone(settings: dict[str, Any], tmp_path: Path) -> None:
-    league = mixed("masked", **settings)
-    described = interface(league)
-    spaces = described.of_policy("shared")
-    modules = module_spec(league.training, described).build()
-    assert set(modules.keys()) == {"shared"}, "no mixer is played"
+def test_an_exported_policy_depends_on_its_own_observation_only(settings: dict[str, Any], tmp_path: Path) -> None:
+    league = qmix_league("masked", **settings)
+    interface_of_league = interface(league)
+    spaces = interface_of_league.of_policy("shared")
+    modules = module_spec(league.training, interface_of_league).build()
+    assert set(modules.keys()) == {"shared"}, "mixers are not exported"
     module = modules["shared"]
     taken, _, state = graph_tensors(module, spaces)
     assert {tensor.name for tensor in taken} - {tensor.name for tensor in state} == {"observation", "action_mask"}
     export_policy(module, spaces, tmp_path / "shared.onnx")
-    met = parity.gather(league.environment, described, {"shared": module}, seed=1)["shared"]
-    proof = parity.prove(tmp_path / "shared.onnx", "shared", module, met, spaces.action)
+    met = parity.collect_observations(league.environment, interface_of_league, {"shared": module}, seed=1)["shared"]
+    proof = parity.check_parity(tmp_path / "shared.onnx", "shared", module, met, spaces.action)
     assert (proof.mismatches, proof.max_difference < 1e-5) == (0, True)
     recurrent = dict(zip(state_names(met[0].state), met[0].state.values(), strict=True))
     graph = OnnxPolicy(tmp_path / "shared.onnx").distribution(met[0].observations, state=recurrent or None)
     assert (graph.actions != 1).all()
 
 
-def test_policies_that_rest_stay_as_they_are() -> None:
+def test_frozen_policies_do_not_change() -> None:
     policies = {"a": ["player_0"], "b": ["player_1"]}
-    algorithm = built(mixed("discrete", {"agents": 2}, policies, policies_to_train=["b"]))
+    algorithm = build(qmix_league("discrete", {"agents": 2}, policies, policies_to_train=["b"]))
     try:
         learner = algorithm.learner_group._learner
-        before = {name: [p.detach().clone() for p in net.parameters()] for name, net in learner.networks.items()}
+        initial = {name: [p.detach().clone() for p in net.parameters()] for name, net in learner.networks.items()}
         algorithm.train()
         changed = {
-            name: any(not torch.equal(a, b) for a, b in zip(before[name], net.parameters(), strict=True))
+            name: any(not torch.equal(a, b) for a, b in zip(initial[name], net.parameters(), strict=True))
             for name, net in learner.networks.items()
         }
     finally:
@@ -230,39 +248,39 @@ def test_policies_that_rest_stay_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, MEMORY], ids=["feed-forward", "memory"])
-def test_agents_that_come_and_go_are_learned_from_while_they_are_there(settings: dict[str, Any]) -> None:
+def test_agents_are_trained_on_while_they_are_present(settings: dict[str, Any]) -> None:
     groups = {f"team_{i}": [f"agent_{i}"] for i in range(3)}
-    document = mixed("discrete", groups=groups, **settings).model_dump(mode="json", by_alias=True)
-    document["environment"]["entry_point"] = "tests.league.environments.simultaneous:meeting"
+    document = qmix_league("discrete", groups=groups, **settings).model_dump(mode="json", by_alias=True)
+    document["environment"]["entry_point"] = "tests.support.simultaneous:meeting"
     document["environment"]["kwargs"] = {"arrives": [0, 2, 0], "leaves": [5, 6, 3], "truncated": [1]}
     document["policies"] = {f"policy_{i}": [f"agent_{i}"] for i in range(3)}
     league = LeagueConfig.from_mapping(document)
 
-    def look(algorithm: OffPolicy, result: dict[str, Any]) -> None:
+    def inspect_algorithm(algorithm: OffPolicy, result: dict[str, Any]) -> None:
         rows = algorithm.replays[JOINT].sample(500).rows
         assert 0 < rows[f"{PRESENT}/policy_1"].mean() < 1
         assert np.isfinite(result[LEARNER_RESULTS][JOINT]["loss"])
 
-    trained(league, 2, look)
+    train(league, 2, inspect_algorithm)
 
 
-def test_the_mixer_reads_the_state_that_rllibs_infos_tell() -> None:
+def test_the_mixer_uses_the_state_of_rllib_infos() -> None:
     config = LeagueConfig.load("configs/two_step_game.yaml")
     document = config.model_dump(mode="json", by_alias=True)
     document["environment"] |= {"entry_point": "examples.two_step:multi_agent_env", "wrappers": []}
     document["policies"] = {"first": ["agent_0"], "second": ["agent_1"]}
     league = LeagueConfig.from_mapping(document)
 
-    def look(algorithm: OffPolicy, _: dict[str, Any]) -> None:
+    def inspect_algorithm(algorithm: OffPolicy, _: dict[str, Any]) -> None:
         mixer = algorithm.learner_group._learner.networks["mixer/team"]
         assert isinstance(mixer, MonotonicMixer)
         assert mixer.first_weights.in_features == 3
         assert algorithm.replays[JOINT].sample(10).rows[STATE].shape == (10, 3)
 
-    trained(league, 1, look)
+    train(league, 1, inspect_algorithm)
 
 
-def test_actions_that_have_no_values_are_refused_with_what_to_do() -> None:
-    league = mixed("numbers")
-    with pytest.raises(ConfigError, match=r"training\.groups\.team: qmix needs Discrete actions, and player_0 has"):
+def test_actions_without_values_are_rejected() -> None:
+    league = qmix_league("numbers")
+    with pytest.raises(ConfigError, match=r"training\.groups\.team: qmix needs Discrete actions, but player_0 has"):
         algorithm_config(league, interface(league))

@@ -1,4 +1,4 @@
-"""The learner, alone: on joint transitions that a runner in this process has sampled."""
+"""The learner alone, on joint transitions sampled by a runner in this process."""
 
 import itertools
 
@@ -9,13 +9,13 @@ from ray.rllib.core.learner.learner import DEFAULT_OPTIMIZER
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from tests.training.leagues import maddpg
+from tests.support.training_leagues import maddpg
 from training.algorithms.maddpg import algorithm_config
-from training.learners.maddpg import MADDPGLearner, Place, critic_of
-from training.learners.maddpg_loss import critic_loss, td_target
-from training.replay import Replay, Sample
-from training.sampling.actor_runner import ActorRunner
-from training.sampling.closed import JOINT
+from training.learners.maddpg import AgentSlot, MADDPGLearner, critic_loss, critic_name
+from training.learners.off_policy import bootstrapped_returns
+from training.replay_buffer import ReplayBuffer, Sample
+from training.sampling.closed_transitions import JOINT
+from training.sampling.replay_runner import ActorRunner
 
 OWN = {"a": ["player_0"], "b": ["player_1"]}
 GAMMA = 0.95
@@ -31,14 +31,14 @@ def learner_of(league: LeagueConfig) -> MADDPGLearner:
     return learner
 
 
-def sampled(league: LeagueConfig, actions: int = 600) -> Sample:
-    """All that was played, in order."""
+def sample_transitions(league: LeagueConfig, actions: int = 600) -> Sample:
+    """All transitions, in order."""
     runner = ActorRunner(config=algorithm_config(league, interface(league)), worker_index=0)
     try:
         _, blocks = runner.transitions(actions, exploration=0.5)
     finally:
         runner.stop()
-    replay = Replay(10_000)
+    replay = ReplayBuffer(10_000)
     replay.add(blocks[JOINT])
     indices = np.arange(len(replay))
     return Sample(replay.rows(indices, gamma=GAMMA), indices, np.ones(len(indices), np.float32))
@@ -52,33 +52,34 @@ def are_equal(first: list[torch.Tensor], second: list[torch.Tensor]) -> bool:
     return all(map(torch.equal, first, second))
 
 
-def test_targets_are_those_of_equation_6_and_truncated_agents_are_bootstrapped() -> None:
+def test_targets_follow_equation_6_and_bootstrap_truncated_agents() -> None:
     """In this environment player_1 terminates after two of four rounds, player_0 is truncated at the end."""
     league = maddpg("summing", {"ends": 2}, OWN)
-    learner, sample = learner_of(league), sampled(league)
+    learner, sample = learner_of(league), sample_transitions(league)
     batch = learner.batch(sample)
     rows = batch.rows
     for head, flags in (("truncated/a", "terminated/a"), ("terminated/b", "truncated/b")):
-        assert rows[head].any(), "each of the two kinds of end is among them"
+        assert rows[head].any(), "both kinds of ending occur"
         assert not rows[flags].any()
-    order = [learner._seen(Place("a", 0))]
+    order = [learner._critic_agents(AgentSlot("a", 0))]
     targets = learner._targets("a", batch, order)
     stays = rows["present/b"] & ~rows["terminated/b"]
     seen = [{"observation": rows[f"next_observations/{agent}/observation"][:, 0]} for agent in "ab"]
     acts = [learner.targets[agent].act(o, 1.0)[0] for agent, o in zip("ab", seen, strict=True)]
-    following = learner.targets[critic_of("a")](seen, [acts[0], acts[1] * stays])
+    following = learner.targets[critic_name("a")](seen, [acts[0], acts[1] * stays])
     assert torch.allclose(targets, rows["rewards/a"][:, 0] + GAMMA * following)
-    cut = td_target(rows["rewards/a"][:, 0], following, rows["truncated/a"][:, 0], rows["discounts"])
-    assert not torch.allclose(targets, cut), "taking truncation for termination shows"
-    own = learner._targets("b", batch, [learner._seen(Place("b", 0))])
+    cut = bootstrapped_returns(rows["rewards/a"][:, 0], rows["discounts"], rows["truncated/a"][:, 0], following)
+    assert not torch.allclose(targets, cut), "treating truncation as termination has no effect"
+    own = learner._targets("b", batch, [learner._critic_agents(AgentSlot("b", 0))])
     ended = rows["terminated/b"][:, 0]
-    assert torch.equal(own[ended], rows["rewards/b"][:, 0][ended]), "nothing follows a termination"
+    # There is no bootstrap after termination.
+    torch.testing.assert_close(own[ended], rows["rewards/b"][:, 0][ended])
 
 
 @pytest.mark.parametrize("critic", ["centralised", "own"])
-def test_each_network_has_an_optimizer_of_its_own_and_is_moved_by_its_own_loss(critic: str) -> None:
+def test_each_network_has_its_own_optimizer_and_loss(critic: str) -> None:
     league = maddpg("summing", {}, OWN, critic=critic)
-    learner, sample = learner_of(league), sampled(league)
+    learner, sample = learner_of(league), sample_transitions(league)
     networks = {"a", "b", "a.critic", "b.critic"}
     assert set(learner._named_optimizers) == {f"{name}_{DEFAULT_OPTIMIZER}" for name in networks}
     for name, network in learner.networks.items():
@@ -87,35 +88,35 @@ def test_each_network_has_an_optimizer_of_its_own_and_is_moved_by_its_own_loss(c
     before = {name: weights(network) for name, network in learner.networks.items()}
     learner.learn({"a": sample}, ["a"])
     moved = {name for name, network in learner.networks.items() if not are_equal(before[name], weights(network))}
-    assert moved == {"a", "a.critic"}, "policies that do not learn stay as they are, critics included"
+    assert moved == {"a", "a.critic"}, "frozen policies and their critics do not change"
     rows = learner.batch(sample).rows
-    order = [learner._seen(Place("a", 0))]
-    seen, done = learner._situation(rows, order)
+    order = [learner._critic_agents(AgentSlot("a", 0))]
+    seen, done = learner._critic_inputs(rows, order)
     for name, loss in (
         ("a.critic", critic_loss(learner.networks["a.critic"](seen, done), torch.zeros(len(done[0])))),
         ("a", learner._policy_loss("a", seen, done, torch.ones(len(done[0])))),
     ):
         before = {key: weights(network) for key, network in learner.networks.items()}
-        learner.descend(loss, [name])
+        learner.gradient_step(loss, [name])
         assert {key for key, net in learner.networks.items() if not are_equal(before[key], weights(net))} == {name}
 
 
-def test_a_step_of_the_actor_raises_its_critics_value() -> None:
+def test_an_actor_step_increases_the_value_of_its_critic() -> None:
     league = maddpg("summing", {}, OWN, lr=0.001, regularization=0)
-    learner, sample = learner_of(league), sampled(league)
-    seen, done = learner._situation(learner.batch(sample).rows, [learner._seen(Place("a", 0))])
+    learner, sample = learner_of(league), sample_transitions(league)
+    seen, done = learner._critic_inputs(learner.batch(sample).rows, [learner._critic_agents(AgentSlot("a", 0))])
     everyone = torch.ones(len(done[0]))
     losses = []
     for _ in range(10):
         loss = learner._policy_loss("a", seen, done, everyone)
         losses.append(loss.item())
-        learner.descend(loss, ["a"])
+        learner.gradient_step(loss, ["a"])
     assert all(after < before for before, after in itertools.pairwise(losses)), losses
 
 
-def test_independent_critics_see_nothing_of_others() -> None:
+def test_independent_critics_ignore_other_agents() -> None:
     league = maddpg("summing", {}, OWN)
-    sample = sampled(league)
+    sample = sample_transitions(league)
     other = Sample(dict(sample.rows), sample.indices, sample.weights)
     for name in ("observations/b/observation", "actions/b", "next_observations/b/observation"):
         other.rows[name] = other.rows[name] + np.float32(1)
@@ -128,9 +129,9 @@ def test_independent_critics_see_nothing_of_others() -> None:
         assert are_equal(*results) != differs
 
 
-def test_what_is_recorded_of_absent_agents_counts_nothing() -> None:
+def test_rows_of_absent_agents_are_ignored() -> None:
     league = maddpg("summing", {"ends": 2}, OWN)
-    sample = sampled(league)
+    sample = sample_transitions(league)
     absent = ~sample.rows["present/b"]
     assert absent.any()
     other = Sample({name: column.copy() for name, column in sample.rows.items()}, sample.indices, sample.weights)
@@ -144,18 +145,18 @@ def test_what_is_recorded_of_absent_agents_counts_nothing() -> None:
     assert are_equal(*results)
 
 
-def test_agents_of_one_policy_take_the_first_place_in_turn() -> None:
+def test_agents_that_share_a_policy_are_first_in_turn() -> None:
     policies = {"pair": ["player_0", "player_2"], "single": ["player_1"]}
     learner = learner_of(maddpg("discrete", {"agents": 3}, policies))
-    first, second, single = Place("pair", 0), Place("pair", 1), Place("single", 0)
-    assert [learner._seen(place) for place in (first, second, single)] == [
+    first, second, single = AgentSlot("pair", 0), AgentSlot("pair", 1), AgentSlot("single", 0)
+    assert [learner._critic_agents(place) for place in (first, second, single)] == [
         [first, second, single],
         [second, first, single],
         [single, first, second],
     ]
-    sample = sampled(maddpg("discrete", {"agents": 3}, policies))
+    sample = sample_transitions(maddpg("discrete", {"agents": 3}, policies))
     rows = learner.batch(sample).rows
-    seen, done = learner._situation(rows, [learner._seen(first), learner._seen(second)])
+    seen, done = learner._critic_inputs(rows, [learner._critic_agents(first), learner._critic_agents(second)])
     k = len(sample.indices)
     tasks = rows["observations/pair/observation"]
     assert torch.equal(seen[0]["observation"], torch.cat([tasks[:, 0], tasks[:, 1]]))
@@ -167,9 +168,9 @@ def test_agents_of_one_policy_take_the_first_place_in_turn() -> None:
     assert {policy: error.shape for policy, error in errors.items()} == {"pair": (k,), "single": (k,)}
 
 
-def test_targets_follow_by_polyaks_average() -> None:
+def test_targets_follow_by_polyak_averaging() -> None:
     league = maddpg("summing", {}, OWN)
-    learner, sample = learner_of(league), sampled(league)
+    learner, sample = learner_of(league), sample_transitions(league)
     before = {name: weights(target) for name, target in learner.targets.items()}
     learner.learn({"a": sample, "b": sample}, ["a", "b"])
     assert set(before) == set(learner.networks)
@@ -180,7 +181,7 @@ def test_targets_follow_by_polyaks_average() -> None:
 
 def test_running_statistics_reach_actors_critics_and_targets() -> None:
     league = maddpg("summing", {}, OWN, normalize_observations=True)
-    learner, sample = learner_of(league), sampled(league)
+    learner, sample = learner_of(league), sample_transitions(league)
     learner.learn({"a": sample, "b": sample}, ["a", "b"])
     mean = sample.rows["observations/a/observation"].mean()
     for network in (*learner.networks.values(), *learner.targets.values()):

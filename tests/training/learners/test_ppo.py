@@ -1,4 +1,4 @@
-"""The learner, alone: on episodes that a runner in this process has sampled."""
+"""The learner alone, on episodes sampled by a runner in this process."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from ray.rllib.utils.metrics import ALL_MODULES
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
-from tests.training.leagues import solvable
+from tests.support.training_leagues import solvable
 from training.algorithms.ppo import algorithm_config
 from training.learners import ppo
 from training.learners.ppo import PPOLearner
@@ -33,7 +33,7 @@ def learner_of(league: LeagueConfig) -> PPOLearner:
     return learner
 
 
-def played(league: LeagueConfig, steps: int = 256) -> list[SingleAgentEpisode]:
+def sample_episodes(league: LeagueConfig, steps: int = 256) -> list[SingleAgentEpisode]:
     runner = LockstepEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
     try:
         return runner.sample(num_timesteps=steps)
@@ -50,7 +50,7 @@ def weights(learner: PPOLearner) -> dict[str, dict[str, np.ndarray]]:
 
 
 def equal(first: Any, second: Any) -> bool:
-    """Of nested states."""
+    """Equality of nested states."""
     if isinstance(first, dict):
         return first.keys() == second.keys() and all(equal(value, second[key]) for key, value in first.items())
     if isinstance(first, list | tuple):
@@ -61,10 +61,10 @@ def equal(first: Any, second: Any) -> bool:
 @pytest.fixture(scope="module")
 def two() -> tuple[LeagueConfig, list[SingleAgentEpisode]]:
     league = solvable("discrete", **TWO)
-    return league, played(league)
+    return league, sample_episodes(league)
 
 
-def test_an_update_changes_every_policy_and_says_how(two: tuple) -> None:
+def test_an_update_changes_every_policy_and_reports_metrics(two: tuple) -> None:
     learner = learner_of(two[0])
     before = weights(learner)
     metrics = learn(learner, two[1])
@@ -80,9 +80,9 @@ def test_an_update_changes_every_policy_and_says_how(two: tuple) -> None:
 
 
 @pytest.mark.parametrize("training", [{}, {"normalize_observations": True}], ids=["plain", "normalised"])
-def test_a_policy_that_rests_keeps_weights_and_optimiser(training: dict[str, Any]) -> None:
+def test_a_frozen_policy_keeps_weights_and_optimizer(training: dict[str, Any]) -> None:
     league = solvable("far_numbers", kwargs={"agents": 2}, policies=TWO["policies"], **training)
-    learner, episodes = learner_of(league), played(league)
+    learner, episodes = learner_of(league), sample_episodes(league)
     learn(learner, episodes)
     before, optimizers = weights(learner), learner._get_optimizer_state()
     metrics = learn(learner, episodes, policies=("b",))
@@ -106,9 +106,9 @@ def test_a_policy_that_rests_keeps_weights_and_optimiser(training: dict[str, Any
     ],
     ids=["shared", "normalised", "recurrent", "continuous"],
 )
-def test_learning_goes_on_from_disk_as_it_would_have(name: str, options: dict[str, Any], tmp_path: Path) -> None:
+def test_a_restored_learner_continues_identically(name: str, options: dict[str, Any], tmp_path: Path) -> None:
     league = solvable(name, **options)
-    first, second = played(league), played(league.with_training(seed=9))
+    first, second = sample_episodes(league), sample_episodes(league.with_training(seed=9))
     learner = learner_of(league)
     learn(learner, first)
     learner.save_to_path(tmp_path / "state")
@@ -123,7 +123,7 @@ def test_learning_goes_on_from_disk_as_it_would_have(name: str, options: dict[st
     assert equal(learner._get_optimizer_state(), restored._get_optimizer_state())
 
 
-def test_each_policy_learns_by_its_own_settings(two: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_policy_learns_with_its_own_settings(two: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     own = {"b": {"lr": 0.5, "gamma": 0.1, "lambda": 0.2, "clip": 0.4, "entropy": 0.6}}
     league = two[0].with_training(per_policy=own)
     learner = learner_of(league)
@@ -150,7 +150,7 @@ def test_each_policy_learns_by_its_own_settings(two: tuple, monkeypatch: pytest.
     assert rates == {"a_default_optimizer": settings.lr, "b_default_optimizer": 0.5}
 
 
-def test_a_shared_encoder_has_one_optimiser_that_each_policys_loss_moves(two: tuple) -> None:
+def test_a_shared_encoder_has_one_optimizer_for_the_losses_of_all_policies(two: tuple) -> None:
     league = two[0].with_training(shared_encoder=True)
     learner = learner_of(league)
     names = list(learner._named_optimizers)
@@ -172,18 +172,18 @@ def test_a_gradient_that_is_not_finite_is_dropped(two: tuple, caplog: pytest.Log
     after = weights(learner)
     assert equal(before["a"], after["a"])
     assert not equal(before["b"], after["b"])
-    assert "Dropped a gradient of a that is not finite" in caplog.text
+    assert "Dropped a non-finite gradient of a" in caplog.text
 
 
-def test_a_gpu_that_there_is_not_is_refused(two: tuple) -> None:
+def test_a_missing_gpu_is_rejected(two: tuple) -> None:
     if torch.cuda.is_available():
-        pytest.skip("there is one")
-    with pytest.raises(ConfigError, match=r"training\.gpus: 0\.5 asked for the learner, but torch sees no GPU"):
+        pytest.skip("a GPU is present")
+    with pytest.raises(ConfigError, match=r"training\.gpus: 0\.5 requested for the learner, but torch finds no GPU"):
         learner_of(two[0].with_training(gpus=0.5))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_a_gpu_learns_as_the_processor_does(two: tuple) -> None:
+def test_a_gpu_learns_like_the_cpu(two: tuple) -> None:
     torch.manual_seed(0)
     learners = [learner_of(two[0].with_training(gpus=gpus)) for gpus in (0, 1)]
     for policy, module in learners[1].module.items():

@@ -1,4 +1,4 @@
-"""The loss and its gradient, against RLlib's own."""
+"""The loss and its gradient, compared with RLlib's."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -19,10 +19,10 @@ from ray.rllib.core.distribution.torch.torch_distribution import (
 from ray.rllib.evaluation.postprocessing import Postprocessing
 
 from league.policies.actions import dist_inputs_size
-from league.spaces import from_gymnasium
-from training.learners.ppo_loss import ppo_loss
+from league.spaces.conversion import from_gymnasium
+from training.learners.ppo import ppo_loss
 from training.learners.train_batch import Minibatch
-from training.modules.distributions import distribution
+from training.modules.distributions import torch_distribution
 from training.sampling.distributions import distribution as sampled_from
 
 ROWS, CLIP, ENTROPY, VALUE = 64, 0.2, 0.03, 0.7
@@ -36,7 +36,7 @@ def minibatch(space: gymnasium.Space) -> Minibatch:
     return Minibatch({}, torch.from_numpy(raw), old, torch.from_numpy(log_p), torch.randn(ROWS), torch.randn(ROWS) * 3)
 
 
-def rllibs(minibatch: Minibatch, dist_inputs: torch.Tensor, values: torch.Tensor, dist: Any) -> tuple[Any, dict]:
+def rllib_loss(minibatch: Minibatch, dist_inputs: torch.Tensor, values: torch.Tensor, dist: Any) -> tuple[Any, dict]:
     module = SimpleNamespace(
         get_train_action_dist_cls=lambda: dist,
         get_exploration_action_dist_cls=lambda: dist,
@@ -79,9 +79,11 @@ def test_loss_and_gradient_equal_rllibs(space: gymnasium.Space, dist: Any) -> No
     for theirs in (True, False):
         inputs, predicted = new.clone().requires_grad_(), values.clone().requires_grad_()
         if theirs:
-            total, logged = rllibs(steps, inputs, predicted, dist)
+            total, logged = rllib_loss(steps, inputs, predicted, dist)
         else:
-            ours = ppo_loss(steps, inputs, predicted, distribution(space), clip=CLIP, entropy=ENTROPY, value_loss=VALUE)
+            ours = ppo_loss(
+                steps, inputs, predicted, torch_distribution(space), clip=CLIP, entropy=ENTROPY, value_loss=VALUE
+            )
             total = ours.total
         total.backward()
         gradients.append((inputs.grad, predicted.grad))
@@ -92,16 +94,16 @@ def test_loss_and_gradient_equal_rllibs(space: gymnasium.Space, dist: Any) -> No
     assert ours.policy.item() == pytest.approx(logged["policy_loss"].item(), rel=1e-5)
     assert ours.value.item() == pytest.approx(logged["vf_loss"].item(), rel=1e-5)
     assert ours.entropy.item() == pytest.approx(logged["entropy"].item(), rel=1e-5)
-    assert 0.1 < ours.clip_fraction < 0.9, "the clipping took part"
+    assert 0.1 < ours.clip_fraction < 0.9, "clipping must occur"
 
 
-def test_nothing_is_clipped_where_the_policy_has_not_changed() -> None:
+def test_an_unchanged_policy_is_not_clipped() -> None:
     steps = minibatch(spaces.Discrete(5))
     loss = ppo_loss(
         steps,
         steps.dist_inputs,
         steps.targets,
-        distribution(spaces.Discrete(5)),
+        torch_distribution(spaces.Discrete(5)),
         clip=CLIP,
         entropy=0,
         value_loss=VALUE,

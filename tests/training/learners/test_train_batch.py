@@ -1,4 +1,4 @@
-"""The bootstrap of each way in which a chunk can end, with values that are known; and what becomes of a memory."""
+"""The bootstrap of each way in which a chunk can end, with known values; and recurrent states."""
 
 from typing import Any
 
@@ -12,8 +12,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from training.learners import train_batch as train_batches
-from training.learners.advantages import generalized_advantages
-from training.learners.train_batch import Chunks, TrainBatch, train_batch
+from training.learners.train_batch import Chunks, TrainBatch, generalized_advantages, train_batch
 from training.modules.actor_critic import ActorCritic
 
 GAMMA, LAMBDA = 0.5, 0.9
@@ -69,7 +68,7 @@ def chunk(
     )
 
 
-def taken(batch: TrainBatch) -> list[float]:
+def step_observations(batch: TrainBatch) -> list[float]:
     """The observations of the steps."""
     return batch.observations["observation"][batch.acted].flatten().tolist()
 
@@ -79,29 +78,29 @@ def taken(batch: TrainBatch) -> list[float]:
     [({"terminated": True}, 1.0), ({"truncated": True}, 1.0 + GAMMA * 8.0), ({}, 1.0 + GAMMA * 8.0)],
     ids=["terminated", "truncated", "cut"],
 )
-def test_the_last_value_counts_unless_the_agent_terminated(
+def test_the_last_value_is_used_unless_the_agent_terminated(
     identity: Identity, end: dict[str, bool], target: float
 ) -> None:
-    """One-step targets, λ = 0; chunks stand one behind another and do not leak."""
+    """One-step targets, λ = 0; consecutive chunks are independent."""
     chunks = [chunk([2.0, 4.0, 8.0], [0.0, 1.0], **end), chunk([16.0, 32.0], [3.0])]
     found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0)
-    assert found.targets.tolist() == [GAMMA * 4.0, target, 3.0 + GAMMA * 32.0]
-    assert taken(found) == [2.0, 4.0, 16.0]
+    assert found.targets.tolist() == pytest.approx([GAMMA * 4.0, target, 3.0 + GAMMA * 32.0])
+    assert step_observations(found) == [2.0, 4.0, 16.0]
     assert found.actions.tolist() == [0, 1, 0]
 
 
-def test_what_is_bootstrapped_can_be_decided_otherwise(identity: Identity) -> None:
-    """As RLlib does it: what was truncated counts as terminated."""
+def test_bootstrapping_can_be_configured(identity: Identity) -> None:
+    """Like RLlib, which treats truncation as termination."""
 
     def unless_over(chunks: Chunks) -> NDArray:
         return np.array([not chunk.is_done for chunk in chunks])
 
     chunks = [chunk([2.0, 4.0], [1.0], truncated=True), chunk([2.0, 4.0], [1.0])]
     found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0, bootstraps=unless_over)
-    assert found.targets.tolist() == [1.0, 1.0 + GAMMA * 4.0]
+    assert found.targets.tolist() == pytest.approx([1.0, 1.0 + GAMMA * 4.0])
 
 
-def test_advantages_are_standardised_and_targets_are_not(identity: Identity) -> None:
+def test_advantages_are_standardized_and_targets_are_not(identity: Identity) -> None:
     chunks = [chunk([0.0, 1.0, 2.0, 3.0], [1.0, -1.0, 5.0], terminated=True)]
     found = train_batch(identity, chunks, gamma=GAMMA, lambda_=LAMBDA)
     advantages = generalized_advantages(
@@ -118,17 +117,15 @@ def test_statistics_are_updated_before_values_are_computed() -> None:
     chunks = [chunk([1000.0, 1002.0, 1004.0], [0.0, 0.0])]
     found = train_batch(net, chunks, gamma=1.0, lambda_=1.0)
     normalization = net.encoder.features.parts[0][0]
-    assert (float(normalization.count), float(normalization.mean)) == (3, 1002)
+    assert (float(normalization.count), float(normalization.mean)) == (3, pytest.approx(1002))
     last = net.compute_values({Columns.OBS: {"observation": torch.tensor([[1004.0]])}})
     np.testing.assert_allclose(found.targets, last.detach().repeat(2), rtol=1e-5)
 
 
 @pytest.mark.parametrize("at_once", [2, 3, 100])
-def test_a_memory_values_each_step_from_its_state_and_the_last_from_what_follows(
-    at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Against the module, step by step: with γ = 1, λ = 0 and no reward, a target is the value of the next step."""
-    monkeypatch.setattr(train_batches, "VALUED_AT_ONCE", at_once)
+def test_a_recurrent_value_uses_the_state_of_each_step(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compared with the module step by step: for γ = 1, λ = 0, no reward, targets are the values of the next steps."""
+    monkeypatch.setattr(train_batches, "VALUE_PASS_ROWS", at_once)
     net = network(spaces.Discrete(5), recurrence=3)
     states = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     chunks = [chunk([0, 1, 2, 3], [0.0] * 3, states[:3], truncated=True), chunk([4, 2, 1], [0.0] * 2, states[3:])]
@@ -140,15 +137,15 @@ def test_a_memory_values_each_step_from_its_state_and_the_last_from_what_follows
             answer, after = net.value_step(batch)
         return answer.item(), after
 
-    def before(step: int) -> dict[str, torch.Tensor]:
+    def state_before(step: int) -> dict[str, torch.Tensor]:
         return {"h": torch.from_numpy(states[step : step + 1]), "c": torch.from_numpy(-states[step : step + 1])}
 
-    expected = [value(1, before(1))[0], value(2, before(2))[0], value(3, value(2, before(2))[1])[0]]
-    expected += [value(2, before(4))[0], value(1, value(2, before(4))[1])[0]]
+    expected = [value(1, state_before(1))[0], value(2, state_before(2))[0], value(3, value(2, state_before(2))[1])[0]]
+    expected += [value(2, state_before(4))[0], value(1, value(2, state_before(4))[1])[0]]
     assert found.targets.tolist() == pytest.approx(expected, abs=1e-6)
 
 
-def test_chunks_are_cut_into_sequences_with_their_own_first_states() -> None:
+def test_chunks_are_cut_into_sequences_with_their_first_states() -> None:
     net = network(spaces.Discrete(9), recurrence=1)
     states = np.arange(8, dtype=np.float32)[:, None]
     chunks = [chunk(list(range(6)), [0.0] * 5, states[:5]), chunk([6, 7, 8, 0], [0.0] * 3, states[5:])]
@@ -165,7 +162,7 @@ def test_chunks_are_cut_into_sequences_with_their_own_first_states() -> None:
     assert len(minibatch.targets) == len(minibatch.advantages) == len(minibatch.log_p) == 5
 
 
-def test_steps_are_taken_in_any_order_without_a_memory(identity: Identity) -> None:
+def test_steps_without_recurrence_are_taken_in_any_order(identity: Identity) -> None:
     found = train_batch(identity, [chunk([2.0, 4.0, 8.0], [0.0, 1.0]), chunk([16.0, 32.0], [3.0])], gamma=1, lambda_=1)
     minibatch = found.take(torch.tensor([2, 0]))
     assert found.units == len(found) == 3

@@ -1,3 +1,5 @@
+"""Actor-critic networks, and encoders shared by several policies."""
+
 import numpy as np
 import pytest
 import torch
@@ -6,8 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ray.rllib.core.columns import Columns
 
+from league.config import LeagueConfig
+from league.environments.building import interface
 from league.errors import ConfigError
-from training.modules.actor_critic import MASKED, ActorCritic
+from tests.support.training_leagues import solvable
+from training.algorithms.ppo import module_spec
+from training.modules.actor_critic import ActorCritic, SharedEncoder
+from training.modules.policy_module import MASKED_LOGIT
 
 PLANES = spaces.Box(0, 1, (6, 7, 2), np.int8)
 MASK = spaces.Box(0, 1, (7,), np.int8)
@@ -24,20 +31,20 @@ def module(action: spaces.Space | None = None, recurrence: int | None = None, **
 
 @given(st.lists(st.lists(st.booleans(), min_size=7, max_size=7).filter(any), min_size=1, max_size=5))
 @settings(max_examples=30, deadline=None)
-def test_illegal_actions_have_probability_zero_and_legal_ones_their_logits(rows: list[list[bool]]) -> None:
+def test_illegal_actions_have_probability_zero_and_legal_ones_keep_their_logits(rows: list[list[bool]]) -> None:
     net = module(observation=PLANES, action_mask=MASK)
     planes = torch.randint(0, 2, (len(rows), 6, 7, 2), dtype=torch.int8)
     mask = torch.tensor(rows, dtype=torch.int8)
     masked = net.forward_inference({Columns.OBS: {"observation": planes, "action_mask": mask}})
     plain = net.forward_inference({Columns.OBS: {"observation": planes}})
     logits, legal = masked[Columns.ACTION_DIST_INPUTS], mask.bool()
-    assert (logits[~legal] == MASKED).all()
-    assert torch.equal(logits[legal], plain[Columns.ACTION_DIST_INPUTS][legal])
+    assert (logits[~legal] == MASKED_LOGIT).all()
+    torch.testing.assert_close(logits[legal], plain[Columns.ACTION_DIST_INPUTS][legal])
     assert (torch.softmax(logits, -1)[~legal] == 0).all()
 
 
 @pytest.mark.parametrize("action", [spaces.Discrete(7), spaces.MultiDiscrete([3, 4])])
-def test_entropy_and_gradient_are_finite_where_one_action_is_legal(action: spaces.Space) -> None:
+def test_entropy_and_gradient_are_finite_with_one_legal_action(action: spaces.Space) -> None:
     net = module(action, observation=PLANES, action_mask=MASK)
     mask = torch.zeros((4, 7), dtype=torch.bool)
     mask[:, 2] = True
@@ -49,25 +56,25 @@ def test_entropy_and_gradient_are_finite_where_one_action_is_legal(action: space
     out = net.forward_train(batch)
     log_p, entropy = net.distribution.evaluate(out[Columns.ACTION_DIST_INPUTS], raw)
     (log_p.sum() + entropy.sum() + out[Columns.VF_PREDS].sum()).backward()
-    assert torch.equal(entropy, torch.zeros(4))
-    assert torch.equal(log_p, torch.zeros(4))
+    torch.testing.assert_close(entropy, torch.zeros(4))
+    torch.testing.assert_close(log_p, torch.zeros(4))
     assert all(torch.isfinite(param.grad).all() for param in net.parameters())
 
 
-def test_values_are_the_same_in_each_pass() -> None:
+def test_values_are_equal_in_each_pass() -> None:
     net = module(observation=PLANES)
     batch = {Columns.OBS: {"observation": torch.randint(0, 2, (5, 6, 7, 2), dtype=torch.int8)}}
     values = net.compute_values(batch)
     assert values.shape == (5,)
-    assert torch.equal(values, net.forward_train(batch)[Columns.VF_PREDS])
-    assert torch.equal(values, net.value_step(batch)[0])
-    assert torch.equal(values, net.compute_values(batch, net.encoder(batch[Columns.OBS])))
+    torch.testing.assert_close(values, net.forward_train(batch)[Columns.VF_PREDS])
+    torch.testing.assert_close(values, net.value_step(batch)[0])
+    torch.testing.assert_close(values, net.compute_values(batch, net.encoder(batch[Columns.OBS])))
     assert net.get_initial_state() == {}
     assert not net.is_stateful()
 
 
-def test_a_memory_learns_from_sequences_what_it_does_step_by_step() -> None:
-    """Three sequences of 4, 1 and 3 steps, each from a state of its own, give the same as acting through them."""
+def test_a_recurrent_network_learns_from_sequences_as_step_by_step() -> None:
+    """Three sequences of 4, 1 and 3 steps, each with its own first state, equal the steps one by one."""
     net = module(recurrence=5, die=spaces.Discrete(6))
     lengths, rolls = [4, 1, 3], torch.randint(0, 6, (8,))
     first = {key: torch.randn(3, 5) for key in net.get_initial_state()}
@@ -89,21 +96,21 @@ def test_a_memory_learns_from_sequences_what_it_does_step_by_step() -> None:
     assert {key: value.tolist() for key, value in net.get_initial_state().items()} == {"h": [0] * 5, "c": [0] * 5}
 
 
-def test_a_memory_tells_histories_apart_and_sequences_do_not_leak() -> None:
+def test_a_recurrent_network_distinguishes_histories_and_separates_sequences() -> None:
     net = module(recurrence=5, die=spaces.Discrete(6))
     state = {key: torch.zeros(2, 5) for key in net.get_initial_state()}
 
-    def last_of_both(rolls: list[int]) -> list[float]:
+    def last_values(rolls: list[int]) -> list[float]:
         batch = {Columns.OBS: {"die": torch.tensor(rolls)}, Columns.STATE_IN: state}
         values = net.forward_train(batch | {Columns.SEQ_LENS: torch.tensor([2, 2])})[Columns.VF_PREDS]
         return values[[1, 3]].tolist()
 
-    before, changed = last_of_both([1, 4, 2, 4]), last_of_both([3, 4, 2, 4])
+    before, changed = last_values([1, 4, 2, 4]), last_values([3, 4, 2, 4])
     assert before[0] != changed[0]
     assert before[1] == changed[1]
 
 
-def test_the_deviation_of_numbers_does_not_depend_on_the_observation() -> None:
+def test_the_deviation_of_box_actions_does_not_depend_on_the_observation() -> None:
     net = module(spaces.Box(-1, 1, (2, 2)), observation=PLANES)
     batch = {Columns.OBS: {"observation": torch.randint(0, 2, (5, 6, 7, 2), dtype=torch.int8)}}
     inputs = net.forward_train(batch)[Columns.ACTION_DIST_INPUTS]
@@ -116,6 +123,100 @@ def test_the_deviation_of_numbers_does_not_depend_on_the_observation() -> None:
 
 
 @pytest.mark.parametrize("action", [spaces.Box(0, 3, (2,), np.int8), spaces.MultiBinary(3), spaces.Text(3)])
-def test_other_actions_are_refused(action: spaces.Space) -> None:
-    with pytest.raises(ConfigError, match="no policy has actions of"):
+def test_unsupported_action_spaces_are_rejected(action: spaces.Space) -> None:
+    with pytest.raises(ConfigError, match="unsupported action space"):
         module(action, observation=PLANES)
+
+
+TWO = {"kwargs": {"agents": 2}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
+
+
+def build(league: LeagueConfig) -> SharedEncoder:
+    torch.manual_seed(0)
+    module = module_spec(league.training, interface(league)).build()
+    assert isinstance(module, SharedEncoder)
+    return module
+
+
+@pytest.fixture
+def shared_module() -> SharedEncoder:
+    return build(solvable("discrete", **TWO, shared_encoder=True))
+
+
+def batch(**rows: list[int]) -> dict[str, dict[str, dict[str, torch.Tensor]]]:
+    return {policy: {Columns.OBS: {"observation": torch.tensor(values)}} for policy, values in rows.items()}
+
+
+def test_the_encoder_runs_once_for_all_rows(shared_module: SharedEncoder) -> None:
+    rows: list[int] = []
+    shared_module.encoder.register_forward_hook(lambda _, inputs, __: rows.append(len(inputs[0]["observation"])))
+    for forward in (shared_module.forward_exploration, shared_module.forward_inference, shared_module.forward_train):
+        forward(batch(b=[0, 1, 2], a=[2]))
+    assert rows == [4, 4, 4]
+
+
+def test_policies_give_the_same_result_together_and_alone(shared_module: SharedEncoder) -> None:
+    inputs = batch(b=[0, 1, 2], a=[2])
+    learned = shared_module.forward_train(inputs)
+    for forward in ("forward_exploration", "forward_inference"):
+        together = getattr(shared_module, forward)(inputs)
+        assert set(together) == {"a", "b"}
+        for policy, columns in inputs.items():
+            alone = getattr(shared_module[policy], forward)(columns)[Columns.ACTION_DIST_INPUTS]
+            assert not together[policy][Columns.ACTION_DIST_INPUTS].requires_grad
+            assert torch.allclose(together[policy][Columns.ACTION_DIST_INPUTS], alone, atol=1e-7)
+            assert torch.allclose(learned[policy][Columns.ACTION_DIST_INPUTS], alone, atol=1e-7)
+            values = shared_module[policy].compute_values(columns)
+            assert torch.allclose(learned[policy][Columns.VF_PREDS], values, atol=1e-7)
+    heads = [shared_module[policy].policy_head.weight for policy in ("a", "b")]
+    assert not torch.equal(*heads)
+    assert shared_module.forward_inference({}) == {}
+
+
+def test_a_shared_encoder_has_fewer_parameters_and_remains_shared_after_restoring(shared_module: SharedEncoder) -> None:
+    shared = {id(parameter) for part in shared_module.values() for parameter in part.parameters()}
+    own = {id(parameter) for parameter in shared_module.encoder.parameters()}
+    apart = sum(len(list(part.parameters())) for part in shared_module.values())
+    assert apart - len(shared) == len(own) > 0
+    other = build(solvable("discrete", **TWO, shared_encoder=True, seed=6))
+    with torch.no_grad():
+        other.encoder.hidden[0].weight.zero_()
+    other.set_state(shared_module.get_state())
+    assert other["a"].encoder is other["b"].encoder
+    assert torch.equal(other.encoder.hidden[0].weight, shared_module.encoder.hidden[0].weight)
+
+
+def test_policies_can_have_different_action_masks() -> None:
+    league = LeagueConfig.from_mapping(
+        {
+            "league": "tictactoe",
+            "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
+            "policies": {"a": ["player_1"], "b": ["player_2"]},
+            "training": {"shared_encoder": True},
+        }
+    )
+    net = build(league)
+    mask = torch.tensor([[0] * 8 + [1], [1] + [0] * 8], dtype=torch.int8)
+    observed = {"observation": torch.zeros((2, 3, 3, 2), dtype=torch.int8), "action_mask": mask}
+    answer = net.forward_exploration({"a": {Columns.OBS: observed}, "b": {Columns.OBS: observed}})
+    for policy in ("a", "b"):
+        assert answer[policy][Columns.ACTION_DIST_INPUTS].argmax(-1).tolist() == [8, 0]
+
+
+def test_policies_with_different_observation_spaces_are_rejected() -> None:
+    league = LeagueConfig.from_mapping(
+        {
+            "league": "adversary",
+            "environment": {"entry_point": "mpe2.simple_adversary_v3"},
+            "policies": {"adversary": ["adversary_*"], "good": ["agent_*"]},
+            "training": {"shared_encoder": True},
+        }
+    )
+    with pytest.raises(ConfigError, match="policies adversary and good have different observation spaces"):
+        module_spec(league.training, interface(league))
+
+
+def test_statistics_cover_all_policies() -> None:
+    net = build(solvable("far_numbers", normalize_observations=True, shared_encoder=True))
+    net["shared"].encoder.update_statistics({"observation": torch.from_numpy(np.array([[1.0], [3.0]]))})
+    assert net.encoder.features.parts[0][0].mean.tolist() == pytest.approx([2.0])

@@ -4,9 +4,8 @@ import pytest
 import torch
 from ray.rllib.core.columns import Columns
 
-from training.modules.acting import MASKED
-from training.modules.noisy import NoisyLinear
-from training.modules.q_network import QNetwork, epsilon_greedy
+from training.modules.policy_module import MASKED_LOGIT
+from training.modules.q_network import NoisyLinear, QNetwork, epsilon_greedy
 
 SPACE = gymnasium.spaces.Dict(
     {
@@ -47,37 +46,39 @@ KINDS = [
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
 def test_illegal_actions_are_neither_best_nor_explored(kind: dict[str, object]) -> None:
-    module, observed = network(**kind), batch([[1, 0, 1], [0, 1, 0], [1, 1, 1]] * 30)
-    allowed = observed[Columns.OBS]["action_mask"].bool()
-    values = module.forward_inference(observed)[Columns.ACTION_DIST_INPUTS]
+    module, inputs = network(**kind), batch([[1, 0, 1], [0, 1, 0], [1, 1, 1]] * 30)
+    allowed = inputs[Columns.OBS]["action_mask"].bool()
+    values = module.forward_inference(inputs)[Columns.ACTION_DIST_INPUTS]
     assert allowed[torch.arange(len(values)), values.argmax(-1)].all()
-    assert ((values == MASKED) == ~allowed).all()
+    assert ((values == MASKED_LOGIT) == ~allowed).all()
     module.exploration = 0.5
-    explored = module.forward_exploration(observed)[Columns.ACTION_DIST_INPUTS].softmax(-1)
+    explored = module.forward_exploration(inputs)[Columns.ACTION_DIST_INPUTS].softmax(-1)
     assert (explored[~allowed] == 0).all()
     torch.testing.assert_close(explored.sum(-1), torch.ones(len(values)))
-    assert torch.equal(values, module.forward_inference(observed)[Columns.ACTION_DIST_INPUTS]), "acting draws nothing"
+    assert torch.equal(values, module.forward_inference(inputs)[Columns.ACTION_DIST_INPUTS]), (
+        "greedy inference is deterministic"
+    )
 
 
-def test_epsilon_greedy_by_hand_also_where_values_are_zero() -> None:
-    """RLlib's masks by `q != 0`: it never explores a legal action of value 0, and fails on a row of zeros."""
-    values = torch.tensor([[0.0, 0.0, MASKED], [0.0, 3.0, MASKED], [MASKED, 0.0, MASKED]])
+def test_epsilon_greedy_supports_values_of_zero() -> None:
+    """RLlib masks by `q != 0`: it never explores a legal action of value 0, and fails on a row of zeros."""
+    values = torch.tensor([[0.0, 0.0, MASKED_LOGIT], [0.0, 3.0, MASKED_LOGIT], [MASKED_LOGIT, 0.0, MASKED_LOGIT]])
     found = epsilon_greedy(values, 0.2).softmax(-1)
     torch.testing.assert_close(found, torch.tensor([[0.9, 0.1, 0.0], [0.1, 0.9, 0.0], [0.0, 1.0, 0.0]]))
     random = epsilon_greedy(torch.zeros(1, 3), 1.0).softmax(-1)
     torch.testing.assert_close(random, torch.full((1, 3), 1 / 3))
 
 
-def test_advantages_of_legal_actions_have_mean_zero_around_the_value() -> None:
-    module, observed = network(dueling=True), batch([[1, 0, 1]] * 4)
-    answers = module.answers(observed[Columns.OBS])
+def test_advantages_of_legal_actions_have_mean_zero() -> None:
+    module, inputs = network(dueling=True), batch([[1, 0, 1]] * 4)
+    outputs = module.head_outputs(inputs[Columns.OBS])
     assert module.value is not None
-    value = module.value(module.encoder(observed[Columns.OBS]))
-    torch.testing.assert_close(answers[:, [0, 2]].mean(-1, keepdim=True), value)
+    value = module.value(module.encoder(inputs[Columns.OBS]))
+    torch.testing.assert_close(outputs[:, [0, 2]].mean(-1, keepdim=True), value)
 
 
-def test_noise_is_factorised_and_off_when_acting() -> None:
-    """y − y₀ = σ_w f(ε_out) f(ε_in)ᵀ x + σ_b f(ε_out): for x = 0 only the bias's remains."""
+def test_noise_is_factorized_and_disabled_in_inference() -> None:
+    """y − y₀ = σ_w f(ε_out) f(ε_in)ᵀ x + σ_b f(ε_out): for x = 0 only the noise of the bias remains."""
     torch.manual_seed(3)
     layer = NoisyLinear(4, 2)
     x = torch.randn(5, 4)

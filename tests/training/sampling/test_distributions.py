@@ -1,4 +1,4 @@
-"""Against SciPy and torch, which compute the same in their own ways."""
+"""Compared with independent implementations in SciPy and torch."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scipy.stats import chisquare, kstest
 
 from league.errors import ConfigError
 from league.spaces import Box, Discrete, MultiDiscrete, Space
-from training.modules.actor_critic import MASKED
+from training.modules.policy_module import MASKED_LOGIT
 from training.sampling.distributions import distribution
 
 ROWS = 20_000
@@ -20,8 +20,8 @@ SPACES: list[tuple[Space, int]] = [(Discrete(n=4, start=2), 4), (SEVERAL, 9), (N
 seeds = st.integers(0, 2**32 - 1)
 
 
-def theirs(space: Space, inputs: np.ndarray) -> torch.distributions.Distribution:
-    """torch's distribution of the same inputs."""
+def torch_distribution(space: Space, inputs: np.ndarray) -> torch.distributions.Distribution:
+    """torch's distribution for the same inputs."""
     tensor = torch.from_numpy(inputs).double()
     if isinstance(space, Discrete):
         return torch.distributions.Categorical(logits=tensor)
@@ -30,41 +30,41 @@ def theirs(space: Space, inputs: np.ndarray) -> torch.distributions.Distribution
 
 
 def expected(space: Space, inputs: np.ndarray, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log-probabilities and entropies by torch."""
+    """Log-probabilities and entropies computed by torch."""
     if isinstance(space, MultiDiscrete):
         parts = np.split(inputs, np.cumsum(NVEC)[:-1], axis=1)
         pairs = [expected(Discrete(n=n), part, raw[:, i]) for i, (n, part) in enumerate(zip(NVEC, parts, strict=True))]
         return sum(pair[0] for pair in pairs), sum(pair[1] for pair in pairs)
-    found = theirs(space, inputs)
+    found = torch_distribution(space, inputs)
     return found.log_prob(torch.from_numpy(raw)).numpy(), found.entropy().numpy()
 
 
 @pytest.mark.parametrize(("space", "d"), SPACES, ids=lambda value: getattr(value, "type", None))
 @given(seed=seeds, rows=st.integers(1, 7))
 @settings(deadline=None, max_examples=25)
-def test_probabilities_and_entropies_are_torchs(space: Space, d: int, seed: int, rows: int) -> None:
+def test_probabilities_and_entropies_equal_torch(space: Space, d: int, seed: int, rows: int) -> None:
     rng = np.random.default_rng(seed)
-    drawing, inputs = distribution(space), rng.normal(size=(rows, d)).astype(np.float32)
-    for raw, log_p in (drawing.sample(inputs, rng), drawing.mode(inputs)):
+    sampler, inputs = distribution(space), rng.normal(size=(rows, d)).astype(np.float32)
+    for raw, log_p in (sampler.sample(inputs, rng), sampler.mode(inputs)):
         log_probabilities, entropies = expected(space, inputs, raw)
         assert log_p.dtype == np.float32
         assert log_p.shape == (rows,)
         np.testing.assert_allclose(log_p, log_probabilities, atol=1e-4)
-        np.testing.assert_allclose(drawing.log_p(inputs, raw), log_probabilities, atol=1e-4)
-        np.testing.assert_allclose(drawing.entropy(inputs), entropies, atol=1e-4)
+        np.testing.assert_allclose(sampler.log_p(inputs, raw), log_probabilities, atol=1e-4)
+        np.testing.assert_allclose(sampler.entropy(inputs), entropies, atol=1e-4)
 
 
-def test_the_mode_is_the_most_probable() -> None:
+def test_the_mode_is_the_most_probable_action() -> None:
     several = np.array([[0, 1, 3, 2, 2.5, 9, 8, 7, 8.5]], np.float32)
     assert distribution(SEVERAL).mode(several)[0].tolist() == [[1, 0, 0]]
     assert distribution(Discrete(n=4)).mode(several[:, :4])[0].tolist() == [2]
     assert distribution(NUMBERS).mode(np.array([[0.25, -3, 0, 1]], np.float32))[0].tolist() == [[0.25, -3.0]]
 
 
-def test_samples_of_several_choices_follow_each_and_keep_to_the_masks() -> None:
+def test_multidiscrete_samples_follow_their_probabilities_and_masks() -> None:
     p = [np.array([0.3, 0.7]), np.array([0.2, 0.0, 0.8]), np.array([0.1, 0.2, 0.3, 0.4])]
     with np.errstate(divide="ignore"):
-        logits = np.maximum(np.log(np.concatenate(p)), MASKED).astype(np.float32)
+        logits = np.maximum(np.log(np.concatenate(p)), MASKED_LOGIT).astype(np.float32)
     raw, _ = distribution(SEVERAL).sample(np.tile(logits, (ROWS, 1)), np.random.default_rng(1))
     assert raw.dtype == np.int64
     for i, probabilities in enumerate(p):
@@ -76,7 +76,7 @@ def test_samples_of_several_choices_follow_each_and_keep_to_the_masks() -> None:
     assert chisquare(joint, ROWS * np.outer(p[0], p[2]).ravel()).pvalue > 1e-3
 
 
-def test_samples_of_numbers_are_normal_and_independent() -> None:
+def test_box_samples_are_normal_and_independent() -> None:
     inputs = np.tile(np.array([1.0, -2.0, np.log(0.5), np.log(3)], np.float32), (ROWS, 1))
     raw, _ = distribution(NUMBERS).sample(inputs, np.random.default_rng(1))
     assert raw.dtype == np.float32
@@ -85,7 +85,7 @@ def test_samples_of_numbers_are_normal_and_independent() -> None:
     assert abs(np.corrcoef(raw.T)[0, 1]) < 4 / np.sqrt(ROWS)
 
 
-def test_random_actions_are_uniform_over_what_is_legal() -> None:
+def test_random_actions_are_uniform_over_legal_actions() -> None:
     rng = np.random.default_rng(1)
     mask = np.tile(np.array([1, 1, 0, 1, 1, 1, 0, 0, 1], np.int8), (ROWS, 1))
     raw, inputs = distribution(SEVERAL).uniform(mask, ROWS, rng)
@@ -98,6 +98,6 @@ def test_random_actions_are_uniform_over_what_is_legal() -> None:
     assert kstest(numbers.ravel(), "uniform", (-1, 2)).pvalue > 1e-3
 
 
-def test_spaces_that_no_policy_can_have_are_refused() -> None:
+def test_unsupported_spaces_are_rejected() -> None:
     with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):
         distribution(Box(dtype="int32", shape=(2,), low=0, high=5))

@@ -1,4 +1,4 @@
-"""The runner on an environment whose observations say which agent, which turn and which reset they belong to."""
+"""The runner on an environment whose observations identify agent, turn and reset."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -23,13 +23,13 @@ from ray.rllib.utils.metrics import (
 from league.config import LeagueConfig
 from league.environments.building import interface
 from tests.conformance.stepping import plain_loop
-from tests.league.environments.counting import Counting
-from tests.training.leagues import counting, tictactoe
+from tests.support.counting import Counting
+from tests.support.training_leagues import counting, tictactoe
 from training.algorithms.ppo import algorithm_config
 from training.learners.train_batch import train_batch
+from training.runs.trial import build_algorithm
 from training.sampling.env_runner import LockstepEnvRunner
 from training.sampling.play_metrics import ENTROPY
-from training.trial import build
 
 LIVES = [4, 6]
 CASES = ([], [0], [1], [0, 1])
@@ -40,7 +40,7 @@ def runner_of(league: LeagueConfig) -> LockstepEnvRunner:
     return LockstepEnvRunner(config, worker_index=0)
 
 
-def whole(chunks: Iterable[SingleAgentEpisode]) -> dict[tuple[int, int], list[SingleAgentEpisode]]:
+def by_episode(chunks: Iterable[SingleAgentEpisode]) -> dict[tuple[int, int], list[SingleAgentEpisode]]:
     """(agent, seed modulo 97) → the chunks of its episode, in order."""
     episodes = defaultdict(list)
     for chunk in chunks:
@@ -51,12 +51,12 @@ def whole(chunks: Iterable[SingleAgentEpisode]) -> dict[tuple[int, int], list[Si
 
 @pytest.mark.parametrize("truncated", CASES, ids=str)
 @pytest.mark.parametrize("per_call", [1, 7, 60])
-def test_chunks_put_together_are_what_the_plain_loop_gives(truncated: list[int], per_call: int) -> None:
-    """Observations, summed rewards and the reason of the end; however often sampling is cut."""
+def test_chunks_equal_the_plain_loop(truncated: list[int], per_call: int) -> None:
+    """Observations, summed rewards and endings, for any fragment length."""
     runner = runner_of(counting(LIVES, truncated))
     chunks = [chunk for _ in range(-(-180 // per_call)) for chunk in runner.sample(num_timesteps=per_call)]
     ended = 0
-    for (agent, seed), found in whole(chunks).items():
+    for (agent, seed), found in by_episode(chunks).items():
         env = Counting(tuple(LIVES), tuple(truncated))
         reports = plain_loop(env, seed)[f"player_{agent}"]
         turns = [report[1]["observation"] for report in reports]
@@ -79,11 +79,11 @@ def test_chunks_put_together_are_what_the_plain_loop_gives(truncated: list[int],
 
 
 def test_openings_are_played_but_not_learned_from() -> None:
-    """Episodes begin anywhere within the opening; from there on, all is there."""
+    """Episodes start at any step of the opening; all later steps are recorded."""
     runner = runner_of(counting(LIVES, [], opening_plies=5))
     chunks = [chunk for _ in range(6) for chunk in runner.sample(num_timesteps=51)]
     firsts = set()
-    for (agent, seed), found in whole(chunks).items():
+    for (agent, seed), found in by_episode(chunks).items():
         reports = plain_loop(Counting(tuple(LIVES)), seed)[f"player_{agent}"]
         first = int(found[0].observations.data["observation"][0][1])
         firsts.add((agent, first))
@@ -96,7 +96,7 @@ def test_openings_are_played_but_not_learned_from() -> None:
     assert sum(stat.peek() for stat in metrics[NUM_MODULE_STEPS_SAMPLED].values()) < 306
 
 
-def test_every_chunk_has_an_id_of_its_own() -> None:
+def test_each_chunk_has_a_unique_id() -> None:
     runner = runner_of(counting(LIVES, []))
     chunks = [chunk for _ in range(30) for chunk in runner.sample(num_timesteps=5)]
     for ids in ([chunk.id_ for chunk in chunks], [chunk.multi_agent_episode_id for chunk in chunks]):
@@ -116,15 +116,15 @@ def test_log_probabilities_belong_to_the_actions_and_observations() -> None:
         np.testing.assert_allclose(extra[Columns.ACTION_LOGP].data, expected.numpy(), atol=1e-5)
 
 
-def test_metrics_count_what_was_played() -> None:
+def test_metrics_count_the_played_steps() -> None:
     runner = runner_of(counting(LIVES, []))
     runner.sample(num_timesteps=300)
     metrics = runner.get_metrics()
-    peeked = {key: metrics[key].peek() for key in (NUM_ENV_STEPS_SAMPLED, NUM_EPISODES, EPISODE_LEN_MEAN)}
-    assert peeked[NUM_ENV_STEPS_SAMPLED] == 300
-    assert peeked[NUM_EPISODES] == 30
-    assert peeked[EPISODE_LEN_MEAN] == sum(LIVES)
-    # Player i has 10^i of each move until its own last one; moves alternate until player 0 has left.
+    values = {key: metrics[key].peek() for key in (NUM_ENV_STEPS_SAMPLED, NUM_EPISODES, EPISODE_LEN_MEAN)}
+    assert values[NUM_ENV_STEPS_SAMPLED] == 300
+    assert values[NUM_EPISODES] == 30
+    assert values[EPISODE_LEN_MEAN] == sum(LIVES)
+    # Player i gets 10^i for each move until its last one; moves alternate until player 0 has left.
     returns = {policy: stat.peek() for policy, stat in metrics[EPISODE_MODULE_RETURN_MEAN].items()}
     assert returns == {"policy_0": 7.0, "policy_1": 100.0}
     steps = {policy: stat.peek() for policy, stat in metrics[NUM_MODULE_STEPS_SAMPLED].items()}
@@ -133,7 +133,7 @@ def test_metrics_count_what_was_played() -> None:
     assert runner.get_metrics()[NUM_ENV_STEPS_SAMPLED].peek() == 0
 
 
-def test_every_reset_has_its_own_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_reset_has_its_own_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[int] = []
     reset = Counting.reset
 
@@ -152,7 +152,7 @@ def test_every_reset_has_its_own_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(set(seeds)) == len(seeds)
 
 
-def test_a_seed_decides_the_play() -> None:
+def test_the_seed_determines_the_play() -> None:
     def play(seed: int) -> list[list[int]]:
         torch.manual_seed(0)
         runner = runner_of(tictactoe(seed=seed))
@@ -163,7 +163,7 @@ def test_a_seed_decides_the_play() -> None:
     assert play(1) != play(2)
 
 
-def test_whole_episodes_greedy_and_random_play() -> None:
+def test_complete_episodes_with_greedy_and_random_play() -> None:
     runner = runner_of(tictactoe())
     assert sum(chunk.is_done for chunk in runner.sample(num_episodes=6)) >= 12
     greedy = runner.sample(num_timesteps=40, explore=False, force_reset=True)
@@ -179,22 +179,22 @@ def test_whole_episodes_greedy_and_random_play() -> None:
 
 
 def test_a_sample_is_never_empty() -> None:
-    """Less than a move in each copy closes nothing: the runner plays on until something is closed."""
+    """Less than one move per environment closes no step: the runner continues until a step is closed."""
     chunks = runner_of(tictactoe()).sample(num_timesteps=1)
     assert sum(map(len, chunks)) >= 1
 
 
-def test_weights_are_taken_over_if_they_are_newer() -> None:
+def test_newer_weights_are_applied() -> None:
     runner, other = runner_of(tictactoe()), runner_of(tictactoe(seed=9))
     weights = other.get_state(COMPONENT_RL_MODULE)[COMPONENT_RL_MODULE]
 
     def value() -> float:
         return float(runner.module["shared"].policy_head.weight.detach().sum())
 
-    before = value()
+    initial = value()
     runner.set_state({COMPONENT_RL_MODULE: weights, WEIGHTS_SEQ_NO: 3})
     newer = value()
-    assert newer != before
+    assert newer != initial
     old = runner_of(tictactoe(seed=10)).get_state(COMPONENT_RL_MODULE)[COMPONENT_RL_MODULE]
     runner.set_state({COMPONENT_RL_MODULE: old, WEIGHTS_SEQ_NO: 2})
     assert value() == newer
@@ -204,7 +204,7 @@ def test_weights_are_taken_over_if_they_are_newer() -> None:
 
 
 @pytest.mark.parametrize("truncated", CASES, ids=str)
-def test_rllibs_own_learner_takes_the_episodes_and_agrees_on_value_targets(truncated: list[int]) -> None:
+def test_rllibs_learner_accepts_the_episodes_and_agrees_on_value_targets(truncated: list[int]) -> None:
     league = counting(LIVES, truncated)
     runner = runner_of(league)
     episodes = [episode for _ in range(3) for episode in runner.sample(num_timesteps=50)]
@@ -236,15 +236,15 @@ def test_rllibs_own_learner_takes_the_episodes_and_agrees_on_value_targets(trunc
         ):
             expected = theirs[policy][column][kept].numpy()
             np.testing.assert_allclose(mine.numpy(), expected, rtol=1e-3, atol=1e-3)
-    # RLlib's pipeline lengthens the episodes that it is given.
+    # RLlib's pipeline modifies the episodes.
     fresh = runner.sample(num_timesteps=50)
     assert learner.update(episodes=fresh, num_epochs=1, minibatch_size=32, timesteps={})
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_remote_runners_share_no_seed_and_are_in_step_with_the_learner() -> None:
-    league = tictactoe(runners=2, copies=2, train_batch_size=64, minibatch_size=32, epochs=1)
-    algorithm = build(league, interface(league), runner_cpus=0.5)
+def test_remote_runners_have_distinct_seeds_and_the_weights_of_the_learner() -> None:
+    league = tictactoe(runners=2, num_envs=2, train_batch_size=64, minibatch_size=32, epochs=1)
+    algorithm = build_algorithm(league, interface(league), runner_cpus=0.5)
     try:
         for _ in range(2):
             algorithm.train()
@@ -257,13 +257,13 @@ def test_remote_runners_share_no_seed_and_are_in_step_with_the_learner() -> None
             assert state[WEIGHTS_SEQ_NO] == learner._weights_seq_no
             for name, array in state[COMPONENT_RL_MODULE]["shared"].items():
                 np.testing.assert_array_equal(array, expected[name])
-        used = [{seeds(copy, episode) for copy in range(2) for episode in range(50)} for _, seeds in states]
+        used = [{seeds(env, episode) for env in range(2) for episode in range(50)} for _, seeds in states]
         assert len(used[0]) == len(used[1]) == 100
         assert not used[0] & used[1]
-        algorithm.begin_anew(128)
-        begun = algorithm.env_runner_group.foreach_env_runner(
+        algorithm.reset_episodes(128)
+        started = algorithm.env_runner_group.foreach_env_runner(
             lambda runner: runner._play._seeds.steps, local_env_runner=False
         )
-        assert begun == [128, 128]
+        assert started == [128, 128]
     finally:
         algorithm.stop()

@@ -1,4 +1,4 @@
-"""The runner in every kind of environment and with every kind of policy: its chunks are what the module says."""
+"""The runner in each kind of environment and with each kind of policy: its chunks equal the outputs of the module."""
 
 import logging
 from collections import defaultdict
@@ -27,32 +27,32 @@ from league.errors import ConfigError, InvalidReward
 from league.policies.actions import to_environment
 from league.registry.registry import Registry
 from league.settings import Storage
-from league.spaces import to_gymnasium
-from tests.league.environments.simultaneous import Meeting
-from tests.league.policies.graphs import masked_mlp
-from tests.league.registry import examples
-from tests.test_environments import CASES, Case
-from tests.training.leagues import solvable, tictactoe
+from league.spaces.conversion import to_gymnasium
+from tests.support import registries
+from tests.support.environment_cases import CASES, Case
+from tests.support.graphs import masked_mlp
+from tests.support.simultaneous import Simultaneous
+from tests.support.training_leagues import solvable, tictactoe
 from training.algorithms.ppo import algorithm_config
 from training.sampling.env_runner import LockstepEnvRunner
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import CRASHES, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 from training.sampling.reset_seeds import ResetSeeds
 
-MEETING = "tests.league.environments.simultaneous:meeting"
-RLLIB_MEETING = "tests.league.environments.simultaneous:rllib_meeting"
+MEETING = "tests.support.simultaneous:meeting"
+RLLIB_MEETING = "tests.support.simultaneous:rllib_meeting"
 
 
 def simultaneous(
     entry_point: str, agents: int = 2, kwargs: dict[str, Any] | None = None, **training: Any
 ) -> LeagueConfig:
-    """Each agent its own policy."""
+    """Each agent has its own policy."""
     return LeagueConfig.from_mapping(
         {
             "league": "together",
             "environment": {"entry_point": entry_point, "kwargs": kwargs or {}},
             "policies": {f"policy_{i}": [f"agent_{i}"] for i in range(agents)},
-            "training": {"runners": 0, "copies": 3, "hidden": [8], "seed": 5} | training,
+            "training": {"runners": 0, "num_envs": 3, "hidden": [8], "seed": 5} | training,
         }
     )
 
@@ -62,7 +62,7 @@ def spread(**training: Any) -> LeagueConfig:
         {
             "league": "spread",
             "environment": {"entry_point": "mpe2.simple_spread_v3", "kwargs": {"max_cycles": 6}},
-            "training": {"runners": 0, "copies": 2, "hidden": [8], "seed": 5} | training,
+            "training": {"runners": 0, "num_envs": 2, "hidden": [8], "seed": 5} | training,
         }
     )
 
@@ -90,11 +90,11 @@ def columns(chunk: SingleAgentEpisode) -> dict[str, Any]:
 KINDS = {
     "simultaneous": spread(),
     "turns": tictactoe(),
-    "several": solvable("several", copies=3),
-    "numbers": solvable("numbers", copies=3),
-    "memory": solvable("remembering", copies=3, recurrence={"width": 4, "sequence": 8}),
+    "several": solvable("several", num_envs=3),
+    "numbers": solvable("numbers", num_envs=3),
+    "memory": solvable("remembering", num_envs=3, recurrence={"width": 4, "sequence": 8}),
     "shared": solvable(
-        "discrete", {"agents": 2}, {"a": ["player_0"], "b": ["player_1"]}, copies=3, shared_encoder=True
+        "discrete", {"agents": 2}, {"a": ["player_0"], "b": ["player_1"]}, num_envs=3, shared_encoder=True
     ),
     "rllib": simultaneous(RLLIB_MEETING),
     "early": simultaneous(MEETING, 3, {"arrives": [0, 1, 0], "leaves": [2, 4, 3], "truncated": [1]}),
@@ -102,8 +102,8 @@ KINDS = {
 
 
 @pytest.mark.parametrize("league", KINDS.values(), ids=KINDS)
-def test_what_was_done_is_what_the_module_says(league: LeagueConfig) -> None:
-    """Inputs of the distributions and log-probabilities, recomputed from the observations, states and raw actions."""
+def test_chunks_equal_the_outputs_of_the_module(league: LeagueConfig) -> None:
+    """Distribution inputs and log-probabilities, recomputed from observations, states and raw actions."""
     runner = runner_of(league)
     chunks = [chunk for _ in range(4) for chunk in runner.sample(num_timesteps=25)]
     assert {chunk.module_id for chunk in chunks} == set(runner.interface.policy_ids)
@@ -132,40 +132,40 @@ def test_what_was_done_is_what_the_module_says(league: LeagueConfig) -> None:
 
 
 @pytest.mark.parametrize("league", KINDS.values(), ids=KINDS)
-def test_two_runners_that_begin_anew_alike_play_alike(league: LeagueConfig) -> None:
+def test_runners_reset_at_the_same_step_play_identically(league: LeagueConfig) -> None:
     first, second = runner_of(league), runner_of(league)
     first.sample(num_timesteps=37)
     for runner in (first, second):
-        runner.begin_anew(5000)
+        runner.reset_episodes(5000)
     mine, theirs = ([columns(chunk) for chunk in runner.sample(num_timesteps=60)] for runner in (first, second))
     assert mine == theirs
-    second.begin_anew(5001)
+    second.reset_episodes(5001)
     assert [columns(chunk) for chunk in second.sample(num_timesteps=60)] != mine
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.entry_point.rpartition(".")[2])
-def test_nothing_of_an_environments_past_is_left_where_play_begins_anew(case: Case) -> None:
-    """So that training that is resumed goes on as it would have, in every environment of PettingZoo and mpe2."""
+def test_a_reset_removes_the_history_of_the_environment(case: Case) -> None:
+    """Resumed training depends on it, in each environment of PettingZoo and mpe2."""
     league = case.league()
     first, second = runner_of(league), runner_of(league)
     first.sample(num_timesteps=40)
     for runner in (first, second):
-        runner.begin_anew(5000)
+        runner.reset_episodes(5000)
     mine, theirs = ([columns(chunk) for chunk in runner.sample(num_timesteps=40)] for runner in (first, second))
     assert mine == theirs
     for runner in (first, second):
         runner.stop()
 
 
-def test_agents_that_come_late_and_leave_early_have_their_own_steps_and_ends() -> None:
+def test_agents_that_join_late_and_leave_early_have_their_own_steps_and_endings() -> None:
     runner = runner_of(KINDS["early"])
     chunks = runner.sample(num_episodes=9)
-    whole = {chunk.agent_id: chunk for chunk in chunks if chunk.is_done}
-    assert {agent: len(chunk) for agent, chunk in whole.items()} == {"agent_0": 2, "agent_1": 3, "agent_2": 3}
-    assert whole["agent_1"].is_truncated
-    assert not whole["agent_1"].is_terminated
-    assert whole["agent_0"].is_terminated
-    assert whole["agent_2"].rewards.data.tolist() == [100.0] * 3
+    complete = {chunk.agent_id: chunk for chunk in chunks if chunk.is_done}
+    assert {agent: len(chunk) for agent, chunk in complete.items()} == {"agent_0": 2, "agent_1": 3, "agent_2": 3}
+    assert complete["agent_1"].is_truncated
+    assert not complete["agent_1"].is_terminated
+    assert complete["agent_0"].is_terminated
+    assert complete["agent_2"].rewards.data.tolist() == [100.0] * 3
     metrics = runner.get_metrics()
     assert metrics[EPISODE_LEN_MEAN].peek() == 4
     assert metrics[EPISODE_RETURN_MEAN].peek() == 2 + 30 + 300
@@ -180,8 +180,8 @@ def test_agents_that_come_late_and_leave_early_have_their_own_steps_and_ends() -
 
 
 @pytest.mark.parametrize("plies", [0, 4])
-def test_a_step_of_a_simultaneous_environment_is_one_of_its_opening(plies: int) -> None:
-    runner = runner_of(spread(opening_plies=plies, copies=4))
+def test_a_simultaneous_step_is_one_opening_ply(plies: int) -> None:
+    runner = runner_of(spread(opening_plies=plies, num_envs=4))
     chunks = runner.sample(num_episodes=40)
     lengths = defaultdict(set)
     for chunk in chunks:
@@ -205,7 +205,7 @@ def test_greedy_play_takes_the_mode() -> None:
         np.testing.assert_array_equal(chunk.actions.data, means)
 
 
-def test_sampling_leaves_the_threads_of_the_process_as_they_are() -> None:
+def test_sampling_preserves_the_number_of_threads() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -219,14 +219,14 @@ def crashing(seeds: list[int], **training: Any) -> LeagueConfig:
     return simultaneous(MEETING, 2, {"leaves": [4, 4], "crashes": seeds}, **training)
 
 
-def of_episodes(*places: tuple[int, int]) -> list[int]:
-    """The seeds of some (copy, episode) of the league above."""
-    seeds = ResetSeeds.of_run(5, runner=0, runners=1, copies=3, steps=0)
-    return [seeds(copy, episode) for copy, episode in places]
+def seeds_of_episodes(*places: tuple[int, int]) -> list[int]:
+    """The seeds of some (environment, episode) of the league above."""
+    seeds = ResetSeeds.of_run(5, runner=0, runners=1, num_envs=3, steps=0)
+    return [seeds(env, episode) for env, episode in places]
 
 
-def test_a_crash_costs_its_own_episode_and_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    seeds = of_episodes((0, 0), (1, 2), (1, 3))
+def test_a_crash_costs_its_own_episode_and_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    seeds = seeds_of_episodes((0, 0), (1, 2), (1, 3))
     runner = runner_of(crashing(seeds))
     with caplog.at_level(logging.WARNING):
         chunks = runner.sample(num_episodes=30)
@@ -238,7 +238,7 @@ def test_a_crash_costs_its_own_episode_and_is_told(caplog: pytest.LogCaptureFixt
     done = [chunk for chunk in chunks if chunk.is_done]
     assert len(done) == 2 * episodes
     assert all(len(chunk) == 4 for chunk in done)
-    # Two steps of both agents were played in each episode that crashed, and are in no chunk.
+    # Both agents played two steps in each crashed episode, which are in no chunk.
     under_way = sum(len(chunk) for chunk in chunks if not chunk.is_done)
     assert metrics[NUM_ENV_STEPS_SAMPLED].peek() == sum(map(len, done)) + under_way + 3 * 4
     lost = {int(seed) % 97 for seed in seeds}
@@ -246,26 +246,26 @@ def test_a_crash_costs_its_own_episode_and_is_told(caplog: pytest.LogCaptureFixt
     assert runner.get_metrics()[CRASHES].peek() == 0
 
 
-def test_too_many_crashes_in_a_row_are_the_environments_own() -> None:
+def test_too_many_consecutive_crashes_are_raised() -> None:
     places = [(0, episode) for episode in range(3)]
     with pytest.raises(RuntimeError, match="the simulator is gone"):
-        runner_of(crashing(of_episodes(*places), crashes=2)).sample(num_episodes=30)
+        runner_of(crashing(seeds_of_episodes(*places), crashes=2)).sample(num_episodes=30)
 
 
-def test_a_reward_that_is_no_number_names_the_league(monkeypatch: pytest.MonkeyPatch) -> None:
-    step = Meeting.step
+def test_an_invalid_reward_names_the_league(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Simultaneous.step
 
-    def broken(self: Meeting, actions: dict[str, int]) -> tuple[dict, ...]:
+    def step_with_nan(self: Simultaneous, actions: dict[str, int]) -> tuple[dict, ...]:
         seen, rewards, *flags = step(self, actions)
         return seen, rewards | {"agent_1": float("nan")}, *flags
 
     runner = runner_of(simultaneous(MEETING))
-    monkeypatch.setattr(Meeting, "step", broken)
+    monkeypatch.setattr(Simultaneous, "step", step_with_nan)
     with pytest.raises(InvalidReward, match=r"^league together: agent agent_1 got a reward of nan"):
         runner.sample(num_timesteps=30)
 
 
-def test_what_is_wrong_at_set_up_names_the_league_once() -> None:
+def test_a_fault_at_setup_names_the_league_once() -> None:
     league = spread()
     config = algorithm_config(league, interface(league))
     config.env_config["league"]["training"]["opponents"] = [{"ref": "script:random", "share": 1.0}]
@@ -274,7 +274,7 @@ def test_what_is_wrong_at_set_up_names_the_league_once() -> None:
         LockstepEnvRunner(config, worker_index=0)
 
 
-def test_copies_are_closed_and_built_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environments_are_closed_and_rebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
     monkeypatch.setattr(lockstep.Lockstep, "close", lambda self: closed.append(self))
     runner = runner_of(tictactoe())
@@ -289,19 +289,19 @@ def test_copies_are_closed_and_built_again(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(closed) == 2
 
 
-def test_a_version_plays_the_other_side_as_it_explores(tmp_path: Path) -> None:
-    """It is loaded once, also where the episodes begin anew; its moves are in no chunk."""
+def test_a_version_plays_the_other_side_with_exploration(tmp_path: Path) -> None:
+    """It is loaded once, even after a reset; its moves are in no chunk."""
     storage = Storage.at(tmp_path)
     registry = Registry.open(storage)
-    registry.register(examples.config(), examples.interface())
+    registry.leagues.register(registries.config(), registries.interface())
     graph = masked_mlp((3, 3, 2), actions=9)
-    row = registry.publish("tictactoe", examples.builder(graph=graph), source="run/1", parent=None)
+    row = registry.publisher.publish("tictactoe", registries.builder(graph=graph), source="run/1", parent=None)
     registry.close()
     runner = runner_of(tictactoe(opponents=[{"ref": row.ref, "share": 1.0}]), storage)
     opponents = runner._play._opponents  # type: ignore[union-attr]
     assert isinstance(opponents, Opponents)
     chunks = runner.sample(num_episodes=20)
-    runner.begin_anew(1000)
+    runner.reset_episodes(1000)
     chunks += runner.sample(num_episodes=20)
     assert runner._play._opponents is opponents  # type: ignore[union-attr]
     assert {chunk.agent_id for chunk in chunks} == {"player_1", "player_2"}

@@ -1,0 +1,180 @@
+"""Is this code as fast as another checkout of it: serving, sampling, stepping and a tournament?
+
+    python -m benchmarks.revisions CHECKOUT [--only PART] [--rounds N] [--seconds S]
+
+Both checkouts use the installed dependencies. Each measures itself with its own benchmark modules, in a process of its
+own; they alternate within a round, each second round in reverse order, and a ratio is the median over the rounds. Rates
+are those of one core, except for serving, where the server, HAProxy and the load generator share all cores.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from statistics import median
+from typing import IO
+
+HERE = Path(__file__).parents[1]
+AT_LEAST = 0.97
+"""Minimum ratio of each rate to that of the other checkout."""
+WORKER = """
+import itertools, logging, os, sys, tempfile, time, warnings
+from pathlib import Path
+
+warnings.simplefilter("ignore")
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+# Results go to the real standard output, and what libraries print goes to standard error.
+results = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+logging.disable(logging.WARNING)
+home = Path(tempfile.mkdtemp(dir=sys.argv[1]))
+
+
+def repeat(step, seconds):
+    "Results of `step` per second, summed."
+    done, start = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - start) < seconds:
+        done += step()
+    return done / elapsed
+
+
+%s
+
+rate(0.5)
+for line in sys.stdin:
+    print(rate(float(line)), file=results, flush=True)
+"""
+STEPPING = """
+from dataclasses import fields
+from benchmarks.stepping import CASES, lockstep
+
+config, number, *_ = (getattr(CASES["{case}"], field.name) for field in fields(CASES["{case}"]))
+environment = lockstep(config, number)
+
+
+def rate(seconds):
+    return repeat(lambda: next(environment) or number, seconds)
+"""
+SAMPLING = """
+import torch
+from benchmarks import sampling
+
+torch.set_num_threads(1)
+runner = sampling.ours(sampling.{environment}, 32)
+
+
+def rate(seconds):
+    return repeat(lambda: runner.sample(num_timesteps=2000) and 2000, seconds)
+"""
+TOURNAMENT = """
+from benchmarks import evaluation
+from benchmarks.evaluated_league import publish
+
+registry, _ = publish(home, 2)
+schedules = evaluation._schedules(registry, blocks=16)
+
+
+def rate(seconds):
+    return repeat(lambda: evaluation._tournament(next(schedules), registry, 0) and 1, seconds)
+"""
+SERVING = """
+from benchmarks.load import measure
+from benchmarks.served_league import BODY, publish
+from benchmarks.serving import _ours
+
+storage = publish(home, versions=1).storage
+
+
+def rate(seconds):
+    with _ours(storage, 1) as url:
+        return measure(url, BODY, connections=32, seconds=10 * seconds, warm_up=4).rate
+"""
+PARTS = {
+    "stepping connect_four": STEPPING.format(case="connect_four"),
+    "stepping simple_spread": STEPPING.format(case="simple_spread"),
+    "sampling connect_four": SAMPLING.format(environment="FOUR"),
+    "sampling simple_spread": SAMPLING.format(environment="SPREAD"),
+    "tournament": TOURNAMENT,
+    "serving": SERVING,
+}
+
+
+class Worker:
+    """A process that measures one checkout on request."""
+
+    def __init__(self, checkout: Path, program: str, scratch: str) -> None:
+        one_thread = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": ""}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", WORKER % program, scratch],
+            cwd=checkout,
+            env=os.environ | one_thread,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+
+    def measure(self, seconds: float) -> float:
+        """Results per second."""
+        print(seconds, file=self._stream(self._process.stdin), flush=True)
+        line = self._stream(self._process.stdout).readline()
+        if not line:
+            raise RuntimeError(f"a measurement ended with exit code {self._process.wait()}")
+        return float(line)
+
+    def close(self) -> None:
+        """End the process."""
+        self._stream(self._process.stdin).close()
+        self._process.wait()
+
+    @staticmethod
+    def _stream(stream: IO[str] | None) -> IO[str]:
+        assert stream is not None
+        return stream
+
+
+def main() -> int:
+    """Print rates and ratios; 1 if a ratio is below 0.97."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkout", type=Path)
+    parser.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"of {', '.join(PARTS)}")
+    parser.add_argument("--rounds", type=int, default=11)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    options = parser.parse_args()
+    failed = False
+    print(f"{'':>24} {'this':>10} {'other':>10}   per second")
+    for name in options.only or PARTS:
+        rounds = list(_rounds(options.checkout, PARTS[name], options.rounds, options.seconds))
+        this, other = (median(rates) for rates in zip(*rounds, strict=True))
+        ratio = median(mine / theirs for mine, theirs in rounds)
+        failed |= ratio < AT_LEAST
+        spread = ", ".join(f"{mine / theirs:.2f}" for mine, theirs in rounds)
+        print(f"{name:>24} {this:>10,.0f} {other:>10,.0f}   {ratio:.3f}x (at least {AT_LEAST}x; {spread})", flush=True)
+    return int(failed)
+
+
+def _rounds(checkout: Path, program: str, rounds: int, seconds: float) -> Iterator[tuple[float, float]]:
+    """The rates of this and the other checkout, in each round."""
+    with _workers(checkout, program) as workers:
+        for number in range(rounds):
+            order = (0, 1) if number % 2 == 0 else (1, 0)
+            rates = {which: workers[which].measure(seconds) for which in order}
+            yield rates[0], rates[1]
+
+
+@contextmanager
+def _workers(checkout: Path, program: str) -> Iterator[tuple[Worker, Worker]]:
+    with ExitStack() as stack:
+        scratch = stack.enter_context(tempfile.TemporaryDirectory())
+        first, second = (
+            stack.enter_context(closing(Worker(each, program, scratch))) for each in (HERE, checkout.resolve())
+        )
+        yield first, second
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""Arguments and options that several commands share, and the registry that they work on."""
+
+import gc
+import os
+from functools import cache
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from league.registry.registry import Registry
+
+CORES = os.cpu_count() or 1
+
+Config = Annotated[
+    str,
+    typer.Argument(metavar="CONFIG", help="YAML file, or name of a bundled configuration such as connect_four."),
+]
+LeagueName = Annotated[str, typer.Argument(metavar="LEAGUE", help="Name of the league, such as connect_four.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
+Reason = Annotated[str, typer.Option(help="Reason, recorded in the history.")]
+Actor = Annotated[
+    str | None, typer.Option(help="Name recorded in the history. Default: the current user of this machine.")
+]
+Timeout = Annotated[float, typer.Option(min=0, help="Maximum time for --wait, in seconds.")]
+Workers = Annotated[
+    int, typer.Option(min=0, help="Number of Ray tasks that play games in parallel; 0 plays in this process.")
+]
+EvaluationCluster = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="Ray cluster to play on; `auto` selects the one running on this machine."),
+]
+
+
+def open_registry() -> "Registry":
+    """Open the registry of the environment variables. Imports SQLAlchemy."""
+    return _registry_class().open()
+
+
+@cache
+def _registry_class() -> "type[Registry]":
+    from league.registry.registry import Registry
+
+    gc.freeze()  # The imported modules stay until the end. Searching them for garbage takes 0.1 s.
+    return Registry

@@ -1,0 +1,1 @@
+"""The promotion gate: sequential tests, verdicts and their verification, nightly runs."""

@@ -1,0 +1,52 @@
+"""Anchors of a gate: named contestants and former champions against which a candidate must not be inferior.
+
+A candidate that beats the champion may lose to earlier champions. In a cycle such as rock, paper, scissors, beating
+the current champion is not progress.
+"""
+
+from __future__ import annotations
+
+from league.config import AnchorConfig
+from league.errors import UnknownAlias
+from league.policies.loading import check_eligible, pinned
+from league.refs import of_league
+from league.registry.registry import Registry
+from league.registry.storage.rows import LeagueRow
+
+
+def resolve_anchors(registry: Registry, league: LeagueRow, candidate: int, champion: str) -> list[AnchorConfig]:
+    """Resolve the anchors of a new verdict to fixed references, in the order of testing: named anchors first.
+
+    The candidate and the champion are left out, as are aliases that do not exist yet.
+    Raises UnknownVersion, UnknownPolicy, EnvironmentMismatch and InvalidReference for anchors that cannot play.
+    """
+    gate = league.config.gate
+    wanted = [*gate.anchors, *(AnchorConfig(ref=ref) for ref in earlier_champions(registry, league))]
+    found: dict[str, AnchorConfig] = {}
+    for anchor in wanted:
+        try:
+            ref = pinned(of_league(anchor.ref, league.slug), league.slug, registry)
+        except UnknownAlias:
+            continue
+        check_eligible(ref, registry, league.config)
+        if ref not in (f"{league.slug}@{candidate}", champion):
+            found.setdefault(ref, anchor.model_copy(update={"ref": ref}))
+    return list(found.values())
+
+
+def earlier_champions(registry: Registry, league: LeagueRow) -> list[str]:
+    """The last `gate.earlier_champions` former champions, newest first.
+
+    Versions that were rolled back or trained in another environment are left out.
+    """
+    events = registry.aliases.history(league.slug)
+    rolled_back = {event.previous for event in events if event.kind == "rollback"}
+    reigned = dict.fromkeys(event.version for event in events)
+    now = events[0].version if events else None
+    refs: list[str] = []
+    for number in reigned:
+        if number == now or number in rolled_back or len(refs) == league.config.gate.earlier_champions:
+            continue
+        if registry.versions.get(league.slug, number).manifest.environment_digest == league.environment_digest:
+            refs.append(f"{league.slug}@{number}")
+    return refs

@@ -1,0 +1,365 @@
+"""The gate: sequential tests against the champion and the anchors decide `promote`, `reject` or `inconclusive`.
+
+The evidence is the score of each block, tested by a GSPRT on Elo. With the model `returns` it is the difference of
+returns, tested by betting. A decision is a function of the settings and of the blocks in schedule order. It does not
+depend on completion times, the number of workers, or blocks after the stopping block.
+
+docs/statistics.md explains how α is spent over a year, and why a candidate that must pass all tests is promoted
+wrongly with at most the α of one (R. L. Berger, "Multiparameter hypothesis testing and acceptance sampling",
+Technometrics 24, 1982).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.matches.game_records import forfeit_difference, unique_games
+from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
+from league.config import GateConfig
+from league.errors import BoundExceeded
+from league.results.records import GAMES_PER_BLOCK, Match
+
+YEAR = timedelta(days=365)
+
+NIGHTS = 365
+"""Nightly runs per year over which α is spent."""
+
+
+def alpha_per_verdict(candidates: int, alpha: float, nights: int = NIGHTS) -> float:
+    """The α of each verdict of a nightly run.
+
+    Args:
+        candidates: Candidates of the nightly run.
+        alpha: The α of a year.
+        nights: Nightly runs of a year.
+
+    Raises:
+        ValueError: Without candidates or runs, or for an alpha outside (0, 1).
+    """
+    if candidates < 1 or nights < 1 or not 0 < alpha < 1:
+        raise ValueError(
+            f"expected candidates >= 1, nights >= 1 and 0 < alpha < 1, got {candidates}, {nights}, {alpha}"
+        )
+    return alpha / nights / candidates
+
+
+def alpha_spent(verdicts: Iterable[tuple[datetime, float]], now: datetime) -> float:
+    """The α spent in the year before `now`. verdicts: when each was opened, and its α."""
+    return sum(alpha for opened_at, alpha in verdicts if now - YEAR < opened_at)
+
+
+def alpha_share(candidates: int, alpha: float, nights: int, spent: float) -> float:
+    """The α of each verdict of a nightly run when `spent` of the year's α is used; 0 if nothing is left."""
+    return max(0.0, min(alpha_per_verdict(candidates, alpha, nights), (alpha - spent) / candidates))
+
+
+Outcome = Literal["promote", "reject", "inconclusive"]
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """State of a sequential test.
+
+    Attributes:
+        outcome: None while the test is open.
+        llr: LLR after the last counted block; 0.0 without blocks.
+        bounds: The values of the LLR at which the test decides.
+        blocks: Counted blocks. A decided test stopped at the last of them.
+        games: Games of these blocks.
+        unique_games: Distinct games among them; None if the moves are unknown.
+        counts: Blocks per cell, worst for the candidate first.
+        curve: LLR after each block. For a betting test, the log wealth of the bettor against H0 (positive) or against
+            H1 (negative), whichever is larger.
+        estimate: Logistic Elo of the candidate above its opponent; None without blocks.
+    """
+
+    outcome: Outcome | None
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    unique_games: int | None
+    counts: tuple[int, ...]
+    curve: tuple[float, ...]
+    estimate: EloEstimate | None
+
+    @property
+    def score(self) -> float | None:
+        """The candidate's mean score over the counted blocks; None without blocks."""
+        top = len(self.counts) - 1
+        return sum(i * n for i, n in enumerate(self.counts)) / (top * self.blocks) if self.blocks else None
+
+
+def decide(
+    settings: GateConfig,
+    block_scores: Sequence[float],
+    comparisons: int = 2,
+    differences: Sequence[float] = (),
+) -> Decision:
+    """Decide from the candidate's score in each block.
+
+    The outcome is `promote` at the first block whose LLR reaches the upper bound, `reject` at the lower bound, and
+    `inconclusive` at `max_blocks`. Blocks after the stopping block do not count.
+
+    Args:
+        settings: Configuration of the gate.
+        block_scores: Mean score in [0, 1] of each block, in schedule order.
+        comparisons: Comparisons per block: 2 if both games compare the contestants, 1 if each contestant plays one
+            game.
+        differences: Return of the candidate minus that of its opponent in each block, for the model `returns`.
+
+    Raises:
+        ValueError: For impossible scores.
+        BoundExceeded: For a difference beyond `return_bound`.
+    """
+    limits = decision_bounds(settings)
+    counts = _cumulated(block_scores[: settings.max_blocks], comparisons)
+    if settings.model == "returns":
+        curve = _wealth(settings, differences[: settings.max_blocks])
+    else:
+        curve = gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
+    crossed = _crossed(curve, limits)
+    blocks = int(crossed[0]) + 1 if crossed.size else len(counts)
+    outcome: Outcome | None = None
+    if crossed.size:
+        outcome = "promote" if curve[blocks - 1] >= limits[1] else "reject"
+    elif blocks == settings.max_blocks:
+        outcome = "inconclusive"
+    return Decision(
+        outcome=outcome,
+        llr=float(curve[blocks - 1]) if blocks else 0.0,
+        bounds=limits,
+        blocks=blocks,
+        games=blocks * GAMES_PER_BLOCK,
+        unique_games=None,
+        counts=tuple(int(n) for n in counts[blocks - 1]) if blocks else (0,) * (2 * comparisons + 1),
+        curve=tuple(float(llr) for llr in curve[:blocks]),
+        estimate=elo_estimate(counts[blocks - 1], "logistic") if blocks else None,
+    )
+
+
+def decide_matches(settings: GateConfig, matches: Sequence[Match], candidate: str) -> Decision:
+    """Decide from matches, and count the unique games among those that count.
+
+    Args:
+        settings: Configuration of the gate.
+        matches: Matches in schedule order.
+        candidate: Reference of the candidate.
+    """
+    differences = _differences(settings, matches, candidate) if settings.model == "returns" else ()
+    decision = decide(settings, *_block_scores(matches, candidate), differences)
+    return replace(decision, unique_games=unique_games(matches[: decision.blocks]))
+
+
+def shadow_shortfall(
+    settings: GateConfig, observations: int, failed: int, agreement: float | None, latency_ms: float | None
+) -> str | None:
+    """Why the observations of a candidate as the champion's shadow are insufficient for promotion.
+
+    Args:
+        settings: Configuration of the gate.
+        observations: Mirrored observations.
+        failed: Requests that the candidate could not answer.
+        agreement: Share of observations for which it chose the champion's action.
+        latency_ms: 95th percentile of its computation time, in milliseconds.
+
+    Returns:
+        A sentence, or None if the candidate may be tested.
+    """
+    if settings.shadow_agreement is None and settings.latency_ms is None:
+        return None
+    if observations < settings.shadow_observations or agreement is None or latency_ms is None:
+        return (
+            f"it has {observations} observations as the champion's shadow, but the gate requires"
+            f" {settings.shadow_observations} for shadow_agreement and latency_ms"
+        )
+    if failed:
+        return f"as a shadow it failed to answer {failed} requests"
+    if settings.shadow_agreement is not None and agreement < settings.shadow_agreement:
+        return (
+            f"as a shadow it agreed with the champion on {agreement:.1%} of {observations} observations,"
+            f" but the gate requires {settings.shadow_agreement:.1%}"
+        )
+    if settings.latency_ms is not None and latency_ms > settings.latency_ms:
+        return (
+            f"as a shadow it computed 95 % of the requests within {latency_ms:g} ms,"
+            f" but the gate requires {settings.latency_ms:g} ms"
+        )
+    return None
+
+
+class SequentialMonitor:
+    """Follows the matches of a verdict incrementally and detects the end of its test.
+
+    It processes each block once. `decide_matches` makes the decision itself.
+    """
+
+    def __init__(self, settings: GateConfig, candidate: str) -> None:
+        self._settings, self._candidate = settings, candidate
+        self.bounds = decision_bounds(settings)
+        self.llr = 0.0
+        self._counts: NDArray[np.int64] | None = None
+        self._differences: list[float] = []
+        self._seen = 0
+
+    def is_over(self, matches: Sequence[Match]) -> bool:
+        """Whether the test is decided or exhausted. matches: all matches of the schedule so far, in order."""
+        new = matches[self._seen : self._settings.max_blocks]
+        if new:
+            curve = self._wealth(new) if self._settings.model == "returns" else self._llr(new)
+            self.llr = float(curve[-1])
+            self._seen += len(new)
+            if _crossed(curve, self.bounds).size:
+                return True
+        return self._seen >= self._settings.max_blocks
+
+    def _llr(self, new: Sequence[Match]) -> NDArray[np.float64]:
+        counts = _cumulated(*_block_scores(new, self._candidate))
+        counts = counts if self._counts is None else counts + self._counts
+        self._counts = counts[-1]
+        assert self._settings.model != "returns"
+        return gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
+
+    def _wealth(self, new: Sequence[Match]) -> NDArray[np.float64]:
+        self._differences += _differences(self._settings, new, self._candidate)
+        return _wealth(self._settings, self._differences)
+
+
+def cell_counts(matches: Sequence[Match], candidate: str) -> tuple[int, ...]:
+    """Number of blocks per cell, worst for the candidate first. Requires at least one match."""
+    return tuple(int(n) for n in _cumulated(*_block_scores(matches, candidate))[-1])
+
+
+def decision_bounds(settings: GateConfig) -> tuple[float, float]:
+    """The two values of the LLR, or of the log wealth, at which a test decides."""
+    if settings.model != "returns":
+        return bounds(settings.alpha, settings.beta)
+    lower, upper = _betting(settings).bounds
+    return -lower, upper
+
+
+def _betting(settings: GateConfig) -> BettingTest:
+    assert settings.return_bound is not None, "the configuration requires it"
+    return BettingTest(settings.return_bound, settings.alpha, settings.beta, settings.return0, settings.return1)
+
+
+def _wealth(settings: GateConfig, differences: Sequence[float]) -> NDArray[np.float64]:
+    """Log wealth of the richer bettor, negative for the bettor against H1."""
+    beyond = [d for d in differences if abs(d) > (settings.return_bound or 0)]
+    if beyond:
+        raise BoundExceeded(
+            f"gate.return_bound is {settings.return_bound:g}, but the returns of a block differ by {beyond[0]:g}:"
+            " void the verdict (`league void`) and set a bound that no block can exceed"
+        )
+    against_h1, against_h0 = _betting(settings).curves(np.asarray(differences, dtype=np.float64))
+    return np.where(against_h0 >= against_h1, against_h0, -against_h1)
+
+
+def _block_scores(matches: Sequence[Match], candidate: str) -> tuple[list[float], int]:
+    """The candidate's score in each block, and the number of comparisons per block."""
+    scores = [match.score(match.contestants.index(candidate)) for match in matches]
+    return scores, matches[0].result().games if matches else GAMES_PER_BLOCK
+
+
+def _differences(settings: GateConfig, matches: Sequence[Match], candidate: str) -> list[float]:
+    """Mean return of the candidate minus that of its opponent in each block.
+
+    In blocks with a forfeit, ± `return_bound`, or 0 if both forfeited.
+    """
+    bound, gaps = settings.return_bound or 0.0, list[float]()
+    for match in matches:
+        if (ruled := forfeit_difference(match, candidate)) is not None:
+            gaps.append(ruled * bound)
+            continue
+        own = match.contestants.index(candidate)
+        mine, other = match.mean_return(own), match.mean_return(1 - own)
+        assert mine is not None
+        assert other is not None
+        gaps.append(mine - other)
+    return gaps
+
+
+def _cumulated(block_scores: Sequence[float], comparisons: int) -> NDArray[np.int64]:
+    """Counts per cell after each block, shape (blocks, 2 comparisons + 1)."""
+    halves = np.asarray(block_scores, dtype=np.float64) * 2 * comparisons
+    cells = np.rint(halves)
+    if not (np.abs(halves - cells) < 1e-6).all() or ((cells < 0) | (cells > 2 * comparisons)).any():
+        step = 1 / (2 * comparisons)
+        raise ValueError(f"block scores with {comparisons} comparison(s) must be multiples of {step:g} in [0, 1]")
+    return np.eye(2 * comparisons + 1, dtype=np.int64)[cells.astype(np.intp)].cumsum(axis=0)
+
+
+def _crossed(curve: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.intp]:
+    return np.flatnonzero((curve <= limits[0]) | (curve >= limits[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorResult:
+    """A non-inferiority test against one anchor. margin: by how much the candidate may be weaker."""
+
+    ref: str
+    margin: float
+    schedule: str
+    decision: Decision
+
+    @property
+    def is_passed(self) -> bool:
+        return self.decision.outcome == "promote"
+
+
+@dataclass(frozen=True, slots=True)
+class GateResult:
+    """Results of all tests of a candidate.
+
+    anchors: started tests in order, of `planned_anchors` in total.
+    forfeits: forfeited games, or None if the gate allows them.
+    """
+
+    champion: Decision
+    anchors: tuple[AnchorResult, ...] = ()
+    planned_anchors: int = 0
+    forfeits: int | None = None
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """Outcome of the verdict; None while a test is open."""
+        return self._conclusion()[0]
+
+    @property
+    def note(self) -> str | None:
+        """Why the candidate is not promoted although it beat the champion."""
+        return self._conclusion()[1]
+
+    def _conclusion(self) -> tuple[Outcome | None, str | None]:
+        if self.champion.outcome != "promote":
+            return self.champion.outcome, None
+        if self.forfeits:
+            return "reject", f"it forfeited {self.forfeits} games, but the gate allows none"
+        for anchor in self.anchors:
+            if anchor.decision.outcome == "reject":
+                return "reject", f"it beat the champion, but is weaker than {anchor.ref}"
+            if anchor.decision.outcome == "inconclusive":
+                return "inconclusive", (
+                    f"it beat the champion, but {anchor.decision.games} games do not show that it is at most"
+                    f" {anchor.margin:g} weaker than {anchor.ref}"
+                )
+        is_complete = len(self.anchors) == self.planned_anchors and all(anchor.is_passed for anchor in self.anchors)
+        return ("promote" if is_complete else None), None
+
+
+def combine_results(
+    champion: Decision, anchors: Sequence[AnchorResult], planned_anchors: int, forfeits: int | None
+) -> GateResult:
+    """Combine the tests up to the first anchor that is not passed. Later anchors are ignored."""
+    looked_at: list[AnchorResult] = []
+    for anchor in anchors if champion.outcome == "promote" and not forfeits else ():
+        looked_at.append(anchor)
+        if not anchor.is_passed:
+            break
+    return GateResult(champion, tuple(looked_at), planned_anchors, forfeits)

@@ -1,0 +1,232 @@
+"""The nightly run of a league: gates new versions, promotes the best one and updates all ratings.
+
+Every step is stored in the registry or the ledger before the next begins. An interrupted run resumes without playing a
+match twice, repeating a verdict, or losing or repeating a promotion.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+
+from evaluation.gating import verdicts
+from evaluation.gating.gate import alpha_share, alpha_spent
+from evaluation.matches import tournament
+from evaluation.matches.leaderboard import compute_leaderboard
+from evaluation.matches.worker import baselines
+from evaluation.results import Confirmation, Listener, NightlyReport, VerdictReport
+from evaluation.schedules.builders import ANCHOR, gauntlet
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.errors import (
+    ArtifactCorrupt,
+    BoundExceeded,
+    EnvironmentMismatch,
+    GameCrashed,
+    GameHung,
+    NotFound,
+    ObservationError,
+    WorkerLost,
+)
+from league.policies.loading import eligible
+from league.ray_cluster import ray_session
+from league.refs import CHAMPION
+from league.registry.registry import Registry
+from league.registry.storage.rows import LeagueRow, NightlyRunRow, VerdictRow, VersionRow
+from league.results.ledger import Ledger
+from league.results.records import Schedule
+
+RATING_BLOCKS = 32
+"""Matches of a new version against each opponent for its rating, in addition to those of its verdict."""
+
+CONTESTANT_FAULTS = (
+    ArtifactCorrupt,
+    BoundExceeded,
+    EnvironmentMismatch,
+    GameCrashed,
+    GameHung,
+    NotFound,
+    ObservationError,
+    WorkerLost,
+)
+"""Errors of a single version, which do not prevent verdicts on the others."""
+
+
+def nightly(
+    config: LeagueConfig, *, registry: Registry, workers: int = 0, listener: Listener | None = None
+) -> NightlyReport:
+    """Gate all versions without a verdict, oldest first, each against the current champion.
+
+    Without a champion, the opponent is `script:random`. Each new version then plays a short gauntlet for its rating. A
+    version that cannot play is reported as a fault.
+
+    Args:
+        config: Configuration of the league.
+        registry: Registry of the league.
+        workers: Parallel Ray tasks; 0 plays in this process.
+        listener: Receives progress and verdicts.
+
+    Raises:
+        AlreadyRunning: Another nightly run of this league is active.
+        InterfaceChanged: The configuration no longer fits the league's versions.
+        WorkerLost: Workers died repeatedly.
+    """
+    began = time.monotonic()
+    with registry.exclusive_lock(f"nightly-{config.league}"), ray_session():
+        registry.leagues.register(config, interface(config))
+        nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), workers, listener)
+        before = nightly_run.champion()
+        nightly_run.run_gate()
+        nightly_run.confirm()
+        nightly_run.rate()
+        report = NightlyReport(
+            league=config.league,
+            champion_before=before,
+            champion=nightly_run.champion(),
+            verdicts=tuple(nightly_run.verdicts),
+            confirmations=tuple(nightly_run.confirmations),
+            alpha_spent=nightly_run.spent(),
+            faults=tuple(nightly_run.faults),
+            leaderboard=compute_leaderboard(registry, config.league),
+            seconds=time.monotonic() - began,
+        )
+        nightly_run.close(report)
+        return report
+
+
+class _NightlyRun:
+    def __init__(self, registry: Registry, league: LeagueRow, workers: int, listener: Listener | None) -> None:
+        self._registry, self._league = registry, league
+        self._workers, self._listener = workers, listener
+        self._row: NightlyRunRow | None = None
+        self.verdicts: list[VerdictReport] = []
+        self.confirmations: list[Confirmation] = []
+        self.faults: list[str] = []
+
+    def champion(self) -> str | None:
+        number = self._registry.aliases.current(self._league.slug).get(CHAMPION)
+        return None if number is None else f"{self._league.slug}@{number}"
+
+    def spent(self) -> float:
+        """The α of a year spent by all verdicts of nightly runs."""
+        rows = self._registry.verdicts.all(self._league.slug)
+        return alpha_spent(((row.opened_at, row.alpha) for row in rows if row.settings.get("night")), datetime.now(UTC))
+
+    def run_gate(self) -> None:
+        """Finish the open verdicts, then gate every version without one."""
+        for row in self._registry.verdicts.all(self._league.slug):
+            if row.outcome is None:
+                self._conclude(row)
+        nightly_runs = self._registry.nightly_runs.all(self._league.slug)
+        self._row = next((row for row in nightly_runs if row.ended_at is None), None)
+        if self._row is not None:
+            self._test_candidates(self._row)
+        if waiting := self._waiting():
+            if self._row is not None:
+                self._registry.nightly_runs.close(self._row.id, None)
+            self._row = self._begin(waiting)
+            if self._row is not None:
+                self._test_candidates(self._row)
+
+    def _waiting(self) -> list[int]:
+        """Versions that the current nightly run does not include."""
+        numbers = [version.number for version in self._untested()]
+        return [number for number in numbers if self._row is None or number not in self._row.candidates]
+
+    def _begin(self, candidates: list[int]) -> NightlyRunRow | None:
+        """Open a nightly run. None if the α of the year is spent."""
+        gate = self._league.config.gate
+        alpha = (
+            gate.alpha if gate.nights is None else alpha_share(len(candidates), gate.alpha, gate.nights, self.spent())
+        )
+        if alpha > 0:
+            return self._registry.nightly_runs.open(self._league.slug, candidates, alpha)
+        self.faults.append(
+            f"{len(candidates)} versions are waiting: the verdicts of the last 365 days spent all of gate.alpha"
+            f" ({gate.alpha:g}); for more than {gate.nights} nightly runs per year, raise gate.nights"
+        )
+        return None
+
+    def _test_candidates(self, nightly_run: NightlyRunRow) -> None:
+        for version in self._untested():
+            if version.number in nightly_run.candidates:
+                self._open_and_conclude(version, nightly_run)
+
+    def _open_and_conclude(self, version: VersionRow, nightly_run: NightlyRunRow) -> None:
+        with self._faults_of(version.ref):
+            opponent = self.champion() or ANCHOR
+            row = verdicts.open_verdict(
+                self._registry, self._league, version.number, opponent, nightly_run.alpha, self._number_of(nightly_run)
+            )
+            self._conclude(row)
+
+    def _number_of(self, nightly_run: NightlyRunRow) -> int | None:
+        """Id of the nightly run, or None if verdicts do not count against the α of a year."""
+        return None if self._league.config.gate.nights is None else nightly_run.id
+
+    def confirm(self) -> None:
+        """Play the missing confirmation matches of promotions."""
+        for row in self._registry.verdicts.all(self._league.slug):
+            if row.outcome == "promote" and verdicts.confirmation(self._registry, row) is None:
+                with self._faults_of(f"the confirmation of {row.league}@{row.candidate}"):
+                    gain = verdicts.confirm(self._registry, row, workers=self._workers, listener=self._listener)
+                    if gain is not None:
+                        self.confirmations.append(gain)
+
+    def close(self, report: NightlyReport) -> None:
+        if self._row is not None:
+            self._registry.nightly_runs.close(self._row.id, report.to_json())
+
+    def rate(self) -> None:
+        """Play the missing or unfinished rating gauntlet of each version."""
+        ledger = Ledger(self._registry)
+        digest = self._league.environment_digest
+        begun = {
+            schedule.contestants[0]: schedule
+            for schedule in ledger.schedules(self._league.slug)
+            if schedule.kind == "gauntlet" and schedule.environment_digest == digest
+        }
+        versions = eligible(self._registry, self._league.slug)
+        for previous, version in zip([None, *versions], versions, strict=False):
+            schedule = begun.get(version.ref) or self._gauntlet(version, previous)
+            if len(ledger.positions(schedule.id)) < schedule.length:
+                with self._faults_of(version.ref):
+                    tournament.play_schedule(
+                        schedule, registry=self._registry, workers=self._workers, listener=self._listener
+                    )
+
+    def _untested(self) -> list[VersionRow]:
+        """Versions without a verdict, oldest first."""
+        return [each for each in eligible(self._registry, self._league.slug) if not self._is_tested(each)]
+
+    def _is_tested(self, version: VersionRow) -> bool:
+        """Whether a version is champion or has an effective verdict."""
+        if version.ref == self.champion():
+            return True
+        rows = (row for row in self._registry.verdicts.all(self._league.slug) if row.candidate == version.number)
+        return any(verdicts.is_effective(row) for row in rows)
+
+    def _conclude(self, verdict: VerdictRow) -> None:
+        with self._faults_of(f"{verdict.league}@{verdict.candidate} against {verdict.champion}"):
+            report = verdicts.conclude(self._registry, verdict, workers=self._workers, listener=self._listener)
+            self.verdicts.append(report)
+            if self._listener:
+                self._listener(report)
+
+    def _gauntlet(self, version: VersionRow, previous: VersionRow | None) -> Schedule:
+        """Schedule against the baselines, the champion and the previous version."""
+        versions = {each.ref for each in eligible(self._registry, self._league.slug)} - {version.ref}
+        rivals = (self.champion(), previous.ref if previous else None)
+        opponents = [*baselines(self._league.interface), *(ref for ref in rivals if ref and ref in versions)]
+        return gauntlet(
+            self._league.config, self._league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS
+        )
+
+    @contextmanager
+    def _faults_of(self, who: str) -> Iterator[None]:
+        try:
+            yield
+        except CONTESTANT_FAULTS as error:
+            self.faults.append(f"{who}: {error}")

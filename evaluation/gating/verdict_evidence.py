@@ -1,0 +1,105 @@
+"""Evidence of a verdict, computed from the ledger: contestants, test statistics, outcome and reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from evaluation.gating.gate import Decision
+from evaluation.gating.verdicts import (
+    anchor_report,
+    confirmation,
+    difference_of_returns,
+    gate_of,
+    gate_result,
+    gate_statistics,
+)
+from evaluation.results import AnchorReport, Confirmation, Difference, Document, iso_timestamp
+from league.registry.changes import OPEN
+from league.registry.registry import Registry
+from league.registry.storage.rows import AliasEvent, VerdictRow
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictEvidence(Document):
+    """A verdict with its evidence.
+
+    outcome: as in a VerdictReport, or `open`. reason: one sentence.
+    hypotheses: elo0 and elo1 in the unit of `model`, or two mean differences of returns.
+    curve: LLR after each block; the test decides at `bounds`.
+    counts: blocks per cell, worst for the candidate first.
+    elo, interval, difference: as in a VerdictReport.
+    alpha: error probability of the verdict. anchors: its non-inferiority tests. confirmation: the confirmation match of
+    its promotion.
+    """
+
+    verdict: str
+    candidate: str
+    opponent: str
+    outcome: str
+    promoted: bool
+    reason: str
+    opened_at: str
+    closed_at: str | None
+    model: str
+    hypotheses: tuple[float, float]
+    llr: float
+    bounds: tuple[float, float]
+    curve: tuple[float, ...]
+    blocks: int
+    games: int
+    unique_games: int
+    counts: tuple[int, ...]
+    score: float | None
+    elo: float | None
+    interval: tuple[float | None, float | None] | None
+    difference: Difference | None
+    alpha: float
+    anchors: tuple[AnchorReport, ...]
+    confirmation: Confirmation | None
+
+
+def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[AliasEvent]) -> VerdictEvidence:
+    """Compute the evidence of a verdict. events: history of the champion alias."""
+    candidate = f"{verdict.league}@{verdict.candidate}"
+    gate = gate_of(verdict)
+    seen = gate_result(registry, verdict)
+    decision = seen.champion
+    promoted = any(event.verdict == verdict.id for event in events)
+    return VerdictEvidence(
+        verdict=verdict.id,
+        candidate=candidate,
+        opponent=verdict.champion,
+        outcome=verdict.outcome or OPEN,
+        promoted=promoted,
+        reason=_reason(verdict, decision, promoted),
+        opened_at=iso_timestamp(verdict.opened_at),
+        closed_at=iso_timestamp(verdict.closed_at) if verdict.closed_at else None,
+        model=gate.model,
+        hypotheses=(gate.return0, gate.return1) if gate.model == "returns" else (gate.elo0, gate.elo1),
+        **gate_statistics(decision),
+        curve=decision.curve,
+        difference=difference_of_returns(registry, verdict, decision.blocks),
+        alpha=verdict.alpha,
+        anchors=tuple(map(anchor_report, seen.anchors)),
+        confirmation=confirmation(registry, verdict),
+    )
+
+
+def _reason(verdict: VerdictRow, decision: Decision, promoted: bool) -> str:
+    """Why the verdict has its outcome, in one sentence."""
+    note = (verdict.evidence or {}).get("note")
+    llr, lower, upper = (f"{value:.2f}".replace("-", "−") for value in (decision.llr, *decision.bounds))
+    after = f"after {decision.games} games, the LLR was {llr}"
+    match verdict.outcome:
+        case None:
+            return f"Undecided: {after}, between {lower} and {upper}."
+        case "promote" if promoted:
+            return f"Stronger: {after}, above the bound of {upper}."
+        case "promote":
+            return f"Stronger ({after}), but not promoted: {note or 'no reason was recorded'}."
+        case "inconclusive":
+            return note or f"Inconclusive: {after}, between {lower} and {upper}, at the maximum number of games."
+        case "reject" if note is None and decision.llr <= decision.bounds[0]:
+            return f"Not stronger: {after}, below the bound of {lower}."
+    return note or f"{str(verdict.outcome).capitalize()}: {after}."

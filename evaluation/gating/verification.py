@@ -1,0 +1,117 @@
+"""Verifies a verdict: recomputes its evidence from the games in the ledger and compares it with the record.
+
+Only the settings under which the verdict was opened are trusted. Matches are checked against their schedule, scores
+against returns, and every number of the evidence against the recomputed one. Games can also be replayed from their
+seeds, which verifies the returns themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evaluation.gating.verdicts import gate_result, report_of
+from evaluation.playback.replay import replay
+from evaluation.results import Document
+from league.environments.lockstep import stepping
+from league.errors import InvalidInput, LedgerConflict, VerdictRefuted
+from league.registry.registry import Registry
+from league.registry.storage.rows import VerdictRow
+from league.registry.verdicts import VOID
+from league.results.ledger import Ledger
+from league.results.records import Match
+from league.results.scoring import admit
+
+ROUNDING = 1e-9
+"""Tolerance for derived floats (LLR, Elo, scores, intervals), relative and absolute: rounding differs between
+processors and BLAS kernels. Outcomes, counts and games must be equal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verification(Document):
+    """A verdict that was verified.
+
+    matches: matches in the ledger. numbers: recomputed fields of the evidence. replayed: replayed games.
+    """
+
+    verdict: str
+    outcome: str
+    matches: int
+    numbers: int
+    replayed: int
+
+
+def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verification:
+    """Recompute a closed verdict, and replay `replays` of its games, evenly spaced.
+
+    Raises:
+        VerdictRefuted: The record differs. The message names every difference.
+        NotFound: There is no such verdict.
+        InvalidInput: The verdict is open.
+    """
+    row = registry.verdicts.get(verdict)
+    if row.outcome is None or row.evidence is None:
+        raise InvalidInput(f"verdict {verdict} is still open: `league nightly` resumes it")
+    matches = _checked_matches(registry, row, row.schedule)
+    for anchor in row.settings.get("anchors", ()):
+        matches += _checked_matches(registry, row, anchor["schedule"])
+    seen = gate_result(registry, row)
+    # A verdict can be voided for reasons outside its games, at any point.
+    outcome = VOID if row.outcome == VOID else str(seen.outcome)
+    note = seen.note if outcome not in (VOID, "promote") else row.evidence.get("note")
+    computed = report_of(registry, row, outcome, seen, note).to_json()
+    if row.outcome == VOID:
+        # A voided verdict keeps its evidence, which is empty if it was open.
+        computed = {name: value for name, value in computed.items() if name in row.evidence and name != "outcome"}
+    wrong = [
+        f"{name} is {row.evidence.get(name)!r}, but the games give {value!r}"
+        for name, value in computed.items()
+        if not _same(row.evidence.get(name), value)
+    ]
+    if wrong:
+        raise VerdictRefuted(f"the record of verdict {verdict} contradicts its games: {'; '.join(wrong)}")
+    replayed = _replay(registry, row, matches, replays)
+    return Verification(verdict, row.outcome, len(matches), len(computed), replayed)
+
+
+def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Match]:
+    """All matches of one of its schedules, each checked against the schedule."""
+    ledger = Ledger(registry)
+    schedule, matches = ledger.schedule(name), ledger.matches(league=row.league, schedule=name)
+    try:
+        for position, match in enumerate(matches):
+            if match.position != position:
+                raise VerdictRefuted(f"verdict {row.id} lacks match {position} of {name} but has a later one")
+            admit(match, schedule)
+    except LedgerConflict as error:
+        raise VerdictRefuted(f"verdict {row.id} counts a match that contradicts its schedule: {error}") from error
+    return matches
+
+
+def _same(recorded: Any, computed: Any) -> bool:
+    if isinstance(computed, dict):
+        return isinstance(recorded, dict) and all(_same(recorded.get(key), value) for key, value in computed.items())
+    if isinstance(computed, list):
+        return isinstance(recorded, list) and len(recorded) == len(computed) and all(map(_same, recorded, computed))
+    if isinstance(computed, float) and isinstance(recorded, int | float):
+        return math.isclose(recorded, computed, rel_tol=ROUNDING, abs_tol=ROUNDING)
+    return bool(recorded == computed)
+
+
+def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], replays: int) -> int:
+    games = [(match, index) for match in matches for index in range(len(match.games))]
+    wanted = min(replays, len(games))
+    if not wanted:
+        return 0
+    league = registry.leagues.get(row.league)
+    with closing(stepping(league.config.environment, 1)) as environment:
+        for number in np.linspace(0, len(games) - 1, wanted).astype(int):
+            match, index = games[number]
+            for _ in replay(environment, league.config, league.interface, match, index):
+                pass
+    return wanted

@@ -1,0 +1,1 @@
+"""Matches and tournaments: the lockstep game loop, forfeits, timeouts and the leaderboard."""

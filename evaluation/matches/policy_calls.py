@@ -1,0 +1,151 @@
+"""Calls policies and validates their actions row by row. Rows without a playable action forfeit their games.
+
+The result of a row must not depend on its batch. If a policy fails on a batch, it is called for each row separately
+with the row's generator restored, so that a fault in one game does not affect the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.matches.game_state import State
+from league.environments.stepping import Batch, allows_nothing, legal_rows
+from league.errors import IllegalMask, one_line
+from league.policies.policy import Actions, Policy
+from league.results.records import Reason
+from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete
+
+Generators = Sequence[np.random.Generator]
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyFault:
+    """Why a row has no playable action. detail: for people; differs between machines."""
+
+    reason: Reason
+    detail: str
+
+
+@dataclass(slots=True)
+class PolicyOutput:
+    """Actions (k, …) and recurrent states of k rows; states are None for a policy without.
+
+    faults: by row. Actions and states of faulty rows are undefined.
+    """
+
+    actions: NDArray
+    states: list[State] | None
+    faults: dict[int, PolicyFault] = field(default_factory=dict)
+
+
+def call_policy(
+    policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
+) -> PolicyOutput:
+    """Call a policy that acts in `space` on a batch.
+
+    generators: one per row for a stochastic policy, else None.
+    Raises IllegalMask if the environment allows no action, which is not the contestant's fault.
+    """
+    before = None if generators is None else [each.bit_generator.state for each in generators]
+    try:
+        answer = _call_batch(policy, batch, space, state, generators)
+    except MemoryError:
+        raise
+    except Exception:
+        if generators is not None and before is not None:
+            for each, mark in zip(generators, before, strict=True):
+                each.bit_generator.state = mark
+        answer = _call_rows(policy, batch, space, state, generators)
+    mask = batch.observations.get(ACTION_MASK)
+    legal = legal_rows(answer.actions, space, mask)
+    if answer.faults or not legal.all():
+        _check_mask(mask, space)
+        for row in np.flatnonzero(~legal).tolist():
+            answer.faults.setdefault(row, _illegal(answer.actions[row], mask, row))
+    return answer
+
+
+def action_fault(given: Actions, space: Leaf, mask: NDArray | None) -> PolicyFault | None:
+    """Why the single action of a batch is unplayable, or None. Raises IllegalMask like `call_policy`."""
+    try:
+        _check_form(given, 1, space)
+    except _Malformed as error:
+        return PolicyFault("malformed", str(error))
+    if legal_rows(given.actions, space, mask).all():
+        return None
+    _check_mask(mask, space)
+    return _illegal(given.actions[0], mask, 0)
+
+
+class _Malformed(Exception):
+    """The policy did not return an array of actions."""
+
+
+def _call_batch(
+    policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
+) -> PolicyOutput:
+    """Call the policy and check the form of its output. Raises whatever the policy raises."""
+    rows = len(batch.envs)
+    given = policy.act(batch.observations, state=state, rng=generators)
+    _check_form(given, rows, space)
+    if given.state is None:
+        return PolicyOutput(given.actions, None)
+    return PolicyOutput(
+        given.actions, [{name: array[row] for name, array in given.state.items()} for row in range(rows)]
+    )
+
+
+def _call_rows(
+    policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
+) -> PolicyOutput:
+    rows = len(batch.envs)
+    given: dict[int, NDArray] = {}
+    states: list[State] = [{} for _ in range(rows)]
+    faults: dict[int, PolicyFault] = {}
+    for row in range(rows):
+        own = None if state is None else {name: array[[row]] for name, array in state.items()}
+        draws = None if generators is None else [generators[row]]
+        try:
+            answer = _call_batch(policy, batch.rows([row]), space, own, draws)
+        except MemoryError:
+            raise
+        except _Malformed as error:
+            faults[row] = PolicyFault("malformed", str(error))
+        except Exception as error:
+            faults[row] = PolicyFault("crashed", one_line(error, with_type=True))
+        else:
+            given[row] = answer.actions[0]
+            states[row] = answer.states[0] if answer.states else {}
+    # The policy's own dtype, as for a whole batch, because actions are recorded in it.
+    actions = np.zeros((rows, *space.shape), np.result_type(*given.values()) if given else space.dtype)
+    for row, action in given.items():
+        actions[row] = action
+    return PolicyOutput(actions, states if any(states) else None, faults)
+
+
+def _check_form(given: Actions, rows: int, space: Leaf) -> None:
+    """Raise _Malformed unless there is an action of the space's shape and kind, and a state if any, for each row."""
+    kinds = "iu" if isinstance(space, Discrete | MultiDiscrete) else "iuf" if isinstance(space, Box) else "biuf"
+    actions = given.actions
+    if not isinstance(actions, np.ndarray) or actions.dtype.kind not in kinds or actions.shape != (rows, *space.shape):
+        found = f"{actions.dtype} {list(actions.shape)}" if isinstance(actions, np.ndarray) else type(actions).__name__
+        raise _Malformed(f"actions are {found}, expected {space.dtype} {[rows, *space.shape]}")
+    for name, array in (given.state or {}).items():
+        if len(array) != rows:
+            raise _Malformed(f"{name} has {len(array)} rows, expected {rows}")
+
+
+def _illegal(action: NDArray, mask: NDArray | None, row: int) -> PolicyFault:
+    if not np.isfinite(action).all():
+        return PolicyFault("not_finite", f"action {action.tolist()}")
+    allowed = "" if mask is None else f", where action_mask is {mask[row].tolist()}"
+    return PolicyFault("illegal_action", f"action {action.tolist()}{allowed}")
+
+
+def _check_mask(mask: NDArray | None, space: Leaf) -> None:
+    if mask is not None and allows_nothing(mask, space).any():
+        raise IllegalMask("the environment's action_mask allows no action: expected at least one 1")

@@ -1,0 +1,319 @@
+"""Plays schedules and evaluations: matches run in chunks, here or as Ray tasks, and are appended in schedule order.
+
+Chunks are aligned ranges of consecutive positions. A chunk that finishes early waits for all earlier chunks, and is
+appended as a whole or not at all. The ledger therefore always holds a prefix of the schedule, independent of the number
+of workers, and an interrupted run resumes after it. At most one chunk per worker is in flight or waiting, which limits
+the loss of an interruption.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from itertools import islice, pairwise
+from typing import Generic, TypeVar, get_args
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+
+from evaluation.matches.game_records import forfeits, unique_games
+from evaluation.matches.leaderboard import by_side, rank_contestants
+from evaluation.matches.worker import baselines, match_worker
+from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
+from evaluation.schedules.builders import ANCHOR, scoring
+from evaluation.schedules.tournament_plan import (
+    DEFAULT_BLOCKS,
+    MOST_BLOCKS,
+    UNLIMITED,
+    Budget,
+    Kind,
+    StoppingRule,
+    TournamentPlan,
+    plan_tournament,
+)
+from evaluation.statistics.payoff import cross_play_table, tabulate
+from evaluation.statistics.population import population
+from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
+from league.policies.loading import check_eligible, eligible, pinned
+from league.ray_cluster import ensure_local, node_addresses, ray_session
+from league.refs import CHAMPION
+from league.registry.registry import Registry
+from league.registry.storage.rows import LeagueRow
+from league.results.ledger import Ledger
+from league.results.records import GAMES_PER_BLOCK, Match, Schedule
+from league.settings import Storage
+
+T = TypeVar("T")
+
+
+class ReorderBuffer(Generic[T]):
+    """Takes items by index 0, 1, … in any order and returns them in order of the index."""
+
+    def __init__(self) -> None:
+        self.due = 0
+        """The place of the next item to come out."""
+        self._waiting: dict[int, T] = {}
+
+    def __len__(self) -> int:
+        """Number of waiting items."""
+        return len(self._waiting)
+
+    def put(self, place: int, item: T) -> None:
+        """Add a finished item."""
+        self._waiting[place] = item
+
+    def take(self) -> T | None:
+        """The next item in order; None while it is missing."""
+        if self.due not in self._waiting:
+            return None
+        item = self._waiting.pop(self.due)
+        self.due += 1
+        return item
+
+
+GAMES_PER_ENV = 4
+"""Games of a chunk per parallel environment: enough that handing chunks out costs little, few enough that little is
+played in vain when a test stops or a worker dies."""
+
+RETRIES = 5
+"""How often a chunk is retried after its worker died."""
+
+StopCondition = Callable[[Sequence[Match]], bool]
+"""All matches of a schedule so far, in order → whether to stop."""
+
+
+def play_schedule(
+    schedule: Schedule,
+    *,
+    registry: Registry,
+    workers: int = 0,
+    enough: StopCondition | None = None,
+    until: int | None = None,
+    listener: Listener | None = None,
+) -> list[Match]:
+    """Play the missing matches of `schedule` and return all its matches in order.
+
+    Args:
+        schedule: The schedule; stored in the ledger if it is new.
+        registry: Registry of the league.
+        workers: Parallel Ray tasks; 0 plays in this process. A local Ray is started if none is connected, and left
+            running: `ray_session` owns it.
+        enough: Ends the schedule early; called before the first chunk and after each.
+        until: Maximum number of matches. The ledger may contain more, which are returned as well.
+        listener: Receives progress.
+
+    Raises:
+        LeagueError: The errors of `MatchWorker.play`.
+        WorkerLost: Workers died repeatedly.
+        ConfigError: The cluster's machines do not share the registry.
+    """
+    ledger = Ledger(registry)
+    schedule = ledger.open(schedule)
+    config = registry.leagues.get(schedule.league).config
+    matches = ledger.matches(league=schedule.league, schedule=schedule.id)
+    end = schedule.length if until is None else min(until, schedule.length)
+    chunks = chunks_of(end, len(matches), config.play.num_envs)
+    document = config.model_dump_json(by_alias=True)
+    played = (
+        _in_ray(schedule, chunks, registry.storage, document, workers)
+        if workers and chunks
+        else _here(schedule, chunks, registry.storage, document)
+    )
+    with closing(played):
+        while True:
+            ended = enough is not None and enough(matches)
+            if listener:
+                listener(Progress(_describe(schedule), len(matches), schedule.length))
+            chunk = None if ended else next(played, None)
+            if chunk is None:
+                return matches
+            ledger.extend(chunk)
+            matches += chunk
+
+
+def evaluate(
+    league: str,
+    refs: Sequence[str] = (),
+    *,
+    registry: Registry,
+    schedule: Kind = "round_robin",
+    against: Sequence[str] = (),
+    blocks: int | None = None,
+    budget: Budget = UNLIMITED,
+    workers: int = 0,
+    seed: int = 0,
+    listener: Listener | None = None,
+) -> EvaluationReport:
+    """Play a tournament of `refs` and the scripted baselines, or cross-play of `refs` in one team.
+
+    Args:
+        league: The league.
+        refs: Versions, aliases (resolved now) and scripts. By default all versions trained in the current environment.
+        registry: Registry of the league.
+        schedule: `round_robin`: every pair plays `blocks` matches. `gauntlet`: each of `refs` plays each of `against`.
+            `adaptive`: a quarter of a round robin's matches, chosen to reduce rating uncertainty most. `cross_play`:
+            pairs of `refs` play in one team.
+        against: Opponents in a gauntlet; by default the champion and the baselines.
+        blocks: Matches per pair; by default 32, or as many as the budget allows.
+        budget: Limits of games, minutes or precision.
+        workers: Parallel Ray tasks; 0 plays in this process.
+        seed: Selects other games. Repeating a call with equal arguments finds its matches in the ledger.
+        listener: Receives progress.
+
+    Raises:
+        InvalidInput: Options that do not fit together.
+        LeagueError: UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and the errors of
+            `play_schedule`.
+    """
+    row = registry.leagues.get(league)
+    _check_options(schedule, against, budget)
+    requested = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
+    opponents: list[str] = []
+    if schedule == "gauntlet":
+        opponents = [pinned(ref, league, registry) for ref in against] or _opponents(registry, row)
+    elif schedule != "cross_play":
+        requested += baselines(row.interface)
+    for ref in [*requested, *opponents]:
+        check_eligible(ref, registry, row.config)
+    contestants = list(dict.fromkeys(requested))
+    blocks = blocks or (DEFAULT_BLOCKS if budget.is_open else MOST_BLOCKS)
+    if budget.precision is not None and ANCHOR not in [*contestants, *opponents]:
+        raise InvalidInput(f"precision: ratings are relative to {ANCHOR}, which does not play in this evaluation")
+    plan = plan_tournament(row.config, row.interface, schedule, contestants, opponents, blocks, seed)
+    with ray_session():
+        matches, stopped_by = _play_plan(plan, budget, registry, workers, listener)
+    return _report(row, schedule, plan, matches, stopped_by)
+
+
+def _check_options(schedule: Kind, against: Sequence[str], budget: Budget) -> None:
+    if schedule not in get_args(Kind):
+        raise InvalidInput(f"schedule: expected one of {', '.join(get_args(Kind))}, got {schedule!r}")
+    if against and schedule != "gauntlet":
+        raise InvalidInput(f"against: only a gauntlet has separate opponents, not {schedule}")
+    if budget.precision is not None and schedule == "cross_play":
+        raise InvalidInput("precision: cross_play computes no ratings")
+
+
+def _opponents(registry: Registry, row: LeagueRow) -> list[str]:
+    champion = registry.aliases.current(row.slug).get(CHAMPION)
+    return [*([] if champion is None else [f"{row.slug}@{champion}"]), *baselines(row.interface)]
+
+
+def _play_plan(
+    plan: TournamentPlan, budget: Budget, registry: Registry, workers: int, listener: Listener | None
+) -> tuple[list[Match], StoppedBy]:
+    """Play the schedules of a plan until its end or the limit of the budget."""
+    limit, matches = StoppingRule(budget, plan), list[Match]()
+
+    def enough(own: Sequence[Match]) -> bool:
+        return limit.is_reached([*matches, *own])
+
+    def report_progress(progress: Progress | VerdictReport) -> None:
+        if listener and isinstance(progress, Progress):
+            listener(replace(progress, played=len(matches) + progress.played, of=limit.most))
+
+    while not limit.is_reached(matches) and (schedule := plan.next_schedule(matches)) is not None:
+        until = limit.most - len(matches)
+        matches += play_schedule(
+            schedule, registry=registry, workers=workers, enough=enough, until=until, listener=report_progress
+        )
+    return limit.counted(matches)
+
+
+def _report(
+    row: LeagueRow, kind: Kind, plan: TournamentPlan, matches: Sequence[Match], stopped_by: StoppedBy
+) -> EvaluationReport:
+    tournament = () if kind == "cross_play" else plan.contestants
+    compared = "team" if kind == "cross_play" else scoring(row.config, row.interface)
+    distinct = {ref: unique_games(matches, ref) for ref in tournament}
+    table = rank_contestants((match.result() for match in matches), distinct) if tournament else ()
+    order, sides = [standing.ref for standing in table], tuple(row.interface.sides)
+    rated_by_side = compared == "side" and len(sides) > 1
+    return EvaluationReport(
+        league=row.slug,
+        schedule=plan.name,
+        environment_digest=row.environment_digest,
+        games=sum(len(match.games) for match in matches),
+        unique_games=unique_games(matches),
+        leaderboard=table,
+        payoff=tabulate(order, sides, matches if tournament else ()),
+        scoring=compared,
+        by_side=by_side(sides, matches) if rated_by_side else {},
+        kind=kind,
+        stopped_by=stopped_by,
+        # Pairs chosen by rating may meet only once or twice, too rarely to estimate payoffs.
+        population=population(order, matches) if kind == "round_robin" else None,
+        cross_play=None if tournament else cross_play_table(plan.contestants, matches),
+        forfeits={ref: lost for ref in plan.contestants if (lost := forfeits(matches, ref))},
+    )
+
+
+def chunks_of(length: int, played: int, num_envs: int) -> list[range]:
+    """The positions from `played` to `length`, cut at multiples of the chunk size.
+
+    A chunk keeps all parallel environments busy for a few games each.
+    """
+    size = math.ceil(GAMES_PER_ENV * num_envs / GAMES_PER_BLOCK)
+    cuts = [played, *range((played // size + 1) * size, length, size), length]
+    return [range(start, end) for start, end in pairwise(cuts) if start < end]
+
+
+def _describe(schedule: Schedule) -> str:
+    first, *others = schedule.contestants
+    if len(others) == 1:
+        return f"{first} against {others[0]}"
+    return f"{first} against {len(others)} others" if schedule.kind == "gauntlet" else f"{len(others) + 1} contestants"
+
+
+def _here(schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str) -> Generator[list[Match]]:
+    for chunk in chunks:
+        yield match_worker(storage, config).play(schedule, chunk)
+
+
+def _in_ray(
+    schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str, workers: int
+) -> Generator[list[Match]]:
+    """The chunks in order. A chunk starts when an earlier one has been taken.
+
+    Raises ConfigError if the nodes of the cluster do not share `storage`.
+    """
+    ensure_local(workers)
+    storage.check_reach(node_addresses())
+    job = ray.put((schedule, storage, config))
+    waiting = enumerate(chunks)
+    flying: dict[ray.ObjectRef, int] = {}
+    done: ReorderBuffer[list[Match]] = ReorderBuffer()
+    while done.due < len(chunks):
+        room = workers - len(flying) - len(done)
+        flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
+        if (chunk := done.take()) is not None:
+            yield chunk
+            continue
+        for ref in ray.wait(list(flying))[0]:
+            index = flying.pop(ref)
+            done.put(index, _result(ref, schedule, chunks[index]))
+
+
+@ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
+def _play_chunk(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
+    schedule, storage, config = job
+    return match_worker(storage, config).play(schedule, chunk, expendable=True)
+
+
+def _result(ref: ray.ObjectRef, schedule: Schedule, chunk: range) -> list[Match]:
+    try:
+        matches: list[Match] = ray.get(ref)
+    except RayTaskError as error:
+        # Ray wraps exceptions of tasks.
+        if isinstance(error.cause, LeagueError):
+            raise error.cause from None
+        raise
+    except RayError as error:
+        players = " and ".join(dict.fromkeys(ref for position in chunk for ref in schedule.contestants_at(position)))
+        raise WorkerLost(
+            f"workers died {RETRIES + 1} times over matches {chunk.start} to {chunk.stop - 1} of {schedule.id}, of"
+            f" {players}; see the logs of the workers: {one_line(error)}"
+        ) from error
+    return matches

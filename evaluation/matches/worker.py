@@ -1,0 +1,96 @@
+"""Per-process state for playing matches of a league: environments and a bounded cache of loaded contestants."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from functools import lru_cache
+
+from evaluation.matches.lockstep_runner import Roster, play_matches
+from evaluation.matches.watchdog import Deadline
+from evaluation.schedules.builders import ANCHOR
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.environments.lockstep import stepping
+from league.environments.stepping import BatchedEnvironment
+from league.errors import EnvironmentMismatch
+from league.interface import Interface
+from league.policies.loading import check_eligible, check_plays, contestant
+from league.policies.policy import Policy
+from league.refs import ScriptRef
+from league.registry.registry import Registry
+from league.results.records import Match, Schedule
+from league.settings import Storage
+
+MOST_CONTESTANTS = 64
+"""Contestants that stay loaded in one process."""
+
+
+class MatchWorker:
+    """Plays matches of one league. Not thread-safe."""
+
+    def __init__(self, config: LeagueConfig, registry: Registry) -> None:
+        self.config = config
+        self.interface = interface(config)
+        self._registry = registry
+        self._environment: BatchedEnvironment | None = None
+        self._contestants: OrderedDict[str, dict[str, tuple[str, Policy]]] = OrderedDict()
+
+    def play(self, schedule: Schedule, positions: Iterable[int], *, expendable: bool = False) -> list[Match]:
+        """Play the matches at `positions`, in that order.
+
+        expendable: whether this process may exit to end a game that hangs: see watchdog.py.
+        Raises EnvironmentMismatch if the schedule is for another environment, and the errors of `play_matches` and of
+        loading.
+        """
+        if schedule.environment_digest != self.config.environment.digest():
+            raise EnvironmentMismatch(
+                f"schedule {schedule.id} was created for another environment than league {schedule.league} has now"
+            )
+        positions = list(positions)
+        refs = dict.fromkeys(ref for position in positions for ref in schedule.contestants_at(position))
+        roster: Roster = {ref: self.contestant(ref) for ref in refs}
+        seated = self.interface.apart() if schedule.scoring == "team" else self.interface
+        settings = self.config.play
+        deadline = Deadline(settings.game_seconds, expendable)
+        environment = self._environment or stepping(self.config.environment, settings.num_envs)
+        # An interrupted environment is neither reused nor closed, because closing may hang.
+        self._environment = None
+        matches = play_matches(schedule, positions, environment, seated, roster, settings.max_moves, deadline)
+        self._environment = environment
+        return matches
+
+    def contestant(self, ref: str) -> dict[str, tuple[str, Policy]]:
+        """agent → (policy id, policy) of a fixed reference, loaded and verified once.
+
+        Raises loading errors, and EnvironmentMismatch for a version trained in another environment.
+        """
+        if ref not in self._contestants:
+            check_eligible(ref, self._registry, self.config)
+            self._contestants[ref] = contestant(ref, self._registry, self.interface)
+        self._contestants.move_to_end(ref)
+        if len(self._contestants) > MOST_CONTESTANTS:
+            self._contestants.popitem(last=False)
+        return self._contestants[ref]
+
+
+@lru_cache(maxsize=4)
+def match_worker(storage: Storage, config: str) -> MatchWorker:
+    """This process's worker for the league with this configuration, a JSON document."""
+    return MatchWorker(LeagueConfig.model_validate_json(config), Registry.open(storage))
+
+
+BASELINES = (ANCHOR, str(ScriptRef("one_ply")))
+
+
+def baselines(interface: Interface) -> list[str]:
+    """The scripted baselines that can play these spaces."""
+    return [ref for ref in BASELINES if _plays(ref, interface)]
+
+
+def _plays(ref: str, interface: Interface) -> bool:
+    try:
+        check_plays(ScriptRef.parse(ref), interface)
+    except EnvironmentMismatch:
+        return False
+    return True

@@ -1,1 +1,0 @@
-"""What a person looks at: a league as one page."""

@@ -1,0 +1,1 @@
+"""Single games for people: replays, recorded steps, videos and human play."""

@@ -1,0 +1,320 @@
+"""Human play: a game of a person against policies, and what can be played in a league.
+
+No state is kept between two turns: equal seeds and actions give the same game. A client can therefore continue at any
+time and return to any point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.matches.game_state import contestant_returns
+from evaluation.matches.lockstep_runner import agent_sides
+from evaluation.matches.policy_calls import PolicyFault, action_fault
+from evaluation.matches.worker import baselines
+from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of
+from evaluation.playback.single_game import GameStep, Move, play_game, policy_output
+from evaluation.playback.video import data_uri
+from evaluation.results import Document
+from evaluation.schedules.builders import scoring
+from league.config import LeagueConfig
+from league.environments.stepping import BatchedEnvironment
+from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput, one_line
+from league.interface import Interface
+from league.policies.loading import eligible
+from league.policies.onnx import LAST_ACTION, OnnxPolicy
+from league.policies.policy import Actions, Arrays, Policy
+from league.registry.registry import Registry
+from league.results.scoring import scores
+from league.service_requests import HumanPlayRequest
+from league.spaces import ACTION_MASK, DictSpace, Discrete, Space
+
+MOST_OPPONENTS = 50
+
+
+@dataclass(frozen=True, slots=True)
+class PlayableAgent(Document):
+    """An agent that a person can control: its actions are the `actions` integers from `start`."""
+
+    agent: str
+    side: str
+    actions: int
+    start: int
+
+
+@dataclass(frozen=True, slots=True)
+class Playability(Document):
+    """What a person can play in a league.
+
+    why: reason if nothing can be played, else None. draws: whether the environment renders images.
+    opponents: the newest versions that can play, newest first, then scripts.
+    """
+
+    league: str
+    playable: bool
+    why: str | None
+    agents: tuple[PlayableAgent, ...]
+    opponents: tuple[str, ...]
+    draws: bool
+
+
+def playability(league: str, registry: Registry, interface: Interface, draws: bool) -> Playability:
+    """What can be played. draws: whether the environment renders images. Raises UnknownLeague."""
+    side_of = {agent: side for side, agents in interface.sides.items() for agent in agents}
+    playable_agents = tuple(
+        PlayableAgent(agent, side_of[agent], spaces.action.n, spaces.action.start)
+        for agent, spaces in interface.agents.items()
+        if isinstance(spaces.action, Discrete)
+    )
+    kinds = sorted({type(spaces.action).__name__ for spaces in interface.agents.values()})
+    why = None if playable_agents else f"human play needs Discrete actions, but its agents have {' and '.join(kinds)}"
+    versions = [version.ref for version in reversed(eligible(registry, league))]
+    return Playability(
+        league=league,
+        playable=bool(playable_agents),
+        why=why,
+        agents=playable_agents,
+        opponents=(*versions[:MOST_OPPONENTS], *baselines(interface)),
+        draws=draws,
+    )
+
+
+PERSON = "person"
+"""Stands for the person in place of a reference."""
+MOST_NAMED = 32
+"""Legal actions listed in an error."""
+
+
+@dataclass(frozen=True, slots=True)
+class GameState(Document):
+    """State of a game with a person. steps: without images; `picture` is the current one, None without rendering.
+
+    legal: the person's legal actions, empty at the end. acting: agents that act next.
+    chances: the opponent's action probabilities in the person's position, if requested and the opponent is a graph.
+    score: the person's score, 1, ½ or 0, at the end of games that compare contestants; else None.
+    forfeits: agent, reference and reason of an opponent's forfeit.
+    """
+
+    opponent: str
+    agent: str
+    seed: int
+    steps: tuple[RecordedStep, ...]
+    picture: str | None
+    legal: tuple[int, ...]
+    acting: tuple[str, ...]
+    over: bool
+    returns: dict[str, float]
+    score: float | None
+    chances: Chances
+    forfeits: tuple[dict[str, str], ...]
+
+
+def human_play(
+    request: HumanPlayRequest,
+    config: LeagueConfig,
+    interface: Interface,
+    players: Mapping[str, Policy],
+    environment: BatchedEnvironment,
+    draws: bool,
+) -> GameState:
+    """Play the game in `environment`, which has `num_envs` 1.
+
+    Args:
+        request: The request.
+        config: Configuration of the league.
+        interface: Interface of the league.
+        players: agent → the opponent's policy, for all agents including the person's, for action probabilities.
+        environment: The environment. It must not be used again after GameCrashed.
+        draws: Whether the environment renders images.
+
+    Raises:
+        InvalidInput: Unknown agent, or actions after the end of the game.
+        EnvironmentMismatch: The agent's action space is not Discrete.
+        IllegalAction: An illegal action; the message lists legal ones.
+        GameCrashed: The environment raised.
+    """
+    space = space_of(interface, request.agent)
+    person = _Person(request.actions, space, players[request.agent] if request.chances else None)
+    steps, last, stop, picture = _play(environment, players, person, request, interface, draws)
+    awaiting = stop if isinstance(stop, _AwaitingPerson) else None
+    forfeit = stop if isinstance(stop, _Forfeited) else None
+    if person.left and not awaiting:
+        made = len(request.actions) - person.left
+        raise InvalidInput(f"actions: the game ended after {made} of {len(request.actions)} actions")
+    return GameState(
+        opponent=request.opponent,
+        agent=request.agent,
+        seed=request.seed,
+        steps=tuple(steps),
+        picture=picture,
+        legal=awaiting.legal if awaiting else (),
+        acting=last.acting if awaiting else (),
+        over=awaiting is None,
+        returns=last.returns,
+        score=None if awaiting else _score(request.agent, last.returns, forfeit, config, interface),
+        chances=likely(Move(request.agent, {}, None, awaiting.inputs), space) if awaiting else (),
+        forfeits=({"agent": forfeit.agent, "ref": request.opponent, "reason": forfeit.fault.reason},)
+        if forfeit
+        else (),
+    )
+
+
+def _play(
+    environment: BatchedEnvironment,
+    players: Mapping[str, Policy],
+    person: _Person,
+    request: HumanPlayRequest,
+    interface: Interface,
+    draws: bool,
+) -> tuple[list[RecordedStep], GameStep, _Stop | None, str | None]:
+    """The steps of the game, the last one, what stopped it before its end, and the last picture."""
+    policies: dict[str, Policy] = {
+        agent: _Opponent(agent, policy, interface.agents[agent].action, request.chances)
+        for agent, policy in players.items()
+    }
+    policies[request.agent] = person
+    controllers = {agent: PERSON if agent == request.agent else request.opponent for agent in interface.agents}
+    steps: list[RecordedStep] = []
+    last: GameStep | None = None
+    stop: _Stop | None = None
+    try:
+        try:
+            for last in play_game(environment, policies, request.seed):
+                steps.append(step_of(last, controllers, interface))
+        except _Stop as stopping:
+            stop = stopping
+        picture = data_uri(environment.render(0), LARGEST) if draws else None
+    except IllegalAction:
+        raise
+    except Exception as error:
+        raise GameCrashed(
+            f"the game cannot continue: its environment raised {one_line(error, with_type=True)}"
+        ) from error
+    assert last is not None, "a game has at least one step"
+    return steps, last, stop, picture
+
+
+def space_of(interface: Interface, agent: str) -> Discrete:
+    """Action space of the person's agent. Raises InvalidInput and EnvironmentMismatch like `human_play`."""
+    if agent not in interface.agents:
+        raise InvalidInput(f"agent: unknown agent {agent[:64]!r}; known: {', '.join(interface.agents)}")
+    space = interface.agents[agent].action
+    if not isinstance(space, Discrete):
+        raise EnvironmentMismatch(f"human play needs Discrete actions, but {agent} has {type(space).__name__}")
+    return space
+
+
+class _Stop(Exception):
+    """The game cannot continue, or not yet."""
+
+
+class _AwaitingPerson(_Stop):
+    """It is the person's turn. inputs: of the analyst's action distribution."""
+
+    def __init__(self, legal: tuple[int, ...], inputs: NDArray | None) -> None:
+        super().__init__("it is the person's turn")
+        self.legal, self.inputs = legal, inputs
+
+
+class _Forfeited(_Stop):
+    """An opponent returned no playable action."""
+
+    def __init__(self, agent: str, fault: PolicyFault) -> None:
+        super().__init__(fault.detail)
+        self.agent, self.fault = agent, fault
+
+
+class _Person:
+    """Plays the person's actions in order, and queries the analyst for probabilities."""
+
+    def __init__(self, choices: Sequence[int], space: Discrete, analyst: Policy | None) -> None:
+        self._choices, self._space = choices, space
+        self.left = len(choices)
+        self._analyst = analyst if isinstance(analyst, OnnxPolicy) else None
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,
+        explore: bool = False,  # noqa: ARG002
+        rng: Sequence[np.random.Generator] | None = None,
+    ) -> Actions:
+        analysis = None if self._analyst is None else policy_output(self._analyst, observations, state, rng)
+        legal = self._legal(observations.get(ACTION_MASK))
+        if not self.left:
+            inputs = analysis.dist_inputs if analysis else None
+            raise _AwaitingPerson(legal, None if inputs is None else inputs[0])
+        number = len(self._choices) - self.left
+        choice = self._choices[number]
+        self.left -= 1
+        if choice not in legal:
+            named = ", ".join(map(str, legal[:MOST_NAMED])) + ", …" * (len(legal) > MOST_NAMED)
+            raise IllegalAction(f"actions[{number}]: {choice} is illegal, expected one of {named}")
+        actions = np.array([choice], dtype=self._space.dtype)
+        if analysis is None:
+            return Actions(actions)
+        return replace(analysis, actions=actions, state=self._after(analysis, choice))
+
+    def _after(self, analysis: Actions, choice: int) -> dict[str, NDArray] | None:
+        """The analyst's next recurrent state; a previous action in it is replaced by the person's."""
+        if analysis.state is None or LAST_ACTION not in analysis.state:
+            return analysis.state
+        last = np.full_like(analysis.state[LAST_ACTION], choice - self._space.start + 1)
+        return {**analysis.state, LAST_ACTION: last}
+
+    def _legal(self, mask: NDArray | None) -> tuple[int, ...]:
+        if mask is None:
+            return tuple(range(self._space.start, self._space.start + self._space.n))
+        legal = tuple((np.flatnonzero(mask[0]) + self._space.start).tolist())
+        if not legal:
+            raise IllegalMask("action_mask allows no action")
+        return legal
+
+
+class _Opponent:
+    """Raises _Forfeited for the first output of a policy that is not playable.
+
+    with_probabilities: whether to return action probabilities.
+    """
+
+    def __init__(self, agent: str, policy: Policy, space: Space, with_probabilities: bool) -> None:
+        assert not isinstance(space, DictSpace), "action spaces are not dictionaries"
+        self._agent, self._policy, self._space, self._with_probabilities = agent, policy, space, with_probabilities
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,
+        explore: bool = False,  # noqa: ARG002
+        rng: Sequence[np.random.Generator] | None = None,
+    ) -> Actions:
+        try:
+            given = policy_output(self._policy, observations, state, rng)
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise _Forfeited(self._agent, PolicyFault("crashed", one_line(error, with_type=True))) from error
+        if fault := action_fault(given, self._space, observations.get(ACTION_MASK)):
+            raise _Forfeited(self._agent, fault)
+        return given if self._with_probabilities else replace(given, dist_inputs=None)
+
+
+def _score(
+    agent: str, returns: Mapping[str, float], forfeit: _Forfeited | None, config: LeagueConfig, interface: Interface
+) -> float | None:
+    """Score of the person's side against all others. A side that forfeits has lost."""
+    if scoring(config, interface) != "game":
+        return None
+    agents = list(interface.agents)
+    side_of = agent_sides(agents, interface)
+    own = side_of[agents.index(agent)]
+    sides = [int(side != own) for side in range(len(interface.sides))]
+    forfeited = {sides[side_of[agents.index(forfeit.agent)]]} if forfeit else set()
+    values = contestant_returns([returns[each] for each in agents], side_of, sides)
+    return scores([values], "game", [forfeited])[0][0]

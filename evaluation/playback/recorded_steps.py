@@ -1,0 +1,123 @@
+"""Recorded games as JSON documents: steps with images, players and outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from evaluation.playback.captions import chances
+from evaluation.playback.replay import GameSource
+from evaluation.playback.single_game import GameStep, Move
+from evaluation.playback.video import data_uri
+from evaluation.results import Document
+from league.environments.stepping import BatchedEnvironment
+from league.errors import one_line
+from league.interface import Interface
+from league.results.records import Match
+from league.service_requests import RecordingRequest
+from league.spaces import Space
+
+LARGEST = 480
+"""Longer side of an image, in pixels."""
+MOST_CHANCES = 32
+"""Actions per move with probabilities."""
+
+Chances = tuple[tuple[int, float], ...]
+"""(action, probability), most probable first, without impossible actions."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedMove(Document):
+    """One agent's part of a step. ref: who controlled it."""
+
+    agent: str
+    ref: str
+    action: Any
+    chances: Chances
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedStep(Document):
+    """picture: rendered after the step, as a data URI or None. opening: whether the actions were random."""
+
+    step: int
+    moves: tuple[RecordedMove, ...]
+    picture: str | None
+    opening: bool
+
+
+def step_of(
+    step: GameStep, controllers: Mapping[str, str], interface: Interface, picture: str | None = None, opening: int = 0
+) -> RecordedStep:
+    """The document of a step. controllers: agent → who controls it. opening: number of random steps."""
+    moves = tuple(
+        RecordedMove(
+            move.agent, controllers[move.agent], move.action, likely(move, interface.agents[move.agent].action)
+        )
+        for move in step.moves
+    )
+    return RecordedStep(step.step, moves, picture, 0 < step.step <= opening)
+
+
+def likely(move: Move, space: Space) -> Chances:
+    """Action probabilities of a move."""
+    return tuple((action, round(chance, 6)) for action, chance in chances(move, space, MOST_CHANCES) if chance > 0)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedGame(Document):
+    """players: agent → who controlled it. length: steps of the whole game. steps: the requested ones.
+
+    returns: agent → return. forfeits: agent, reference and reason. fault: why the game cannot be replayed; `steps` is
+    empty then.
+    """
+
+    match: str
+    game: int
+    players: dict[str, str]
+    length: int
+    every: int
+    steps: tuple[RecordedStep, ...]
+    returns: dict[str, float]
+    forfeits: tuple[dict[str, str], ...]
+    fault: str | None
+
+
+def recorded_steps(
+    source: GameSource, match: Match, request: RecordingRequest, environment: BatchedEnvironment, draws: bool
+) -> RecordedGame:
+    """The requested steps. The game is always replayed to its end, which verifies it.
+
+    match: the record. draws: whether `environment`, with `num_envs` 1, renders images.
+    """
+    steps: list[RecordedStep] = []
+    last: GameStep | None = None
+    fault = None
+    try:
+        for last in source.play(environment):
+            if request.includes(last.step, last.is_over):
+                picture = data_uri(environment.render(0), LARGEST) if draws else None
+                steps.append(step_of(last, source.controllers, source.interface, picture, source.opening))
+        assert last is not None, "a game has at least one step"
+    except Exception as error:  # third-party code can raise anything
+        steps, last = [], None
+        fault = one_line(error)
+    return RecordedGame(
+        match=match.id,
+        game=request.game,
+        players=dict(source.controllers),
+        length=0 if last is None else last.step,
+        every=request.every,
+        steps=tuple(steps),
+        returns={} if last is None else last.returns,
+        forfeits=_forfeits(match, request.game),
+        fault=fault,
+    )
+
+
+def _forfeits(match: Match, game: int) -> tuple[dict[str, str], ...]:
+    return tuple(
+        {"agent": each.agent, "ref": match.contestants[each.contestant], "reason": each.reason}
+        for each in match.games[game].forfeits
+    )

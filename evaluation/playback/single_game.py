@@ -1,0 +1,132 @@
+"""Plays a single unrecorded game step by step, with local or remote policies."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.config import LeagueConfig
+from league.environments.lockstep import stepping
+from league.environments.stepping import Batch, BatchedEnvironment, Ending, EpisodeStart, Turn
+from league.errors import UnknownPolicy
+from league.interface import Interface
+from league.policies.onnx import OnnxPolicy
+from league.policies.policy import Actions, Arrays, Policy
+from league.seeds import generator
+from league.spaces import Space, paths
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """Observation and action of an agent in one step.
+
+    observation: ONNX input name → array. action: as JSON. dist_inputs: (d,) inputs of the action distribution; None
+    unless the policy is a graph.
+    """
+
+    agent: str
+    observation: dict[str, NDArray]
+    action: Any
+    dist_inputs: NDArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GameStep:
+    """One step of a game. The first one is the reset, without moves.
+
+    moves: of all agents that acted, in the environment's order. endings: of all agents that left the game.
+    returns: agent → return so far. is_over: whether the game has ended. acting: who acts next.
+    """
+
+    step: int
+    moves: tuple[Move, ...]
+    endings: tuple[Ending, ...]
+    returns: dict[str, float]
+    is_over: bool
+    acting: tuple[str, ...] = ()
+
+
+def play_game(environment: BatchedEnvironment, players: Mapping[str, Policy], seed: int) -> Iterator[GameStep]:
+    """Play one game in environment 0 and yield its steps. players: agent → policy. Checkpoints play greedily.
+
+    The environment stays as the game left it, so that each step can be rendered. The caller closes it.
+    """
+    agents = environment.agents
+    episodes = iter([EpisodeStart(seed, agents)])
+    policies = {agent: _AgentPolicy(agent, players[agent], seed) for agent in agents}
+    returns = dict.fromkeys(agents, 0.0)
+    turn, step = environment.start(lambda _: next(episodes, None)), 0
+    yield GameStep(step, (), tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
+    while turn.batches:
+        batches = sorted(turn.batches.items(), key=_place)
+        answers = {agent: policies[agent].act(batch) for agent, batch in batches}
+        turn = environment.step({agent: actions for agent, (actions, _) in answers.items()})
+        step += 1
+        for agent, batch in turn.batches.items():
+            returns[agent] += batch.rewards[0]
+        for ending in turn.endings:
+            returns[agents[ending.agent]] += ending.reward
+        moves = tuple(move for _, move in answers.values())
+        yield GameStep(step, moves, tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
+
+
+def policy_output(
+    policy: Policy, observations: Arrays, state: Arrays | None, rng: Sequence[np.random.Generator] | None
+) -> Actions:
+    """A policy's greedy output. For a graph, it includes the inputs of the action distribution."""
+    if isinstance(policy, OnnxPolicy):
+        return policy.distribution(observations, state=state)
+    return policy.act(observations, state=state, rng=rng)
+
+
+def first_observation(config: LeagueConfig, interface: Interface, policy: str | None, seed: int = 0) -> Any:
+    """First observation of `policy` (None: of whoever begins) in a new episode as nested lists, as in a request body.
+
+    Raises UnknownPolicy if no agent of that policy acts in the first step.
+    """
+    with closing(stepping(config.environment, num_envs=1)) as environment:
+        episodes = iter([EpisodeStart(seed, environment.agents)])
+        turn: Turn = environment.start(lambda _: next(episodes, None))
+    for agent, batch in sorted(turn.batches.items(), key=_place):
+        if policy in (None, interface.policies[agent]):
+            return _value(interface.agents[agent].observation, batch)
+    beginning = ", ".join(sorted({repr(interface.policies[agent]) for agent in turn.batches}))
+    raise UnknownPolicy(f"{policy!r} does not act first in {config.league} ({beginning} does): pass an observation")
+
+
+class _AgentPolicy:
+    """Policy of one agent with its recurrent state and random generator."""
+
+    def __init__(self, agent: str, policy: Policy, seed: int) -> None:
+        self._agent, self._policy = agent, policy
+        self._draws = generator(seed, agent)
+        self._state: Arrays | None = None
+
+    def act(self, batch: Batch) -> tuple[NDArray, Move]:
+        """Actions (1, …) for a batch of this agent alone, and the move."""
+        given = policy_output(self._policy, batch.observations, self._state, [self._draws])
+        self._state, inputs = given.state, given.dist_inputs
+        seen = {name: array[0] for name, array in batch.observations.items()}
+        move = Move(self._agent, seen, given.actions[0].tolist(), None if inputs is None else inputs[0])
+        return given.actions, move
+
+
+def _place(item: tuple[str, Batch]) -> int:
+    return item[1].agents[0]
+
+
+def _value(space: Space, batch: Batch) -> Any:
+    """The first row of a batch as a value of `space`: nested lists under nested keys."""
+    value: Any = {}
+    for name, path in paths(space).items():
+        part = batch.observations[name][0].tolist()
+        if not path:
+            return part
+        inner = value
+        for key in path[:-1]:
+            inner = inner.setdefault(key, {})
+        inner[path[-1]] = part
+    return value

@@ -1,0 +1,1 @@
+"""Reports of a league: HTML page, JSON document, charts and webhook."""

@@ -1,0 +1,272 @@
+"""Results of evaluations and nightly runs as plain records; `to_json()` returns a JSON document without NaN."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from league.results.records import Scoring
+
+
+class Document:
+    """Base of dataclasses that convert to JSON documents."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Nested dictionaries and lists. Non-finite numbers become None."""
+        document: dict[str, Any] = _plain(asdict(self))  # type: ignore[call-overload]
+        return document
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def iso_timestamp(moment: datetime) -> str:
+    """A time as in `2026-03-03T12:00:00Z`."""
+    return moment.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+@dataclass(frozen=True, slots=True)
+class Standing(Document):
+    """Results of one contestant in a leaderboard.
+
+    score: mean score in [0, 1]. mean_return: in the environment's unit, over blocks without forfeits (None without
+    any). rating: Elo above `script:random`; None if no chain of games connects to it.
+    interval: 95 % interval of the rating.
+    unique_games: distinct games by seed, opening and moves; None if the moves were not read.
+    """
+
+    ref: str
+    mean_return: float | None
+    score: float
+    games: int
+    unique_games: int | None
+    rating: float | None
+    interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class RatedVersion(Document):
+    """A version with its rating, interval as in a Standing. champion_at: times when it became champion."""
+
+    ref: str
+    number: int
+    made_at: str
+    steps: int
+    parent: int | None
+    rating: float | None
+    interval: tuple[float, float] | None
+    games: int
+    champion_at: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference(Document):
+    """Mean difference of returns in the environment's unit, with its 95 % interval. A single block has no interval."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Payoff(Document):
+    """Payoff matrix. score[i][j]: mean score of i against j over games[i][j] games; None if they did not meet.
+
+    by_side[side][i][j]: the same for games in which i played that side alone.
+    difference[i][j]: mean return of i minus that of j in the games of the same blocks.
+    """
+
+    contestants: tuple[str, ...]
+    score: tuple[tuple[float | None, ...], ...]
+    games: tuple[tuple[int, ...], ...]
+    by_side: dict[str, tuple[tuple[float | None, ...], ...]]
+    difference: tuple[tuple[Difference | None, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate(Document):
+    """A value with the bounds of its 95 % interval; None if there are too few games."""
+
+    value: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Population(Document):
+    """Shares of the contestants, computed from the whole payoff matrix; they sum to 1.
+
+    alpha_rank: share of time in an imitating population. nash: probability in the maximum-entropy equilibrium.
+    """
+
+    alpha_rank: tuple[Estimate, ...]
+    nash: tuple[Estimate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CrossPlay(Document):
+    """Mean returns of a team (per agent, in the environment's unit) in which two contestants play together.
+
+    returns[i][j]: contestant i controls one agent, which rotates, and j all others; on the diagonal i controls all
+    agents; None if they have not played. own: mean of the diagonal. mixed: mean of the other cells.
+    """
+
+    contestants: tuple[str, ...]
+    returns: tuple[tuple[Estimate | None, ...], ...]
+    own: Estimate | None
+    mixed: Estimate | None
+
+
+StoppedBy = Literal["schedule", "games", "minutes", "precision"]
+"""What ended an evaluation: the end of the schedule, a budget, or sufficient precision."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationReport(Document):
+    """Result of a tournament or of cross-play.
+
+    schedule: id of the schedule; for an adaptive tournament, the common prefix of its rounds' ids.
+    kind: `round_robin`, `gauntlet`, `adaptive` or `cross_play`.
+    by_side: leaderboard of each side; empty if sides are alike or there is only one.
+    population: for a round robin in which all pairs met, else None.
+    cross_play: None for a tournament. With cross-play, leaderboard and payoff are empty.
+    forfeits: contestant → forfeited games, if any.
+    """
+
+    league: str
+    schedule: str
+    environment_digest: str
+    games: int
+    unique_games: int
+    leaderboard: tuple[Standing, ...]
+    payoff: Payoff
+    scoring: Scoring
+    by_side: dict[str, tuple[Standing, ...]]
+    forfeits: dict[str, int] = field(default_factory=dict)
+    kind: str = "round_robin"
+    stopped_by: StoppedBy = "schedule"
+    population: Population | None = None
+    cross_play: CrossPlay | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorReport(Document):
+    """One non-inferiority test with its evidence, as in VerdictReport.
+
+    margin: by how much the candidate may be weaker, in the gate's unit. schedule: of the matches that count.
+    outcome: `not inferior`, `inferior`, `inconclusive`, or `open` if the verdict was voided before its end.
+    """
+
+    ref: str
+    margin: float
+    schedule: str
+    outcome: str
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    unique_games: int
+    counts: tuple[int, ...]
+    score: float | None
+    elo: float | None
+    interval: tuple[float | None, float | None] | None
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictReport(Document):
+    """The test of one candidate with its evidence.
+
+    outcome: `promote`, `reject`, `inconclusive`, or `void` with the reason in `note`.
+    llr, bounds: log likelihood ratio at the end and its bounds; log wealths if returns are tested.
+    blocks, games: counted ones. unique_games: distinct games among them.
+    counts: blocks per cell, worst for the candidate first.
+    score: the candidate's mean score. elo, interval: logistic Elo above the opponent with its 95 % interval; infinite
+    bounds are None.
+    alpha: error probability spent by this verdict.
+    anchors: non-inferiority tests after the opponent was beaten.
+    difference: mean return minus that of the opponent if contestants are compared on the same side or the gate
+    tests returns, else None.
+    promoted: whether this verdict made the candidate champion.
+    note: why it did not although the opponent was beaten, or why it is void.
+    """
+
+    verdict: str
+    candidate: str
+    opponent: str
+    outcome: str
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    unique_games: int
+    counts: tuple[int, ...]
+    score: float | None
+    elo: float | None
+    interval: tuple[float | None, float | None] | None
+    promoted: bool
+    alpha: float
+    anchors: tuple[AnchorReport, ...] = ()
+    difference: Difference | None = None
+    note: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation(Document):
+    """Improvement of a promotion, measured by a match of fixed length. `elo` and `interval` as in VerdictReport."""
+
+    verdict: str
+    candidate: str
+    opponent: str
+    games: int
+    score: float
+    elo: float
+    interval: tuple[float | None, float | None]
+    difference: Difference | None
+
+
+@dataclass(frozen=True, slots=True)
+class NightlyReport(Document):
+    """A nightly run: its verdicts in order, the champion before and after, and all ratings.
+
+    confirmations: confirmation matches played in this run.
+    alpha_spent: by all verdicts of the last 365 days, of the gate's `alpha`.
+    faults: versions that could not be gated or rated, with the reasons; they are retried in the next run.
+    """
+
+    league: str
+    champion_before: str | None
+    champion: str | None
+    verdicts: tuple[VerdictReport, ...]
+    confirmations: tuple[Confirmation, ...]
+    alpha_spent: float
+    faults: tuple[str, ...]
+    leaderboard: tuple[Standing, ...]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress(Document):
+    """Progress of one schedule.
+
+    what: for people, such as `connect_four@3 against connect_four@2`.
+    played, of: matches (blocks) so far and at most.
+    llr, bounds: state of the sequential test, for verdicts.
+    """
+
+    what: str
+    played: int
+    of: int
+    llr: float | None = None
+    bounds: tuple[float, float] | None = None
+
+
+Listener = Callable[[Progress | VerdictReport], None]
+"""Receives progress and verdicts, in the process that started the evaluation."""

@@ -1,0 +1,1 @@
+"""Schedules of matches: block design, adaptive pairing and stopping rules."""

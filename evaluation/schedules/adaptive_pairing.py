@@ -1,0 +1,132 @@
+"""Adaptive pairing: schedules the matches that reduce the uncertainty of the ranking most. Pure.
+
+Strengths follow the Bradley–Terry model with a wide normal prior; their posterior is approximated by a normal
+distribution (Laplace). The value of a match, Φ(-|m|/s) × w s² / (1 + w s²), and the choice of a round are explained in
+docs/statistics.md.
+
+Sources: M. E. Glickman and S. T. Jensen, "Adaptive paired comparison design", J. Stat. Planning and Inference 127
+(2005), for choosing pairs by expected information; M. Rowland et al., "Multiagent evaluation under incomplete
+information", NeurIPS 2019, for skipping pairs with a known order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import expit, ndtr
+
+from evaluation.statistics.blas import single_threaded_blas
+from league.results.records import BlockResult
+from league.seeds import generator
+
+Floats = NDArray[np.float64]
+Pairing = tuple[int, int]
+
+PRIOR = 600 * math.log(10) / 400
+"""Prior standard deviation of strengths in log odds: 600 Elo."""
+
+GROWTH = 16
+"""A round adds a sixteenth of the matches so far, and at least one per contestant."""
+
+STEPS = 16
+"""Approximate minimum number of steps to choose a round. A large round plays a pair several times."""
+
+WORTHWHILE = 0.5
+"""A step skips pairs whose value is below this share of the best one."""
+
+
+def round_size(contestants: int, played: int) -> int:
+    """Number of matches of the round after `played` matches, independent of earlier rounds."""
+    return max(contestants, played // GROWTH)
+
+
+def ring(contestants: int, seed: int) -> list[Pairing]:
+    """The first round: every contestant meets two others, so that all are connected."""
+    order = generator(seed, "ring").permutation(contestants).tolist()
+    pairs = [(min(pair), max(pair)) for pair in zip(order, order[1:] + order[:1], strict=True)]
+    return pairs if contestants > 2 else pairs[: contestants - 1]
+
+
+def choose(points: Floats, games: Floats, number: int, comparisons: int = 2) -> list[Pairing]:
+    """The `number` most valuable pairs, best first. Pairs may repeat.
+
+    Args:
+        points: `points[i, j]`: what i scored against j, shape (n, n).
+        games: Number of games of each pair, shape (n, n).
+        number: Number of matches to choose.
+        comparisons: Games that a match counts for.
+    """
+    with single_threaded_blas():
+        return _chosen(points, games, number, comparisons)
+
+
+def _chosen(points: Floats, games: Floats, number: int, comparisons: int) -> list[Pairing]:
+    strength, precision = posterior(points, games)
+    first, second = np.triu_indices(len(games), 1)
+    gap = strength[first] - strength[second]
+    at_once = math.ceil(number / (STEPS * len(games)))
+    information = at_once * comparisons * expit(gap) * expit(-gap)
+    chosen: list[Pairing] = []
+    while len(chosen) < number:
+        covariance = _inverse(precision)
+        own = np.diag(covariance)
+        variance = own[first] + own[second] - 2 * covariance[first, second]
+        gain = information * variance
+        value = ndtr(-np.abs(gap) / np.sqrt(variance)) * gain / (1 + gain)
+        for pair in _disjoint(value, first, second):
+            i, j = int(first[pair]), int(second[pair])
+            chosen += [(i, j)] * at_once
+            precision[[i, j], [i, j]] += information[pair]
+            precision[[i, j], [j, i]] -= information[pair]
+            if len(chosen) >= number:
+                break
+    return chosen[:number]
+
+
+def tally(contestants: Mapping[str, int], results: Iterable[BlockResult]) -> tuple[Floats, Floats]:
+    """Points and games of each pair, (n, n) each, as `choose` takes them. contestants: reference → number."""
+    points, games = np.zeros((2, len(contestants), len(contestants)))
+    for block in results:
+        i, j = (contestants[ref] for ref in block.contestants)
+        points[[i, j], [j, i]] += block.scores
+        games[[i, j], [j, i]] += block.games
+    return points, games
+
+
+def posterior(points: Floats, games: Floats) -> tuple[Floats, Floats]:
+    """Maximum a posteriori log odds (n,), and the precision (n, n) of the normal approximation."""
+    strength = np.zeros(len(games))
+    while True:
+        expected = expit(strength[:, None] - strength)
+        information = games * expected * (1 - expected)
+        precision = np.diag(information.sum(axis=1) + PRIOR**-2) - information
+        gradient = (points - games * expected).sum(axis=1) - strength / PRIOR**2
+        step = cho_solve(cho_factor(precision), gradient)
+        farthest = np.abs(step).max()
+        if farthest < TOLERANCE:
+            return strength, precision
+        # Far from the maximum, a full Newton step may overshoot. Steps of one unit of log odds do not.
+        strength = strength + step / max(1.0, farthest)
+
+
+TOLERANCE = 1e-6
+"""Convergence of the fit, in log odds."""
+
+
+def _inverse(precision: Floats) -> Floats:
+    return np.asarray(cho_solve(cho_factor(precision), np.eye(len(precision))))
+
+
+def _disjoint(value: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Iterator[int]:
+    """Indices of pairs of different contestants, best first, while they are worthwhile."""
+    busy = set()
+    worthwhile = np.flatnonzero(value >= WORTHWHILE * value.max())
+    for pair in worthwhile[np.argsort(-value[worthwhile], kind="stable")].tolist():
+        i, j = int(first[pair]), int(second[pair])
+        if i not in busy and j not in busy:
+            busy |= {i, j}
+            yield pair

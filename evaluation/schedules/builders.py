@@ -1,0 +1,262 @@
+"""Builds schedules: who plays whom, how often and in which order. Pure and deterministic.
+
+A match is one block: two games with one seed and one opening between two contestants. In the first game, contestant 0
+has one side (the *seat*) and contestant 1 has all others. In the second game they swap. Both contestants therefore get
+the advantage of a seat or an opening once:
+
+| sides | the two games of a block                                                                           |
+|-------|----------------------------------------------------------------------------------------------------|
+| two   | A against B, and B against A                                                                       |
+| more  | A among Bs, and B among As in the same seat; the seat rotates with the rounds of the schedule       |
+| one   | A alone, and B alone: a team, or a single agent                                                    |
+
+league/results/scoring.py defines how games are scored.
+
+Matches are ordered in rounds, each with every pairing once, so that every prefix of a schedule is balanced. An adaptive
+tournament is a sequence of schedules, each computed from the results of the previous ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, combinations_with_replacement
+from typing import Any
+
+import numpy as np
+
+from evaluation.schedules import adaptive_pairing
+from league.config import GateConfig, LeagueConfig
+from league.errors import ConfigError, EnvironmentMismatch
+from league.interface import Interface, digest
+from league.refs import ScriptRef
+from league.results.records import GAMES_PER_BLOCK, BlockResult, Schedule, Scoring
+from league.seeds import derive, generator
+
+ANCHOR = str(ScriptRef("random"))
+"""The contestant whose rating is 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class GamePlan:
+    """One game of a schedule.
+
+    index: number of the game in its block. sides[s]: who controls side s, as an index into the match's contestants.
+    seed: of the environment, equal in both games of a block.
+    """
+
+    position: int
+    index: int
+    sides: tuple[int, ...]
+    seed: int
+    contestants: tuple[str, ...]
+
+    def opening(self, attempt: int, agent: int) -> np.random.Generator:
+        """Random generator of an agent's opening moves: equal in both games, different for each attempt."""
+        return generator(self.seed, "opening", attempt, agent)
+
+    def policy(self, agent: int) -> np.random.Generator:
+        """Random generator of the policy that controls an agent in this game."""
+        return generator(self.seed, "policy", self.index, agent)
+
+
+def game_plans(schedule: Schedule, position: int) -> list[GamePlan]:
+    """The games of match `position` of `schedule`, in order."""
+    seed, contestants = schedule.seed_at(position), schedule.contestants_at(position)
+    return [
+        GamePlan(position, index, schedule.seating_at(position, index), seed, contestants)
+        for index in range(GAMES_PER_BLOCK)
+    ]
+
+
+Pairing = tuple[int, ...]
+
+
+def round_robin(
+    config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int = 0
+) -> Schedule:
+    """Every pair of contestants plays `blocks` matches."""
+    pairings = list(combinations(range(len(contestants)), 2))
+    return _schedule(config, interface, "round_robin", contestants, pairings, blocks * len(pairings), seed)
+
+
+def gauntlet(
+    config: LeagueConfig,
+    interface: Interface,
+    challengers: Sequence[str],
+    opponents: Sequence[str],
+    blocks: int,
+    seed: int = 0,
+    kind: str = "gauntlet",
+) -> Schedule:
+    """Every challenger plays `blocks` matches against every opponent except itself.
+
+    kind: `gauntlet` for the rating of a new version in a nightly run, `challenge` for requested evaluations.
+    """
+    contestants = list(dict.fromkeys([*challengers, *opponents]))
+    number = {ref: i for i, ref in enumerate(contestants)}
+    meetings = [(number[a], number[b]) for a in challengers for b in opponents if a != b]
+    pairings = list({frozenset(pair): pair for pair in meetings}.values())
+    return _schedule(config, interface, kind, contestants, pairings, blocks * len(pairings), seed)
+
+
+def verdict(
+    config: LeagueConfig,
+    interface: Interface,
+    candidate: str,
+    champion: str,
+    gate: GateConfig | None = None,
+    seed: int = 0,
+) -> Schedule:
+    """The candidate plays up to `gate.max_blocks` matches against the champion. The id depends on the gate's settings
+       too.
+
+    gate: by default that of the league.
+    """
+    gate = gate or config.gate
+    schedule = _schedule(config, interface, "verdict", [candidate, champion], [(0, 1)], gate.max_blocks, seed)
+    return replace(schedule, id=f"{schedule.id}-{digest(gate.model_dump(mode='json'))[:8]}")
+
+
+def companion(
+    config: LeagueConfig, interface: Interface, kind: str, verdict: Schedule, opponent: str, blocks: int
+) -> Schedule:
+    """The candidate of a verdict plays up to `blocks` matches against another opponent, with seeds of this verdict
+       alone.
+
+    kind: `anchor` or `confirmation`.
+    """
+    contestants = [verdict.contestants[0], opponent]
+    return _schedule(config, interface, kind, contestants, [(0, 1)], blocks, verdict.seed, of=verdict.id)
+
+
+def cross_play(
+    config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int = 0
+) -> Schedule:
+    """Every pair of contestants, and each with itself, plays `blocks` matches in one team.
+
+    The sides are the team's agents: one contestant controls one of them, the other contestant the others.
+    Raises EnvironmentMismatch unless the league has one side with several agents.
+    """
+    if len(interface.sides) != 1 or len(interface.agents) < 2:
+        raise EnvironmentMismatch(
+            f"cross-play mixes the agents of one team, but league {config.league} has {len(interface.sides)} side(s)"
+            f" and {len(interface.agents)} agent(s)"
+        )
+    if len(contestants) < 2:
+        raise EnvironmentMismatch(f"cross-play in league {config.league} needs two contestants")
+    pairings = list(combinations_with_replacement(range(len(contestants)), 2))
+    length = blocks * len(pairings)
+    return _schedule(config, interface.apart(), "cross_play", contestants, pairings, length, seed, "team")
+
+
+def adaptive_round(
+    config: LeagueConfig,
+    interface: Interface,
+    contestants: Sequence[str],
+    results: Sequence[BlockResult],
+    seed: int = 0,
+) -> Schedule:
+    """The round of an adaptive tournament that follows `results`, the results of all earlier rounds.
+
+    The id identifies the round and the tournament, but not the pairings. These are in the ledger once the round has
+    begun, and stay valid if another machine rounds numbers differently.
+    """
+    first = _first_round(config, interface, contestants, seed)
+    turns, games = _turns(interface), GAMES_PER_BLOCK if len(interface.sides) > 1 else 1
+    pairings: Sequence[Pairing] = first.pairings
+    if results:
+        tally = adaptive_pairing.tally({ref: i for i, ref in enumerate(contestants)}, results)
+        size = adaptive_pairing.round_size(len(contestants), len(results) // turns)
+        pairings = adaptive_pairing.choose(*tally, size, comparisons=games * turns)
+    return replace(
+        first,
+        id=f"{first.id}-{len(results)}",
+        seed=derive(first.seed, len(results)),
+        pairings=tuple(pairings),
+        length=turns * len(pairings),
+    )
+
+
+def adaptive_name(config: LeagueConfig, interface: Interface, contestants: Sequence[str], seed: int = 0) -> str:
+    """Common prefix of the ids of all rounds of an adaptive tournament."""
+    return _first_round(config, interface, contestants, seed).id
+
+
+def adaptive_rounds(interface: Interface, contestants: int) -> Iterator[int]:
+    """Number of matches at the end of each round of an adaptive tournament."""
+    turns, played = _turns(interface), 0
+    while True:
+        played += (
+            adaptive_pairing.round_size(contestants, played) if played else len(adaptive_pairing.ring(contestants, 0))
+        )
+        yield turns * played
+
+
+def _first_round(config: LeagueConfig, interface: Interface, contestants: Sequence[str], seed: int) -> Schedule:
+    pairings = adaptive_pairing.ring(len(contestants), seed)
+    return _schedule(config, interface, "adaptive", contestants, pairings, _turns(interface) * len(pairings), seed)
+
+
+def _turns(interface: Interface) -> int:
+    """How often an adaptive round plays a pairing: once per seat if there are more than two sides."""
+    return len(interface.sides) if len(interface.sides) > 2 else 1
+
+
+def scoring(config: LeagueConfig, interface: Interface) -> Scoring:
+    """`play.scoring` of the configuration; by default `game` if there are several sides with equal spaces, else `side`.
+
+    Chess has two equal sides; an adversary and its opponents have different sides; a team is one side.
+    Raises ConfigError for `game` with a single side.
+    """
+    if config.play.scoring is not None:
+        if config.play.scoring == "game" and len(interface.sides) == 1:
+            raise ConfigError("play.scoring: game compares the sides of a game, but there is only one side: remove it")
+        return config.play.scoring
+    kinds = {
+        tuple(sorted(digest(interface.agents[agent].model_dump(mode="json")) for agent in agents))
+        for agents in interface.sides.values()
+    }
+    return "game" if len(interface.sides) > 1 and len(kinds) == 1 else "side"
+
+
+def _schedule(
+    config: LeagueConfig,
+    interface: Interface,
+    kind: str,
+    contestants: Sequence[str],
+    pairings: Sequence[Pairing],
+    length: int,
+    seed: int,
+    compared: Scoring | None = None,
+    of: str | None = None,
+) -> Schedule:
+    compared = compared or scoring(config, interface)
+    if not pairings:
+        raise EnvironmentMismatch(f"a schedule of league {config.league} needs at least two contestants")
+    content: dict[str, Any] = {
+        "environment": config.environment.digest(),
+        "sides": {side: list(agents) for side, agents in interface.sides.items()},
+        "scoring": compared,
+        "opening_plies": config.play.opening_plies,
+        "contestants": list(contestants),
+        "pairings": [list(pairing) for pairing in pairings],
+        "length": length,
+        "seed": seed,
+    }
+    if of is not None:
+        content |= {"kind": kind, "of": of}
+    name = digest(content)
+    return Schedule(
+        id=f"{config.league}-{kind}-{name[:16]}",
+        league=config.league,
+        kind=kind,
+        seed=derive(seed, name),
+        environment_digest=config.environment.digest(),
+        sides=tuple(interface.sides),
+        contestants=tuple(contestants),
+        pairings=tuple(pairings),
+        length=length,
+        opening_plies=config.play.opening_plies,
+        scoring=compared,
+    )

@@ -1,0 +1,1 @@
+"""The evaluation service: a Serve deployment with subprocesses for evaluations, games and snapshots."""

@@ -1,0 +1,191 @@
+"""Pool of worker processes for games that people watch or play, one process per league.
+
+    GameWorkerPool.submit → the league's thread → pipe → evaluation.service.game_worker
+
+The thread serialises a league's requests, because an environment plays one game at a time. A game that hangs delays its
+own league only, until the deadline. Responses are cached, so that a request that takes longer than an HTTP request may
+last can be repeated.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from league.errors import GameHung, LeagueError, NotReady, Overloaded, WorkerLost, from_document
+from league.service_requests import GameRequest, GameResponse
+from league.subprocesses import Subprocess
+
+T = TypeVar("T")
+
+SECONDS = 60.0
+"""Time limit of one request. A video of several hundred frames takes half of it."""
+GRACE = 5.0
+"""Additional seconds until a process that does not give up by itself is killed."""
+START_TIMEOUT = 60.0
+"""Seconds for a process to start."""
+MOST_WORKERS = 4
+"""Leagues with a process. The least recently used idle process makes room for another league."""
+MOST_WAITING = 16
+"""Unanswered requests of one league."""
+MOST_CACHED, CACHE_BYTES = 256, 64 * 2**20
+"""Cached responses, and their total size in bytes."""
+
+
+class GameWorkerPool:
+    """Called from one event loop.
+
+    seconds: time limit of one request. grace: seconds after that until the process is killed. most: processes.
+    """
+
+    def __init__(self, seconds: float = SECONDS, grace: float = GRACE, most: int = MOST_WORKERS) -> None:
+        self._seconds, self._grace, self._most = seconds, grace, most
+        self._workers: OrderedDict[str, _LeagueWorker] = OrderedDict()
+        self._cache: OrderedDict[str, Future[GameResponse]] = OrderedDict()
+
+    async def submit(self, request: GameRequest, timeout: float) -> GameResponse:
+        """Return the response if it arrives within `timeout` seconds. Otherwise its computation continues.
+
+        Raises:
+            NotReady: The timeout expired. Repeat the same request.
+            Overloaded: Too many requests are waiting.
+            GameHung: The request exceeded its time limit.
+            WorkerLost: The process died.
+            LeagueError: The error that the worker reported.
+        """
+        line = request.model_dump_json()
+        response = self._cache.get(line)
+        if response is None or (response.done() and not request.is_cacheable):
+            response = self._cache[line] = self._worker(request.league).submit(line)
+        self._cache.move_to_end(line)
+        self._evict()
+        try:
+            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(response)), timeout)
+        except TimeoutError:
+            raise NotReady(f"a game of {request.league} is still being computed: repeat the request") from None
+        except LeagueError:
+            if self._cache.get(line) is response:
+                del self._cache[line]  # errors are not cached
+            raise
+
+    def close(self) -> None:
+        """Kill all processes."""
+        while self._workers:
+            self._workers.popitem()[1].close()
+
+    def _worker(self, league: str) -> _LeagueWorker:
+        if league not in self._workers:
+            self._make_room()
+            self._workers[league] = _LeagueWorker(league, self._seconds, self._grace)
+        self._workers.move_to_end(league)
+        return self._workers[league]
+
+    def _make_room(self) -> None:
+        if len(self._workers) < self._most:
+            return
+        idle = next((league for league, worker in self._workers.items() if not worker.is_busy), None)
+        if idle is None:
+            raise Overloaded(f"games of {len(self._workers)} other leagues are being played: retry soon")
+        self._workers.pop(idle).close()
+
+    def _evict(self) -> None:
+        """Remove the oldest responses beyond the limits of the cache."""
+        sizes = {line: _size(response) for line, response in self._cache.items() if response.done()}
+        over, room = len(self._cache) - MOST_CACHED, CACHE_BYTES - sum(sizes.values())
+        for line, size in sizes.items():
+            if over <= 0 and room >= 0:
+                return
+            del self._cache[line]
+            over, room = over - 1, room + size
+
+
+class _LeagueWorker:
+    """The process of one league and the thread that its requests wait in."""
+
+    def __init__(self, league: str, seconds: float, grace: float) -> None:
+        self._league, self._seconds, self._grace = league, seconds, grace
+        self._thread = ThreadPoolExecutor(1, f"games-{league}")
+        self._pending: list[Future[GameResponse]] = []
+        self._process: Subprocess | None = None
+        self._is_closed = False
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it has unanswered requests."""
+        return any(not response.done() for response in self._pending)
+
+    def submit(self, line: str) -> Future[GameResponse]:
+        """Queue a request. Raises Overloaded."""
+        self._pending = [response for response in self._pending if not response.done()]
+        if len(self._pending) >= MOST_WAITING:
+            raise Overloaded(f"{len(self._pending)} games of {self._league} are waiting: retry soon")
+        self._pending.append(self._thread.submit(self._request, line))
+        return self._pending[-1]
+
+    def close(self) -> None:
+        """Kill the process."""
+        self._is_closed = True
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        if self._process is not None:
+            self._process.stop()
+
+    def _request(self, line: str) -> GameResponse:
+        is_old = self._process is not None
+        try:
+            return self._attempt(line)
+        except WorkerLost:
+            if not is_old:
+                raise
+            return self._attempt(line)  # the process may have died before, for another reason
+
+    def _attempt(self, line: str) -> GameResponse:
+        if self._process is None:
+            options = {"league": self._league, "seconds": self._seconds}
+            self._process = Subprocess("evaluation.service.game_worker", json.dumps(options), output=True)
+            if self._is_closed:
+                self._process.kill()
+            self._within(START_TIMEOUT, self._process, _await_start)
+        return self._within(self._seconds + self._grace, self._process, lambda process: _exchange(process, line))
+
+    def _within(self, seconds: float, process: Subprocess, action: Callable[[Subprocess], T]) -> T:
+        """The result of an action on the process, which is killed if that takes longer or fails."""
+        began = time.monotonic()
+        try:
+            with process.deadline(seconds):
+                return action(process)
+        except (OSError, ValueError) as error:
+            process.stop()
+            self._process = None
+            if time.monotonic() - began >= seconds:
+                raise GameHung(f"a game of {self._league} hung: its process was killed after {seconds:g} s") from error
+            raise WorkerLost(f"the process that plays games of {self._league} died: see its log") from error
+
+
+def _await_start(process: Subprocess) -> None:
+    """Raise ValueError if the process dies before it is ready."""
+    json.loads(process.stdout.readline())
+
+
+def _exchange(process: Subprocess, line: str) -> GameResponse:
+    """Send a request and read its response.
+
+    Raises the LeagueError that the process reports, and OSError or ValueError if it dies.
+    """
+    process.stdin.write(line.encode() + b"\n")
+    process.stdin.flush()
+    head = json.loads(process.stdout.readline())
+    if "code" in head:
+        raise from_document(head)
+    content = process.stdout.read(head["size"])
+    if len(content) < head["size"]:
+        raise ValueError("the response is truncated")
+    return GameResponse(head["media_type"], content)
+
+
+def _size(response: Future[GameResponse]) -> int:
+    return 0 if response.exception() else len(response.result().content)

@@ -1,0 +1,1 @@
+"""Statistics of match results: sequential tests, ratings, payoff matrices and population measures."""

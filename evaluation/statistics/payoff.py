@@ -1,0 +1,172 @@
+"""Payoff and cross-play matrices: mean scores, mean returns and paired differences of contestants.
+
+Both games of a block share seed and opening, so the value of a seed cancels in the difference of a block's returns.
+Blocks are independent and the games of a block are not, so intervals are computed over blocks with Student's t.
+
+Cross-play measures zero-shot coordination: how well policies that were not trained together play in one team (H. Hu et
+al., "'Other-play' for zero-shot coordination", ICML 2020). The diagonal of its matrix is self-play; the loss off the
+diagonal shows how much a policy relies on its own conventions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from evaluation.results import CrossPlay, Difference, Estimate, Payoff
+from league.results.records import Game, Match
+
+
+def paired_difference(matches: Iterable[Match], contestant: str, confidence: float = 0.95) -> Difference | None:
+    """Mean return of `contestant` minus that of its opponent.
+
+    Matches with a forfeited game are left out, because a partial return can exceed that of a whole game. After a
+    sequential stop, the interval is conditional on having stopped, and optimistic.
+
+    Args:
+        matches: Matches between `contestant` and one opponent.
+        contestant: Reference of one of the two.
+        confidence: Coverage of the interval.
+
+    Returns:
+        The difference in the environment's unit of returns, or None without complete matches.
+    """
+    gaps = []
+    for match in matches:
+        own = match.contestants.index(contestant)
+        mine, other = match.mean_return(own), match.mean_return(1 - own)
+        if mine is not None and other is not None:
+            gaps.append(mine - other)
+    return student_interval(gaps, confidence) if gaps else None
+
+
+def student_interval(values: Sequence[float], confidence: float = 0.95) -> Difference:
+    """Mean of independent values with Student's interval, mean ± t s/√N. A single value has no interval."""
+    number, mean = len(values), float(np.mean(values))
+    if number == 1:
+        return Difference(mean, None, None)
+    half = float(stdtrit(number - 1, 0.5 + confidence / 2)) * float(np.std(values, ddof=1)) / math.sqrt(number)
+    return Difference(mean, mean - half, mean + half)
+
+
+Floats = NDArray[np.float64]
+Row = tuple[float | None, ...]
+
+
+def tabulate(contestants: Sequence[str], sides: Sequence[str], matches: Iterable[Match]) -> Payoff:
+    """Payoff matrix: mean scores, games and paired differences of each ordered pair of `contestants`.
+
+    `score[i][j] + score[j][i] = 1` for pairs that met, and `difference[i][j].mean = -difference[j][i].mean`. A game
+    counts for a side if the row's contestant played that side and no other.
+
+    Args:
+        contestants: References in the order of rows and columns.
+        sides: Names of the sides.
+        matches: Matches between these contestants.
+    """
+    total, by_side = _PairTotals(contestants), {side: _PairTotals(contestants) for side in sides}
+    met: defaultdict[tuple[str, str], list[Match]] = defaultdict(list)
+    for match in matches:
+        for row in (0, 1):
+            pair = (match.contestants[row], match.contestants[1 - row])
+            met[pair].append(match)
+            for game in match.games:
+                score = game.scores[row]
+                if score is None:
+                    continue
+                total.add(pair, score)
+                if (side := only_side(game, row)) is not None:
+                    by_side[sides[side]].add(pair, score)
+    return Payoff(
+        tuple(contestants),
+        total.means(),
+        total.counts(),
+        {side: table.means() for side, table in by_side.items()},
+        tuple(tuple(paired_difference(met[row, column], row) for column in contestants) for row in contestants),
+    )
+
+
+def only_side(game: Game, contestant: int) -> int | None:
+    """The side that a contestant played in a game, or None if it played several or none."""
+    own = [side for side, player in enumerate(game.sides) if player == contestant]
+    return own[0] if len(own) == 1 else None
+
+
+class _PairTotals:
+    def __init__(self, contestants: Sequence[str]) -> None:
+        self._index = {name: i for i, name in enumerate(contestants)}
+        shape = (len(contestants), len(contestants))
+        self._points: NDArray[np.float64] = np.zeros(shape)
+        self._games: NDArray[np.int64] = np.zeros(shape, dtype=np.int64)
+
+    def add(self, pair: tuple[str, str], points: float) -> None:
+        row, column = (self._index[name] for name in pair)
+        self._points[row, column] += points
+        self._games[row, column] += 1
+
+    def means(self) -> tuple[Row, ...]:
+        return tuple(
+            tuple(float(p / n) if n else None for p, n in zip(points, games, strict=True))
+            for points, games in zip(self._points, self._games, strict=True)
+        )
+
+    def counts(self) -> tuple[tuple[int, ...], ...]:
+        return tuple(tuple(int(n) for n in row) for row in self._games)
+
+
+def cross_play_table(contestants: Sequence[str], matches: Iterable[Match]) -> CrossPlay:
+    """Mean team returns of all pairs of `contestants`; None for pairs that have not played together.
+
+    Matches are independent and the two games of a match are not, so intervals are computed over matches. Matches with a
+    forfeited game have no return and are left out.
+    """
+    cells: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+    teams: defaultdict[frozenset[str], list[float]] = defaultdict(list)
+    for match in matches:
+        if any(game.forfeits for game in match.games):
+            continue
+        returns = [team_return(game) for game in match.games]
+        teams[frozenset(match.contestants)].append(float(np.mean(returns)))
+        if len(set(match.contestants)) == 1:
+            cells[match.contestants[0], match.contestants[0]].append(float(np.mean(returns)))
+            continue
+        for seat, value in enumerate(returns):
+            # Contestant i has the seat in game i.
+            cells[match.contestants[seat], match.contestants[1 - seat]].append(value)
+    return CrossPlay(
+        contestants=tuple(contestants),
+        returns=tuple(tuple(_estimate(cells[row, column]) for column in contestants) for row in contestants),
+        own=_stratified([values for team, values in teams.items() if len(team) == 1]),
+        mixed=_stratified([values for team, values in teams.items() if len(team) > 1]),
+    )
+
+
+def team_return(game: Game) -> float:
+    """Mean return over the agents of the team, where each agent is a side."""
+    total = 0.0
+    for contestant, value in enumerate(game.returns):
+        total += 0.0 if value is None else value * game.sides.count(contestant)
+    return total / len(game.sides)
+
+
+def _estimate(values: Sequence[float]) -> Estimate | None:
+    if not values:
+        return None
+    mean = student_interval(values)
+    return Estimate(mean.mean, mean.low, mean.high)
+
+
+def _stratified(teams: Sequence[Sequence[float]]) -> Estimate | None:
+    """Mean over teams of their means, ± 1.96 combined standard errors."""
+    if not teams:
+        return None
+    mean = float(np.mean([np.mean(values) for values in teams]))
+    if any(len(values) < 2 for values in teams):
+        return Estimate(mean, None, None)
+    error = float(np.sqrt(sum(np.var(values, ddof=1) / len(values) for values in teams))) / len(teams)
+    return Estimate(mean, mean - 1.96 * error, mean + 1.96 * error)

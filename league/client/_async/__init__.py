@@ -1,0 +1,1 @@
+"""The asyncio client; the blocking client, `_sync`, is generated from it."""

@@ -1,0 +1,99 @@
+# Generated from league/client/_async/episode.py by scripts/generate_sync_client.py; do not edit.
+"""Episodes over HTTP, in which one version chooses every action.
+
+The first response determines the version. Later requests specify that version and return the recurrent state.
+"""
+
+from typing import Any, Protocol, Self, TypeVar
+
+from league.client import calls
+from league.client.calls import ApiCall
+from league.client.requests import ActionRequest, Encoding
+from league.client.responses import VERSION_GONE, ActionResponse, Model, episode_interrupted
+from league.seeds import derive
+
+T = TypeVar("T")
+
+
+class Sender(Protocol):
+    """The part of `Client` that an episode uses."""
+
+    encoding: Encoding
+
+    def send(self, call: ApiCall[T]) -> T:
+        """Send an API call and return its parsed response."""
+
+
+class Episode:
+    """An episode of one agent, created by `Client.episode`. Do not share it between threads or tasks.
+
+    The version that answers the first request answers all of them, even if another version is promoted meanwhile.
+
+    Args:
+        client: Sends the requests.
+        model: The policy, with or without a version.
+        explore: Sample actions instead of taking the most likely ones.
+        seed: Seed of the episode. The seed of step t is derived from it and t.
+    """
+
+    def __init__(self, client: Sender, model: Model, *, explore: bool, seed: int | None) -> None:
+        self._client = client
+        self._model = model
+        self._explore = explore
+        self._seed = seed
+        self._last: ActionResponse | None = None
+        self._steps = 0
+
+    @property
+    def version(self) -> int | None:
+        """The version that answers; None before the first action."""
+        return self._last.version if self._last else None
+
+    @property
+    def last(self) -> ActionResponse | None:
+        """The last response, with digest, seed and probabilities; None before the first action."""
+        return self._last
+
+    @property
+    def steps(self) -> int:
+        """Number of actions so far."""
+        return self._steps
+
+    def act(self, observation: Any, *, probabilities: bool = False) -> Any:
+        """Request the next action.
+
+        Args:
+            observation: See `Client.act`.
+            probabilities: Include the action probabilities in the response, which is available as `last`.
+
+        Returns:
+            The action in the environment's format: an int or an array (float32 or int64).
+
+        Raises:
+            VersionRetired: The version that started the episode is not served any more.
+            LeagueError: See `Client`.
+        """
+        request = ActionRequest.build(
+            observation,
+            self._client.encoding,
+            explore=self._explore,
+            seed=None if self._seed is None else derive(self._seed, self._steps),
+            probabilities=probabilities,
+            state=self._last.state if self._last else None,
+        )
+        try:
+            response = self._client.send(calls.act(self._model, request))
+        except VERSION_GONE as error:
+            if self._last is None:
+                raise
+            raise episode_interrupted(self._model, self._steps, error) from error
+        self._model = self._model.at(response.version)
+        self._last = response
+        self._steps += 1
+        return response.action
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """The server holds no state of an episode, so nothing is released."""

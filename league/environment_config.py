@@ -1,0 +1,49 @@
+"""The `environment` section of a league's configuration, which each manifest repeats, and the base of all sections."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from league.interface import digest
+
+JSON = dict[str, Any]
+
+
+class Part(BaseModel):
+    """Base of configuration models: frozen, rejects unknown keys and non-finite numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class WrapperConfig(Part):
+    """A SuperSuit wrapper, in YAML `name` or `{name: {argument: value}}`. Wrappers are applied in order."""
+
+    name: str
+    kwargs: JSON = Field(default={})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"name": value}
+        if isinstance(value, dict) and len(value) == 1 and "name" not in value:
+            name, kwargs = next(iter(value.items()))
+            return {"name": name, "kwargs": kwargs or {}}
+        return value
+
+
+class EnvironmentConfig(Part):
+    """An environment and its wrappers."""
+
+    entry_point: str
+    """A PettingZoo module (`pettingzoo.classic.connect_four_v3`) or a function (`package.module:function`)."""
+    api: Literal["aec", "parallel", "rllib"] | None = None
+    """PettingZoo's AEC or Parallel API, or RLlib's MultiAgentEnv. By default the API is detected: from the return value
+    of a function; for a module, Parallel if it has `parallel_env`, else AEC."""
+    kwargs: JSON = Field(default={})
+    """Keyword arguments of the environment's constructor."""
+    wrappers: tuple[WrapperConfig, ...] = ()
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the environment. Results of environments with different digests are never combined."""
+        return digest(self.model_dump(mode="json"))

@@ -1,0 +1,249 @@
+"""Adapters that give AEC, Parallel and MultiAgentEnv environments a common interface."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+
+from league.errors import EnvironmentMismatch
+
+Observation = dict[str, NDArray]
+"""ONNX input name → array without a batch axis."""
+Split = Callable[[Any], Observation]
+Report = tuple[int, Observation, float, bool, bool]
+"""(agent, observation, reward since the last report, terminated, truncated). Without a flag the agent must act."""
+
+MAX_IDLE_STEPS = 10_000
+"""Consecutive steps without an acting agent after which an environment counts as hung."""
+
+
+class EnvAdapter(Protocol):
+    """An environment with any API. An episode is over when no agent in the reports of a call must act."""
+
+    def reset(self, seed: int) -> list[Report]:
+        """Start an episode."""
+
+    def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
+        """Step the environment. moves: (agent, action) of each agent that must act, ordered by agent."""
+
+    def state(self) -> Any:
+        """Return the current global state; None if the environment has none."""
+
+    def render(self) -> Any:
+        """Return the result of the environment's `render`."""
+
+    def close(self) -> None:
+        """Close the environment."""
+
+
+def adapter_for(env: Any, splits: Sequence[Split]) -> EnvAdapter:
+    """Return the adapter for the API of `env`. splits: for each agent, a function from observation to named arrays."""
+    if isinstance(env, AECEnv):
+        return AECAdapter(env, splits)
+    return ParallelAdapter(env, splits) if isinstance(env, ParallelEnv) else MultiAgentAdapter(env, splits)
+
+
+class _Adapter:
+    """An environment with the indices of its agents."""
+
+    def __init__(self, env: Any, splits: Sequence[Split]) -> None:
+        self._env, self._splits = env, splits
+        self._agents = tuple(env.possible_agents)
+        self._index = {agent: index for index, agent in enumerate(self._agents)}
+
+    def render(self) -> Any:
+        return self._env.render()
+
+    def close(self) -> None:
+        self._env.close()
+
+
+class AECAdapter(_Adapter):
+    """PettingZoo's AEC API: one agent acts at a time. Removes finished agents by dead steps."""
+
+    def reset(self, seed: int) -> list[Report]:
+        self._env.reset(seed=seed)
+        return self._reports()
+
+    def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
+        self._env.step(moves[0][1])
+        return self._reports()
+
+    def state(self) -> Any:
+        return _state(self._env)
+
+    def _reports(self) -> list[Report]:
+        env, reports = self._env, []
+        while env.agents:
+            agent = self._index[env.agent_selection]
+            value, reward, terminated, truncated, _ = env.last()
+            observation = self._splits[agent](value)
+            if not (terminated or truncated):
+                reports.append((agent, observation, float(reward), False, False))
+                return reports
+            # Copied because the environment may reuse the arrays in later steps.
+            last = {name: np.array(array) for name, array in observation.items()}
+            reports.append((agent, last, float(reward), bool(terminated), bool(truncated)))
+            env.step(None)
+            if self._agents[agent] in env.agents:
+                raise EnvironmentMismatch(
+                    f"agent {self._agents[agent]} is terminated or truncated, but remains in `agents`"
+                )
+        return reports
+
+
+class _Simultaneous(_Adapter):
+    """Common state of APIs with simultaneous actions: present agents, unreported rewards, last observations."""
+
+    def __init__(self, env: Any, splits: Sequence[Split]) -> None:
+        super().__init__(env, splits)
+        self._infos: Mapping[str, Any] = {}
+        self._present: set[str] = set()
+        self._left: set[str] = set()
+        self._unreported: dict[str, float] = {}
+        self._last_observations: dict[str, Observation] = {}
+
+    def state(self) -> Any:
+        """Return `info["state"]` of any agent or of RLlib's common info, else the environment's `state()`."""
+        for info in self._infos.values():
+            if isinstance(info, Mapping) and "state" in info:
+                return info["state"]
+        return _state(self._env)
+
+    def _begin(self, observations: Mapping[str, Any]) -> list[Report]:
+        self._present, self._left, self._last_observations = set(), set(), {}
+        self._unreported = dict.fromkeys(self._agents, 0.0)
+        return self._reports(observations, {}, {}, {})
+
+    def _actions(self, moves: Sequence[tuple[int, Any]]) -> dict[str, Any]:
+        return {self._agents[agent]: action for agent, action in moves}
+
+    def _reports(
+        self,
+        observations: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        terminated: Mapping[str, bool],
+        truncated: Mapping[str, bool],
+    ) -> list[Report]:
+        unreported, present = self._unreported, self._present
+        for agent, reward in rewards.items():
+            if agent in unreported and agent not in self._left:
+                unreported[agent] += float(reward)
+        for agent in observations:
+            if agent not in present and not (agent in self._left and _flag(agent, terminated, truncated)):
+                present.add(self._known(agent))
+                self._left.discard(agent)
+        reports: list[Report] = []
+        for index, agent in enumerate(self._agents):
+            if agent not in present:
+                continue
+            has_left = _flag(agent, terminated, truncated)
+            if agent in observations:
+                self._last_observations[agent] = self._splits[index](observations[agent])
+            elif not has_left:
+                continue
+            last = self._last_observations[agent]
+            if has_left:
+                last = {name: np.array(array) for name, array in last.items()}
+                present.discard(agent)
+                self._left.add(agent)
+            flags = bool(terminated.get(agent, False)), bool(truncated.get(agent, False))
+            reports.append((index, last, unreported[agent], *flags))
+            unreported[agent] = 0.0
+        return reports
+
+    def _known(self, agent: str) -> str:
+        if agent not in self._index:
+            raise EnvironmentMismatch(
+                f"agent {agent!r} has an observation, but is not in possible_agents ({', '.join(self._agents)})"
+            )
+        return agent
+
+
+class ParallelAdapter(_Simultaneous):
+    """PettingZoo's Parallel API: all live agents act simultaneously."""
+
+    def reset(self, seed: int) -> list[Report]:
+        observations, self._infos = self._env.reset(seed=seed)
+        return self._begin(observations)
+
+    def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
+        observations, rewards, terminated, truncated, self._infos = self._env.step(self._actions(moves))
+        reports = self._reports(observations, rewards, terminated, truncated)
+        if self._present:
+            self._check_agents(observations)
+        return reports
+
+    def _check_agents(self, observations: Mapping[str, Any]) -> None:
+        agents = set(self._env.agents)
+        for agent in self._present - agents:
+            raise EnvironmentMismatch(f"agent {agent} has left the environment neither terminated nor truncated")
+        for agent in agents - observations.keys() - self._left:
+            raise EnvironmentMismatch(f"agent {agent} is in `agents`, but has no observation")
+
+
+class MultiAgentAdapter(_Simultaneous):
+    """RLlib's MultiAgentEnv: agents with an observation act; `__all__` ends the episode for all remaining agents."""
+
+    def reset(self, seed: int) -> list[Report]:
+        observations, self._infos = self._env.reset(seed=seed)
+        return self._begin(self._kept(observations)) or self.step(())
+
+    def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
+        actions = self._actions(moves)
+        ended: list[Report] = []
+        for _ in range(MAX_IDLE_STEPS):
+            observations, rewards, terminated, truncated, self._infos = self._env.step(actions)
+            is_over = terminated.get("__all__", False) or truncated.get("__all__", False)
+            if is_over:
+                # Agents without their own flag get that of the episode.
+                left = {*self._present, *observations}
+                terminated, truncated = _for_all(left, terminated, truncated)
+            reports = ended + self._reports(self._kept(observations), rewards, terminated, truncated)
+            is_over = is_over or len(self._left) == len(self._agents)
+            if is_over or any(not (report[3] or report[4]) for report in reports):
+                return reports
+            actions, ended = {}, reports
+        raise EnvironmentMismatch(f"no agent had to act for {MAX_IDLE_STEPS} steps")
+
+    @staticmethod
+    def _kept(observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Copies, because the last observations are used after later steps."""
+        return {agent: _copied(value) for agent, value in observations.items()}
+
+
+def _state(env: Any) -> Any:
+    """`state()` is optional in PettingZoo; elsewhere an attribute with this name may have another meaning."""
+    base = getattr(env, "unwrapped", env)
+    if getattr(type(base), "state", None) in (AECEnv.state, ParallelEnv.state) or not callable(
+        state := getattr(env, "state", None)
+    ):
+        return None
+    try:
+        return state()
+    except NotImplementedError:
+        return None
+
+
+def _flag(agent: str, terminated: Mapping[str, bool], truncated: Mapping[str, bool]) -> bool:
+    return bool(terminated.get(agent, False) or truncated.get(agent, False))
+
+
+def _for_all(
+    agents: Iterable[str], terminated: Mapping[str, bool], truncated: Mapping[str, bool]
+) -> tuple[dict[str, bool], dict[str, bool]]:
+    """Add the flags of `__all__` for all `agents` without a flag."""
+    rest = [agent for agent in agents if not _flag(agent, terminated, truncated)]
+    all_terminated = bool(terminated.get("__all__", False))
+    return (
+        dict(terminated) | dict.fromkeys(rest, all_terminated),
+        dict(truncated) | dict.fromkeys(rest, not all_terminated),
+    )
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _copied(part) for key, part in value.items()}
+    return np.array(value)

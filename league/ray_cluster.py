@@ -1,0 +1,157 @@
+"""Connects this process to Ray: starts a local Ray, or joins a running cluster."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+from league.errors import ConfigError, one_line
+from league.settings import Storage
+
+CONNECT_TIMEOUT = 10.0
+"""Seconds for a TCP connection to a cluster. Ray itself would retry for minutes."""
+MIN_OBJECT_STORE = 80
+"""MB. Ray refuses less than 75 MiB."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocalRay:
+    """Resources of a local Ray; None for Ray's default. Raises ConfigError if Ray does not support them.
+
+    Attributes:
+        cpus: Number of CPUs.
+        object_store: Shared memory in MB, at least MIN_OBJECT_STORE.
+        dashboard: Whether to start Ray's dashboard.
+    """
+
+    cpus: int | None = None
+    object_store: int | None = None
+    dashboard: bool = False
+
+    def __post_init__(self) -> None:
+        if self.object_store is not None and self.object_store < MIN_OBJECT_STORE:
+            raise ConfigError(f"--object-store: at least {MIN_OBJECT_STORE} MB, got {self.object_store}")
+
+
+UNLIMITED = LocalRay()
+OF_DASHBOARD = ("aiohttp", "aiohttp_cors", "opencensus", "prometheus_client")
+"""Packages of the extra `ray[default]` without which Ray starts no dashboard."""
+
+
+def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
+    """Start a local Ray and return the address of its dashboard, if it has one.
+
+    options: further arguments of `ray.init`. Raises ConfigError if the dashboard is not installed.
+    """
+    import ray
+
+    if local.dashboard:
+        _check_dashboard()
+    context = ray.init(
+        address="local",
+        num_cpus=local.cpus,
+        object_store_memory=None if local.object_store is None else local.object_store * 10**6,
+        include_dashboard=local.dashboard,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+        **options,
+    )
+    return context.dashboard_url
+
+
+def join(address: str, **options: Any) -> str | None:
+    """Join a running cluster and return the address of its dashboard, if it has one.
+
+    address: `HOST:PORT`, or `auto` for the cluster of this machine. options: further arguments of `ray.init`.
+    Raises ConfigError if the cluster is unreachable.
+    """
+    import ray
+
+    try:
+        _check_port(address)
+        context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"no Ray cluster at {address!r}: {one_line(error)} (if it requires a token, as `ray start`"
+            " does by default: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN on other machines)"
+        ) from error
+    return context.dashboard_url
+
+
+@contextmanager
+def ray_session(address: str | None = None) -> Iterator[None]:
+    """Disconnect from Ray at the end of the block, unless the process was connected before it.
+
+    address: a cluster to join immediately; None starts nothing. Raises ConfigError if the cluster is unreachable.
+    """
+    import ray
+
+    is_owner = not ray.is_initialized()
+    if is_owner and address is not None:
+        join(address)
+    try:
+        yield
+    finally:
+        if is_owner and ray.is_initialized():
+            ray.shutdown()
+
+
+def ensure_local(cpus: int) -> None:
+    """Start a local Ray with a number of CPUs if the process is not connected to Ray."""
+    import ray
+
+    if not ray.is_initialized():
+        start_local(LocalRay(cpus))
+
+
+@contextmanager
+def connected(address: str | None, storage: Storage, local: LocalRay = UNLIMITED) -> Iterator[str | None]:
+    """Connect to Ray for the duration of the block, and yield the URL of its dashboard, if it was started or joined.
+
+    address: a cluster to join. None uses the Ray that this process is connected to, or else starts `local`.
+    Raises ConfigError if the cluster is unreachable, if its nodes do not share `storage`, or if `local` has limits
+    although no local Ray is started.
+    """
+    import ray
+
+    is_connected = ray.is_initialized()
+    if is_connected or address is not None:
+        check_unlimited(local)
+    with ray_session():
+        url = None
+        if not is_connected:
+            url = start_local(local) if address is None else join(address)
+        storage.check_reach(node_addresses())
+        yield f"http://{url}" if url else None
+
+
+def node_addresses() -> set[str]:
+    """Return the IP addresses of the nodes that are alive."""
+    import ray
+
+    return {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
+
+
+def check_unlimited(local: LocalRay) -> None:
+    """Raise ConfigError if `local` has limits, which apply only to a local Ray."""
+    if local != UNLIMITED:
+        raise ConfigError("--cpus, --object-store and --dashboard are for a local Ray: a cluster has its own")
+
+
+def _check_dashboard() -> None:
+    import ray
+
+    if missing := [name for name in OF_DASHBOARD if find_spec(name) is None]:
+        raise ConfigError(f"--dashboard needs {missing[0]}: pip install 'ray[default]=={ray.__version__}'")
+
+
+def _check_port(address: str) -> None:
+    """Raise OSError if nothing listens at HOST:PORT."""
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdigit() and "/" not in host:
+        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT).close()

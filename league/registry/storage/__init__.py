@@ -1,0 +1,1 @@
+"""Storage of the registry: database, artefact store, manifests and locks."""

@@ -1,0 +1,129 @@
+"""Files of checkpoint versions: published atomically and verified against the manifest.
+
+<root>/<league>/<number>/manifest.json, <policy>.onnx, training/…
+<root>/<league>/.publishing-<number>/           in progress
+"""
+
+import hashlib
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+from league.errors import ArtifactCorrupt
+from league.files import disk_errors, move_durably
+from league.registry.storage.manifest import MANIFEST, Manifest
+
+STAGING = ".publishing-"
+
+
+class ArtifactStore:
+    """A directory of artefacts on a disk shared by training, evaluation and serving."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def path(self, league: str, number: int) -> Path:
+        """Return the directory of a published version."""
+        return self.root / league / str(number)
+
+    def last(self, league: str) -> int:
+        """Return the highest number of a directory of the league, ready or not; 0 if there is none.
+
+        It exceeds the numbers in the database if that was lost: such versions are left unchanged.
+        """
+        with disk_errors(self.root), suppress(FileNotFoundError):
+            names = [path.name.removeprefix(STAGING) for path in (self.root / league).iterdir()]
+            return max((int(name) for name in names if name.isdecimal()), default=0)
+        return 0
+
+    def stage(self, league: str, number: int) -> Path:
+        """Create the empty staging directory of a version, on the disk of the final one."""
+        staging = self._staging(league, number)
+        with disk_errors(staging):
+            staging.mkdir(parents=True)
+        return staging
+
+    def commit(self, manifest: Manifest) -> str:
+        """Publish the staged files; returns the text of `manifest.json`.
+
+        All files are flushed to the disk before the rename that makes the version visible.
+        """
+        staging = self._staging(manifest.league, manifest.version)
+        target = self.path(manifest.league, manifest.version)
+        with disk_errors(target):
+            digests = {name: _sha256(staging / name) for name in _files(staging) if name != MANIFEST}
+            text = manifest.model_copy(update={"files": digests}).to_json()
+            (staging / MANIFEST).write_text(text, encoding="utf-8")
+            move_durably(staging, target)
+        return text
+
+    def discard(self, league: str, number: int) -> None:
+        """Remove all files of a version. Must not be called for a ready version."""
+        for directory in (self._staging(league, number), self.path(league, number)):
+            with disk_errors(directory), suppress(FileNotFoundError):
+                shutil.rmtree(directory)
+
+    def is_purged(self, league: str, number: int) -> bool:
+        """Return whether the directory of a version is missing but that of its league exists.
+
+        If the league's directory is missing as well, the disk may not be mounted.
+        """
+        directory = self.path(league, number)
+        with disk_errors(directory):
+            return directory.parent.is_dir() and not directory.is_dir()
+
+    def verify(self, league: str, number: int, sha256: str) -> Path:
+        """Return the directory of a version after verifying all its files. Raises ArtifactCorrupt."""
+        directory = self.path(league, number)
+        with disk_errors(directory):
+            manifest = self.manifest(league, number, sha256)
+            present = set(_files(directory)) - {MANIFEST}
+            for name in sorted(present - set(manifest.files)):
+                raise ArtifactCorrupt(f"{directory / name} does not belong to {league}@{number}")
+            for name, digest in manifest.files.items():
+                path = directory / name
+                # Reading a pipe or a device, which a link may point to, would not end.
+                _check(path, digest, _sha256(path) if name in present and path.is_file() else None)
+        return directory
+
+    def manifest(self, league: str, number: int, sha256: str) -> Manifest:
+        """Read the manifest of a version. Raises ArtifactCorrupt if its digest is not `sha256`."""
+        path = self.path(league, number) / MANIFEST
+        return Manifest.from_json(_verified(path, sha256), source=str(path))
+
+    def read(self, manifest: Manifest, name: str) -> bytes:
+        """Read and verify one file of a version. Raises ArtifactCorrupt."""
+        if name not in manifest.files:
+            raise ArtifactCorrupt(
+                f"{manifest.league}@{manifest.version} has no file {name!r}, which its manifest names"
+            )
+        return _verified(self.path(manifest.league, manifest.version) / name, manifest.files[name])
+
+    def _staging(self, league: str, number: int) -> Path:
+        return self.root / league / f"{STAGING}{number}"
+
+
+def _files(directory: Path) -> list[str]:
+    """Relative paths of all files in `directory`. A symbolic link counts as a file."""
+    found = [path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir()]
+    return sorted(path.relative_to(directory).as_posix() for path in found)
+
+
+def _verified(path: Path, digest: str) -> bytes:
+    with disk_errors(path):
+        content = path.read_bytes() if path.is_file() else None
+    _check(path, digest, None if content is None else hashlib.sha256(content).hexdigest())
+    assert content is not None
+    return content
+
+
+def _check(path: Path, expected: str, found: str | None) -> None:
+    if found is None:
+        raise ArtifactCorrupt(f"{path} is missing or not a regular file")
+    if found != expected:
+        raise ArtifactCorrupt(f"{path} was changed: its SHA-256 is {found[:12]}…, expected {expected[:12]}…")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,269 @@
+"""Database of the registry and the ledger: engine, transactions, migrations and error translation."""
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from urllib.parse import quote
+
+from filelock import FileLock
+from sqlalchemy import Connection, CursorResult, Engine, Executable, create_engine, event, inspect, make_url, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import (
+    ArgumentError,
+    DatabaseError,
+    DBAPIError,
+    DisconnectionError,
+    InterfaceError,
+    InternalError,
+    OperationalError,
+)
+from sqlalchemy.orm import Session
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from league.errors import ConfigError, InvalidInput, StorageError, one_line
+from league.files import disk_errors
+from league.registry.storage.migrations import HEAD, KNOWN
+from league.registry.storage.tables import Base
+
+LOCK = 5_246_001
+"""Key of PostgreSQL's advisory lock."""
+LOCK_SECONDS = 60
+"""Timeout for the upgrade of an SQLite file by another process."""
+
+
+def upgrade(engine: Engine) -> None:
+    """Apply the missing migrations, all or none. If none is missing, Alembic is not imported.
+
+    Raises StorageError if the database was created by a newer release.
+    """
+    with engine.connect() as connection:
+        if revision(connection) == HEAD:
+            return
+    with _exclusive(engine) as connection:
+        current = revision(connection)
+        if current not in (None, *KNOWN):
+            raise StorageError(f"the database has the schema {current} of a newer release: upgrade this program")
+        if current != HEAD:
+            _apply(connection)
+
+
+def revision(connection: Connection) -> str | None:
+    """Return the last applied migration, None for an empty database."""
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+
+
+@contextmanager
+def _exclusive(engine: Engine) -> Iterator[Connection]:
+    """A write transaction that excludes upgrades by other processes."""
+    writing = engine.execution_options(writes=True)
+    if engine.dialect.name == "postgresql":
+        with writing.begin() as connection:
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": LOCK})
+            yield connection
+        return
+    lock = Path(f"{engine.url.database}.lock")
+    with disk_errors(lock), FileLock(lock, timeout=LOCK_SECONDS):
+        _enable_wal(engine)
+        with writing.begin() as connection:
+            yield connection
+
+
+def _enable_wal(engine: Engine) -> None:
+    # The mode is stored in the file. SQLite does not change it inside a transaction, hence the raw connection.
+    connection = engine.raw_connection()
+    try:
+        connection.cursor().execute("PRAGMA journal_mode = WAL")
+    finally:
+        connection.close()
+
+
+def _apply(connection: Connection) -> None:
+    from alembic import command
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).with_name("migrations")).replace("%", "%%"))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
+
+
+BUSY_TIMEOUT_SECONDS = 30
+"""Timeout of a transaction that waits for one of another process."""
+FILE = "file"
+"""Key in a connection's `info`: its open file by device and inode."""
+STORAGE_ERRORS = (OperationalError, DatabaseError, InterfaceError, InternalError)
+"""Disk full, read-only, locked, not a database, no server. Other errors, such as constraints, are not translated."""
+
+
+class Database:
+    """Sessions on the registry's database. Opening it upgrades the schema."""
+
+    def __init__(self, url: str, create: bool = True) -> None:
+        """Open the database. create: create an SQLite file that does not exist. Raises StorageError or ConfigError."""
+        self.engine = _engine(url, create)
+        self._writing = self.engine.execution_options(writes=True)
+        try:
+            with translate_errors(self.engine):
+                upgrade(self.engine)
+        except BaseException:
+            self.close()
+            raise
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A read-only transaction, which never waits for a lock."""
+        with translate_errors(self.engine), Session(self.engine, expire_on_commit=False) as session:
+            yield session
+
+    @contextmanager
+    def write(self) -> Iterator[Session]:
+        """A transaction that is committed at the end, or rolled back on an error. SQLite runs one at a time."""
+        with (
+            translate_errors(self.engine),
+            Session(self._writing, expire_on_commit=False) as session,
+            session.begin(),
+        ):
+            yield session
+
+    def close(self) -> None:
+        """Close the connections."""
+        self.engine.dispose()
+
+
+class Repository:
+    """Base of the repositories. Each public method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+
+def insert(session: Session, table: type[Base], rows: Sequence[Mapping[str, Any]]) -> int:
+    """Insert the rows whose primary key does not exist; returns their number."""
+    if not rows:
+        return 0
+    statement = _dialect(session).insert(table.__table__).on_conflict_do_nothing()
+    kept = {"preserve_rowcount": True}
+    return session.connection().execute(statement, rows, execution_options=kept).rowcount
+
+
+def row_count(session: Session, statement: Executable) -> int:
+    """Execute a statement; returns the number of rows inserted, updated or deleted."""
+    result = session.execute(statement)
+    assert isinstance(result, CursorResult)
+    return result.rowcount
+
+
+def upsert(session: Session, table: type[Base], key: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Insert a row, or update `values` of the row with this primary key."""
+    statement = _dialect(session).insert(table).values(**key, **values)
+    session.execute(statement.on_conflict_do_update(index_elements=list(key), set_=dict(values)))
+
+
+def _dialect(session: Session) -> ModuleType:
+    """The dialect module with ON CONFLICT, which is equal in both databases but not standard SQL."""
+    return postgresql if session.get_bind().dialect.name == "postgresql" else sqlite
+
+
+@contextmanager
+def translate_errors(engine: Engine) -> Iterator[None]:
+    """Translate database failures into a StorageError of one line, and text that is not Unicode into InvalidInput."""
+    try:
+        yield
+    except UnicodeEncodeError as error:
+        raise InvalidInput(f"{error.object[:100]!r} is not valid text: it cannot be encoded as UTF-8") from error
+    except DBAPIError as error:
+        if type(error) not in STORAGE_ERRORS:
+            raise
+        where = engine.url.render_as_string(hide_password=True)
+        reason = one_line(error.orig or error)
+        raise StorageError(f"the database {where} cannot be used: {reason}") from error
+
+
+def _engine(url: str, create: bool) -> Engine:
+    try:
+        parsed = make_url(url)
+    except ArgumentError:
+        raise ConfigError(f"LEAGUE_DATABASE_URL {url!r} is not a database URL") from None
+    name = parsed.get_backend_name()
+    if name not in ("sqlite", "postgresql"):
+        raise ConfigError(f"LEAGUE_DATABASE_URL names {name!r}: expected sqlite or postgresql")
+    if name == "postgresql":
+        return _postgresql(url)
+    if not parsed.database or parsed.database == ":memory:":
+        raise ConfigError(f"LEAGUE_DATABASE_URL {url!r} does not name a file: expected sqlite:////path/to/league.db")
+    return _sqlite(url, Path(parsed.database), create)
+
+
+def _sqlite(url: str, path: Path, create: bool) -> Engine:
+    if create:
+        with disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    engine = create_engine(url, json_serializer=_strict_json, connect_args={"timeout": BUSY_TIMEOUT_SECONDS})
+    event.listen(engine, "do_connect", _open_existing)
+    event.listen(engine, "connect", _prepare_sqlite)
+    event.listen(engine, "checkout", _check_file)
+    event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _open_existing(
+    _: object, record: ConnectionPoolEntry, arguments: list[Any], options: dict[str, Any]
+) -> sqlite3.Connection | None:
+    """Open the database without creating it.
+
+    A file created while the database is moved away would be mistaken for it and mixed with its write-ahead log.
+    """
+    path = arguments[0]
+    record.info[FILE] = path, _identity(path)
+    if record.info[FILE][1] is None:
+        raise StorageError(f"the database {path} does not exist")
+    arguments[0] = f"file:{quote(path)}?mode=rw"
+    options["uri"] = True
+    return None
+
+
+def _check_file(_: object, record: ConnectionPoolEntry, __: object) -> None:
+    """Reconnect if the database file was moved or replaced, because a connection keeps its old file open."""
+    path, opened = record.info[FILE]
+    if _identity(path) != opened:
+        raise DisconnectionError(f"{path} was replaced by another file")
+
+
+def _identity(path: str) -> tuple[int, int] | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _postgresql(url: str) -> Engine:
+    psycopg = make_url(url).set(drivername="postgresql+psycopg")
+    try:
+        return create_engine(psycopg, json_serializer=_strict_json, pool_pre_ping=True)
+    except ModuleNotFoundError:
+        raise ConfigError("PostgreSQL needs a driver: pip install 'policy-league[postgres]'") from None
+
+
+def _strict_json(document: Any) -> str:
+    """Reject NaN and infinity, which PostgreSQL does not accept."""
+    return json.dumps(document, allow_nan=False)
+
+
+def _prepare_sqlite(connection: sqlite3.Connection, _: object) -> None:
+    # The driver begins transactions at the first write, which is too late to read under the lock.
+    connection.isolation_level = None
+    connection.execute("PRAGMA foreign_keys = ON")
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    writes = connection.get_execution_options().get("writes", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

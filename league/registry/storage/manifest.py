@@ -1,0 +1,110 @@
+"""The manifest of a version: `manifest.json`, the last file written and the root of all digests."""
+
+from typing import Any, Self
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from league.environment_config import EnvironmentConfig
+from league.errors import ArtifactCorrupt
+from league.interface import Interface
+from league.spaces import Space
+
+MANIFEST = "manifest.json"
+TRAINING = "training"
+"""Directory of RLlib's state, which only training reads."""
+PROBES = ".probes.npz"
+"""Suffix of a policy's file of probes."""
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Tensor(_Record):
+    """An input or output of a graph. The batch dimension is None."""
+
+    name: str
+    dtype: str
+    shape: tuple[int | None, ...]
+
+
+class Parity(_Record):
+    """Result of comparing a graph with the trained module."""
+
+    observations: int
+    """Number of compared observations, sampled from the environment."""
+    mismatches: int
+    """Greedy actions that differ, without near ties."""
+    near_ties: int
+    """Greedy actions that differ while the two best logits are closer than 1e-5."""
+    max_difference: float
+    """Maximum absolute difference of the distribution inputs."""
+
+
+class PolicyManifest(_Record):
+    """A policy: an ONNX graph that contains its weights."""
+
+    file: str
+    observation: Space
+    action: Space
+    inputs: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+    state: tuple[Tensor, ...] = ()
+    """The recurrent inputs `state_in_<i>`, zero at the start of an episode; `<i>` is a number or `action`."""
+    parity: Parity
+    probes: str | None = None
+    """File of the probes (policies/probes.py) that are checked before serving; None if there are none."""
+
+
+class Manifest(_Record):
+    """The description of a version: environment, policies, origin and the digest of each file."""
+
+    league: str
+    version: int
+    created_at: AwareDatetime
+    interface: Interface
+    policies: dict[str, PolicyManifest]
+    environment: EnvironmentConfig
+    environment_digest: str
+    algorithm: str
+    settings: dict[str, Any]
+    seed: int
+    steps: int
+    """Actions of all agents during training, including its ancestors."""
+    parent: int | None = None
+    git_commit: str | None = None
+    stack: dict[str, str]
+    """package → version"""
+    files: dict[str, str] = Field(default={})
+    """relative path → SHA-256 of every other file; filled in when the version is published"""
+
+    @property
+    def agents(self) -> dict[str, str]:
+        """agent → policy id"""
+        return self.interface.policies
+
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> Self:
+        if set(self.policies) != set(self.interface.policy_ids):
+            raise ValueError(f"policies must be {', '.join(self.interface.policy_ids)}, as the interface says")
+        for name, policy in self.policies.items():
+            spaces = self.interface.of_policy(name)
+            if (policy.observation, policy.action) != (spaces.observation, spaces.action):
+                raise ValueError(f"policy {name} has other spaces than its agents")
+        if self.environment_digest != self.environment.digest():
+            raise ValueError("environment_digest is not that of the environment")
+        return self
+
+    def to_json(self) -> str:
+        """Return the text of `manifest.json`."""
+        return self.model_dump_json(indent=2, by_alias=True) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str | bytes, source: str) -> Self:
+        """Parse `manifest.json`. Raises ArtifactCorrupt, which names `source`."""
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"])
+            raise ArtifactCorrupt(f"{source}: {key or 'manifest'}: {first['msg']}") from error

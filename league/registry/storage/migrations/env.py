@@ -1,0 +1,12 @@
+"""Entry point of Alembic: runs the migrations inside the transaction of `database.upgrade`."""
+
+from alembic import context
+
+from league.registry.storage.tables import Base
+
+context.configure(
+    connection=context.config.attributes["connection"],
+    target_metadata=Base.metadata,
+    render_as_batch=True,
+)
+context.run_migrations()

@@ -1,0 +1,333 @@
+"""Immutable records that the registry returns, detached from database sessions."""
+
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from league.histograms import Histogram
+from league.interface import Interface
+from league.registry.storage.manifest import Manifest
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    from league.config import LeagueConfig
+
+Record = TypeVar("Record", bound="DataclassInstance")
+
+
+def detached(kind: type[Record], row: object, **converted: Any) -> Record:
+    """Return the record of a table's row. converted: fields that differ from the column of the same name."""
+    same = (field.name for field in fields(kind) if field.name not in converted)
+    return kind(**{name: getattr(row, name) for name in same}, **converted)
+
+
+@dataclass(frozen=True, slots=True)
+class LeagueRow:
+    """A registered league."""
+
+    slug: str
+    config: "LeagueConfig"
+    interface: Interface
+    interface_digest: str
+    environment_digest: str
+    registered_at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A note on a version."""
+
+    text: str
+    actor: str
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class VersionRow:
+    """A published checkpoint version."""
+
+    league: str
+    number: int
+    source: str
+    """The checkpoint that it was published from."""
+    sha256: str
+    """Digest of manifest.json, and thereby of the version."""
+    manifest: Manifest
+    aliases: tuple[str, ...]
+    note: Note | None
+
+    @property
+    def ref(self) -> str:
+        return f"{self.league}@{self.number}"
+
+    @property
+    def parent(self) -> int | None:
+        return self.manifest.parent
+
+    @property
+    def steps(self) -> int:
+        return self.manifest.steps
+
+    @property
+    def created_at(self) -> datetime:
+        return self.manifest.created_at
+
+
+@dataclass(frozen=True, slots=True)
+class AliasEvent:
+    """A change of an alias."""
+
+    id: int
+    league: str
+    alias: str
+    kind: Literal["set", "rollback"]
+    version: int
+    previous: int | None
+    """The version that it pointed to before the change."""
+    actor: str
+    reason: str
+    verdict: str | None
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledgement:
+    """What a replica serves of a league. `version` is None while it serves nothing."""
+
+    replica: str
+    league: str
+    version: int | None
+    sha256: str | None
+    fault: str | None
+    """Why it does not serve what it should, if so."""
+    aliases: dict[str, int]
+    """alias → version that it serves"""
+    seen_at: datetime
+    traffic: int | None = None
+    """Id of the traffic setting that it follows completely."""
+
+
+@dataclass(frozen=True, slots=True)
+class Portion:
+    """A version, by number or alias, and its share of requests, from 0 to 1."""
+
+    version: int | str
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """Canary and shadow of a league. `id` is None if none was ever set."""
+
+    league: str
+    id: int | None = None
+    canary: Portion | None = None
+    """Answers its share of requests instead of the champion."""
+    shadow: Portion | None = None
+    """Gets a copy of its share of requests after the champion has answered."""
+    actor: str | None = None
+    reason: str | None = None
+    at: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ShadowCounts:
+    """Comparison of a shadow with the champion on mirrored requests."""
+
+    league: str
+    candidate: int
+    champion: int
+    requests: int
+    """Mirrored requests that were compared."""
+    observations: int
+    """Observations in those requests."""
+    agreed: int
+    """Observations with the same greedy action."""
+    failed: int
+    """Requests that failed on the candidate."""
+    dropped: int
+    """Requests that were not mirrored because the queue was full."""
+    skipped: int
+    """Requests that cannot be mirrored because their recurrent state belongs to another network."""
+    latency: tuple[int, ...]
+    """Histogram (buckets of league/histograms.py) of the candidate's computing time per request."""
+    ns: int
+    """Sum of those times in nanoseconds."""
+
+    @property
+    def agreement(self) -> float | None:
+        return self.agreed / self.observations if self.observations else None
+
+    def milliseconds(self, share: float) -> float | None:
+        """Return the `share` quantile of the computing time; see `Histogram.quantile`."""
+        return Histogram(self.latency).quantile(share)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyRow:
+    """An API key without its text, which is not stored."""
+
+    id: str
+    name: str
+    sha256: str
+    """Digest of the key's text."""
+    scopes: frozenset[str]
+    leagues: frozenset[str] | None
+    """Leagues that it is valid for; None: all."""
+    rate: float | None
+    """Requests per second at each replica; None: unlimited."""
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+
+    def is_valid(self, now: datetime) -> bool:
+        """Return whether the key is neither revoked nor expired."""
+        return self.revoked_at is None and (self.expires_at is None or now < self.expires_at)
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictRow:
+    """The decision of a gate on `candidate` against `champion`; outcome and evidence are None while it is open."""
+
+    id: str
+    """Id of the schedule whose matches it counts."""
+    league: str
+    candidate: int
+    champion: str
+    """A reference: `connect_four@3`, or `script:random` if there was no champion."""
+    settings: dict[str, Any]
+    outcome: str | None
+    evidence: dict[str, Any] | None
+    opened_at: datetime
+    closed_at: datetime | None
+
+    @property
+    def schedule(self) -> str:
+        return self.id
+
+    @property
+    def alpha(self) -> float:
+        """The error probability that it spends of a year's alpha."""
+        return float(self.settings["gate"]["alpha"])
+
+
+@dataclass(frozen=True, slots=True)
+class NightlyRunRow:
+    """A nightly run of a league; `ended_at` and `report` are None while it runs."""
+
+    id: int
+    league: str
+    candidates: tuple[int, ...]
+    """Version numbers."""
+    alpha: float
+    """Alpha of each verdict."""
+    report: dict[str, Any] | None
+    began_at: datetime
+    ended_at: datetime | None
+
+
+EvaluationState = Literal["queued", "running", "done", "failed", "stopped"]
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationRow:
+    """An evaluation that a client requested."""
+
+    id: int
+    league: str
+    request: dict[str, Any]
+    state: EvaluationState
+    progress: dict[str, Any] | None
+    """`what`, `played` and `of`, about the games in progress."""
+    result: dict[str, Any] | None
+    """The report, if done."""
+    error: dict[str, str] | None
+    """`code` and `message`, if failed."""
+    actor: str
+    reason: str | None
+    workers: int | None
+    runner: str | None
+    created_at: datetime
+    started_at: datetime | None
+    heartbeat_at: datetime | None
+    stop_at: datetime | None
+    stopped_by: str | None
+    ended_at: datetime | None
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotRow:
+    """A precomputed document of a league. `mark` identifies the data that it was computed from."""
+
+    document: Any
+    mark: str
+    at: datetime
+
+
+RunState = Literal["running", "silent", "ended", "failed", "stopped"]
+
+
+@dataclass(frozen=True, slots=True)
+class RunRow:
+    """A training run. `steps`, `seconds` of training and `curves` are the latest reported values."""
+
+    league: str
+    id: str
+    algorithm: str
+    settings: dict[str, Any]
+    seed: int
+    target: int
+    """Steps at which it ends."""
+    parent: int | None
+    """The version that training starts from."""
+    state: RunState
+    """`silent`: running without a recent heartbeat."""
+    error: str | None
+    attempts: int
+    """How often it was started or resumed."""
+    steps: int
+    seconds: float
+    curves: dict[str, float]
+    began_at: datetime
+    heartbeat_at: datetime
+    ended_at: datetime | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunPoint:
+    """Values of a run's curves at a step."""
+
+    steps: int
+    curves: dict[str, float]
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeToken:
+    """A summary of a league's state that differs after any change of the league."""
+
+    league: str
+    aliases: dict[str, int]
+    event: int | None
+    """Id of the newest alias event."""
+    version: int | None
+    """Number of the newest version."""
+    note: int | None
+    """Id of the newest note."""
+    traffic: int | None
+    """Id of the traffic setting in force."""
+    serving: dict[int, int]
+    """version → number of replicas that serve it as champion"""
+    verdicts: dict[str, int]
+    """outcome, or `open` → number of verdicts"""
+    evaluation: int | None
+    """Number of the newest evaluation."""
+    evaluations: tuple[EvaluationRow, ...]
+    """Queued and running evaluations."""
+    run: str | None
+    """Id of the newest training run."""
+    runs: tuple[RunRow, ...]
+    """Runs in state `running` or `silent`."""
+    computed_at: datetime | None
+    """When the newest snapshot was computed."""

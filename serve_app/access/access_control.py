@@ -1,0 +1,282 @@
+"""ASGI middleware that checks API keys, permissions, rate limits, load and cross-site requests.
+
+Order of the checks, with the status of a refusal:
+
+    origin → API key → rate limit → load → timeout → application
+    403      401, 403  429          429    504
+
+A web page of another site cannot set the headers that carry an API key, but it could call a server that requires no
+key. Browsers state the origin of a request in `Sec-Fetch-Site` (W3C, "Fetch Metadata Request Headers") or `Origin` (RFC
+6454), and a page cannot change these headers. The timeout applies to HTTP requests only: gRPC calls have their own
+deadlines, and WebSocket and event streams are long-lived.
+"""
+
+from collections.abc import Awaitable, Iterable
+from typing import Any, NamedTuple
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
+from serve_app.access import permissions
+from serve_app.access.access_log import LOG_ENTRY, AccessLog
+from serve_app.access.api_keys import ApiKey, ApiKeyCache
+from serve_app.access.errors import BodyTooSlow, CrossSiteRequest, ErrorHandlers
+from serve_app.access.load_shedding import Backlog
+from serve_app.access.permissions import RequiredPermission
+from serve_app.access.request_body import BODY_READ
+from serve_app.runtime.serve_bypass import is_event_stream
+from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
+from serve_app.settings import ServeSettings
+
+ORIGIN_HEADERS = frozenset((b"sec-fetch-site", b"origin"))
+"""Headers in which a browser states the origin of a request."""
+SAFE_METHODS = ("GET", "HEAD")
+SAME_ORIGIN = (b"same-origin", b"none")
+"""Values of `Sec-Fetch-Site` for a page of this server, and for a bookmark or a typed address."""
+
+
+def reject_cross_site(method: str, headers: Iterable[tuple[bytes, bytes]]) -> None:
+    """Raise CrossSiteRequest if a page of another origin sent a request that is not GET or HEAD."""
+    if method in SAFE_METHODS:
+        return
+    values = dict(headers)
+    site, origin = values.get(b"sec-fetch-site"), values.get(b"origin")
+    # "same-site" is not enough: it includes pages on other ports of this machine.
+    is_ours = site in SAME_ORIGIN if site is not None else origin is None or _authority(origin) == values.get(b"host")
+    if not is_ours:
+        shown = (origin or b"another origin").decode("latin-1")[:100]
+        raise CrossSiteRequest(f"cross-site request from {shown} refused: only pages of this server may send it")
+
+
+def _authority(origin: bytes) -> bytes:
+    """Host and port of an origin; empty for `null`, the opaque origin."""
+    return origin.partition(b"://")[2]
+
+
+KEY = "league.key"
+"""Scope entry of a request with a valid key: its `ApiKey`."""
+BEARER = b"bearer "
+HEADERS = ORIGIN_HEADERS | {b"authorization", b"x-api-key", b"x-request-timeout-ms"}
+DENIAL = "websocket.http.response"
+"""ASGI extension that sends an HTTP response when a WebSocket handshake is refused."""
+POLICY_VIOLATION = 1008
+INVALID_KEY = "the API key is unknown, revoked or expired"
+
+
+class AccessControl:
+    """Decides which requests are accepted. `is_exposed`: whether the server listens to other machines."""
+
+    def __init__(self, api_keys: ApiKeyCache, settings: ServeSettings, is_exposed: bool) -> None:
+        self._api_keys = api_keys
+        self._settings = settings
+        self._is_exposed = is_exposed
+        self.backlog = Backlog(settings.max_waiting, settings.max_turn, settings.burst_tolerance)
+
+    @property
+    def requires_key(self) -> bool:
+        """Whether requests need an API key."""
+        if self._settings.require_keys == "auto":
+            return self._is_exposed or not self._api_keys.is_empty
+        return self._settings.require_keys == "always"
+
+    def admit(self, need: RequiredPermission, token: bytes | None) -> ApiKey | None:
+        """Accept a request or an RPC, and return its key.
+
+        Raises Unauthenticated, Forbidden, RateLimited or Overloaded.
+        """
+        key = None
+        if need.scope is not None and (need.is_change or self.requires_key):
+            key = self._authorize(need, token)
+        if need.scope == "act":
+            self.backlog.admit()
+        return key
+
+    def admit_message(self, key: ApiKey | None) -> None:
+        """Accept a message of a stream that was opened with `key`.
+
+        Raises Unauthenticated (also if the key is no longer valid), RateLimited or Overloaded.
+        """
+        self.check_key(key)
+        if key is not None:
+            _take_token(key)
+        self.backlog.admit()
+
+    def check_key(self, key: ApiKey | None) -> None:
+        """Check the key of an open stream. Raises Unauthenticated if it is no longer valid."""
+        if key is None:
+            if self.requires_key:
+                raise Unauthenticated("this stream now requires an API key")
+        elif not self._api_keys.holds(key):
+            raise Unauthenticated(f"the API key {key.name} was revoked or has expired")
+
+    def presented_key(self, headers: Iterable[tuple[bytes, bytes]]) -> ApiKey | None:
+        """The key in the headers of a request, or None. Raises Unauthenticated if it is invalid."""
+        token = _read_headers(headers).token
+        key = None if token is None else self._api_keys.find(token)
+        if token is not None and key is None:
+            raise Unauthenticated(INVALID_KEY)
+        return key
+
+    def may_read_all(self, headers: Iterable[tuple[bytes, bytes]]) -> bool:
+        """Whether the presented key, if one is required, permits reading all leagues."""
+        try:
+            self.admit(RequiredPermission("read", None, is_of_all=True), _read_headers(headers).token)
+        except LeagueError:
+            return False
+        return True
+
+    def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
+        """Accept an RPC of GRPCInferenceService. Raises the errors of `admit`."""
+        self.admit(permissions.for_rpc(rpc, model), _read_headers(headers_of(metadata)).token)
+
+    def _authorize(self, need: RequiredPermission, token: bytes | None) -> ApiKey:
+        key = None if token is None else self._api_keys.find(token)
+        if key is None:
+            raise Unauthenticated(self._why_not(need, token))
+        if need.scope not in key.scopes:
+            allowed = ", ".join(sorted(key.scopes))
+            raise Forbidden(f"this request requires the scope {need.scope}; the key {key.name} has {allowed}")
+        if key.leagues is not None and need.league not in key.leagues and (need.league or need.is_of_all):
+            allowed, what = ", ".join(sorted(key.leagues)), "all leagues" if need.is_of_all else "another league"
+            raise Forbidden(f"this request concerns {what}; the key {key.name} is restricted to {allowed}")
+        _take_token(key)
+        return key
+
+    def _why_not(self, need: RequiredPermission, token: bytes | None) -> str:
+        if self._api_keys.is_empty:
+            return f"this request requires an API key, and none exists: league keys create NAME --scope {need.scope}"
+        if token is None:
+            return "this request requires an API key: Authorization: Bearer plk_…"
+        return INVALID_KEY
+
+
+class AccessControlMiddleware:
+    """ASGI middleware that applies `AccessControl` to every request."""
+
+    def __init__(
+        self,
+        application: ASGIApp,
+        access: AccessControl,
+        errors: ErrorHandlers,
+        settings: ServeSettings,
+        log: AccessLog | None = None,
+    ) -> None:
+        self._application = application
+        self._log = log
+        self._access = access
+        self._errors = errors
+        self._timeout = settings.timeout
+        self._is_first = True
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request to the application, or respond with an error."""
+        if (kind := scope["type"]) == "lifespan":
+            await self._application(scope, receive, send)
+            return
+        if self._is_first and (here := scope.get("server")):
+            self._is_first = False
+            self._access.backlog.watch_port(here[1])
+        if self._log is not None:
+            send = self._log.begin(scope, _path(scope), send)
+        reply = ResponseTracker(send)
+        try:
+            shown = _read_headers(scope["headers"])
+            method = scope.get("method", "GET")
+            if shown.is_browser:
+                reject_cross_site(method, scope["headers"])
+            key = self._access.admit(permissions.for_request(kind, method, _path(scope)), shown.token)
+            if key is not None:
+                scope[KEY] = key
+                if self._log is not None:
+                    scope[LOG_ENTRY]["key"] = key.name
+            if kind != "http" or is_event_stream(_path(scope)):
+                await self._application(scope, receive, reply.send)
+                return
+            timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
+            await run_within(timeout, self._application(scope, receive, reply.send))
+        except LeagueError as error:
+            if reply.has_started:
+                raise
+            await self._refuse(error, scope, receive, send)
+        except TimeLimitExceeded:
+            if not reply.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
+                await self._refuse(_timeout_error(scope, timeout), scope, receive, send)
+
+    async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
+            return
+        await self._errors.response(_path(scope), error)(scope, receive, send)
+
+
+class ResponseTracker:
+    """Records whether a response has started; after that no error response can be sent."""
+
+    __slots__ = ("_send", "has_started")
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self.has_started = False
+
+    def send(self, message: Message) -> Awaitable[None]:
+        """ASGI `send`."""
+        self.has_started = True
+        return self._send(message)
+
+
+def _take_token(key: ApiKey) -> None:
+    """Take a token of the key's bucket. Raises RateLimited."""
+    if key.bucket is not None and (wait := key.bucket.take()):
+        raise RateLimited(
+            f"rate limit exceeded: the key {key.name} allows {key.bucket.rate:g} requests per second", wait
+        )
+
+
+def headers_of(metadata: Iterable[tuple[str, Any]] | None) -> list[tuple[bytes, bytes]]:
+    """gRPC metadata as ASGI headers."""
+    return [(name.encode(), value.encode() if isinstance(value, str) else value) for name, value in metadata or ()]
+
+
+class RequestHeaders(NamedTuple):
+    """The headers of a request that access control uses."""
+
+    token: bytes | None
+    """The text of the API key."""
+    timeout: bytes | None
+    """The requested timeout in milliseconds."""
+    is_browser: bool
+    """Whether the request has a header of ORIGIN_HEADERS."""
+
+
+def _read_headers(headers: Iterable[tuple[bytes, bytes]]) -> RequestHeaders:
+    token, timeout, is_browser = None, None, False
+    for name, value in headers:
+        if name in HEADERS:
+            if name == b"x-request-timeout-ms":
+                timeout = value
+            elif name == b"x-api-key":
+                token = value.strip()
+            elif name in ORIGIN_HEADERS:
+                is_browser = True
+            elif value[: len(BEARER)].lower() == BEARER:
+                token = value[len(BEARER) :].strip()
+    return RequestHeaders(token, timeout, is_browser)
+
+
+def _seconds(milliseconds: bytes) -> float:
+    if not (milliseconds.isdigit() and len(milliseconds) <= 9 and int(milliseconds)):
+        raise InvalidInput("x-request-timeout-ms must be a positive number of milliseconds")
+    return int(milliseconds) / 1000
+
+
+def _timeout_error(scope: Scope, timeout: float) -> LeagueError:
+    if scope["method"] == "POST" and BODY_READ not in scope:
+        return BodyTooSlow(f"the request body did not arrive within {timeout:g} s")
+    return DeadlineExceeded(f"the request timed out after {timeout:g} s")
+
+
+def _path(scope: Scope) -> str:
+    """The path below the root path, as the router sees it."""
+    path: str = scope["path"]
+    root = scope.get("root_path", "")
+    return path[len(root) :] if root and path.startswith(root) else path

@@ -1,0 +1,114 @@
+"""Writes the access log: one JSON line per request, if the settings name a directory for it.
+
+    {"time": "2026-03-03T14:00:00.123Z", "method": "POST", "route": "/v1/policies/connect_four/action",
+     "policy": "connect_four", "version": 4, "status": 200, "us": 83, "key": "game-server"}
+
+`us` is the time spent in the replica in microseconds. `key` is the name of the API key, never its text. Entries are
+buffered and written by a thread. If the disk is full, log lines are lost; requests are unaffected.
+"""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, suppress
+from datetime import UTC, datetime
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
+
+import orjson
+from starlette.types import Message, Scope, Send
+
+from serve_app.runtime.ray_serve import logger
+
+WRITE_INTERVAL = 0.5
+"""Seconds between two writes."""
+MAX_BUFFERED = 20_000
+"""Maximum number of buffered lines; further lines are dropped."""
+MAX_FILE_BYTES, BACKUP_COUNT = 64 * 2**20, 4
+"""Size at which a file is rotated, and the number of rotated files that are kept."""
+LOG_ENTRY = "league.access"
+"""Scope entry of a logged request: the fields of its line."""
+
+
+class AccessLog:
+    """Writes `access-<replica>.jsonl` in a directory. All methods run on the event loop."""
+
+    def __init__(self, directory: Path, replica: str) -> None:
+        self.path = directory / f"access-{replica}.jsonl"
+        self._lines: list[dict[str, Any]] = []
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="access-log")
+        self._file: RotatingFileHandler | None = None
+        self._has_failed = False
+
+    def begin(self, scope: Scope, path: str, send: Send) -> Send:
+        """Start the entry of a request; returns a `send` that completes it."""
+        begun = perf_counter_ns()
+        line: dict[str, Any] = {"time": None, "method": scope.get("method", scope["type"]), "route": path}
+        line |= {"policy": None, "version": None, "status": None, "us": None, "key": None}
+        scope[LOG_ENTRY] = line
+
+        async def noting(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                line["status"] = message["status"]
+            await send(message)
+            is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
+            if is_end or message["type"] == "websocket.close":
+                line["time"], line["us"] = datetime.now(UTC), (perf_counter_ns() - begun) // 1000
+                self._append(line)
+
+        return noting
+
+    @asynccontextmanager
+    async def writing(self) -> AsyncIterator[None]:
+        """Write buffered lines while the context is active, and the remaining ones on exit."""
+        task = asyncio.create_task(self._write_on())
+        try:
+            yield
+        finally:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+            await self._write()
+            self._thread.shutdown()
+            if self._file is not None:
+                self._file.close()
+
+    def _append(self, line: dict[str, Any]) -> None:
+        if len(self._lines) < MAX_BUFFERED:
+            self._lines.append(line)
+
+    async def _write_on(self) -> None:
+        while True:
+            await asyncio.sleep(WRITE_INTERVAL)
+            await self._write()
+
+    async def _write(self) -> None:
+        lines, self._lines = self._lines, []
+        if lines:
+            await asyncio.get_running_loop().run_in_executor(self._thread, self._put, lines)
+
+    def _put(self, lines: Iterable[dict[str, Any]]) -> None:
+        text = "\n".join(orjson.dumps(line, option=orjson.OPT_UTC_Z).decode() for line in lines)
+        try:
+            if self._file is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = RotatingFileHandler(self.path, maxBytes=MAX_FILE_BYTES, backupCount=BACKUP_COUNT)
+            record = logging.LogRecord("access", logging.INFO, "", 0, text, None, None)
+            if self._file.shouldRollover(record):
+                self._file.doRollover()
+            assert self._file.stream is not None, "it is open"
+            self._file.stream.write(text + "\n")
+            self._file.flush()
+            self._has_failed = False
+        except OSError as error:
+            if not self._has_failed:
+                logger.error("cannot write the access log %s, lines are lost: %s", self.path, error)
+            self._has_failed = True
+
+
+def log_version(scope: Scope, model: str, version: int) -> None:
+    """Record the model and version that answered a logged request."""
+    scope[LOG_ENTRY] |= {"policy": model, "version": version}

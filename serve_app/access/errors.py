@@ -1,0 +1,140 @@
+"""Translates errors to HTTP responses with a status, a stable `code` and a message.
+
+InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415, IllegalAction 422), Unauthenticated 401, Forbidden 403,
+NotFound 404 (VersionRetired 410), BodyTooSlow 408, Conflict 409, Overloaded and RateLimited 429 with Retry-After,
+NotReady, ArtifactCorrupt and StorageError 503 with Retry-After, DeadlineExceeded and GameHung 504, others 500
+"""
+
+from collections.abc import Callable
+from math import ceil
+from typing import Any
+
+import orjson
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from league.errors import (
+    ArtifactCorrupt,
+    BodyTooLarge,
+    Conflict,
+    DeadlineExceeded,
+    Forbidden,
+    GameHung,
+    IllegalAction,
+    InvalidInput,
+    LeagueError,
+    NotFound,
+    NotReady,
+    Overloaded,
+    RateLimited,
+    StorageError,
+    Unauthenticated,
+    VersionRetired,
+)
+from serve_app.runtime.ray_serve import logger
+
+
+class MalformedBody(InvalidInput, code="malformed_body"):
+    """The body is not a JSON object."""
+
+
+class UnsupportedMediaType(InvalidInput, code="unsupported_media_type"):
+    """The Content-Type of the body is not JSON."""
+
+
+class CrossSiteRequest(Forbidden, code="cross_site"):
+    """A page of another origin sent the request."""
+
+
+class BodyTooSlow(LeagueError, code="body_too_slow"):
+    """The body did not arrive in time."""
+
+
+STATUSES: dict[type[LeagueError], int] = {
+    BodyTooLarge: 413,
+    UnsupportedMediaType: 415,
+    IllegalAction: 422,
+    InvalidInput: 400,
+    Unauthenticated: 401,
+    Forbidden: 403,
+    NotFound: 404,
+    VersionRetired: 410,
+    BodyTooSlow: 408,
+    Conflict: 409,
+    Overloaded: 429,
+    RateLimited: 429,
+    NotReady: 503,
+    ArtifactCorrupt: 503,
+    StorageError: 503,
+    DeadlineExceeded: 504,
+    GameHung: 504,
+    LeagueError: 500,
+}
+"""HTTP status by class; the nearest ancestor of an error's class applies."""
+CODES = {404: "unknown_path", 405: "method_not_allowed"}
+
+
+def status_of(error: LeagueError) -> int:
+    """The HTTP status of an error."""
+    return next(STATUSES[ancestor] for ancestor in type(error).__mro__ if ancestor in STATUSES)
+
+
+class ErrorHandlers:
+    """Starlette's exception handlers.
+
+    retry: `Retry-After` of a 503, in seconds. count: called with the path and code of each error.
+    """
+
+    def __init__(self, retry: float, count: Callable[[str, str], None]) -> None:
+        self._count = count
+        self._headers = {
+            401: {"www-authenticate": "Bearer"},
+            408: {"connection": "close"},  # the rest of the body is not read
+            429: {"retry-after": "1"},
+            503: {"retry-after": str(max(1, round(retry)))},
+        }
+
+    def handlers(self) -> dict[Any, Any]:
+        """Exception class → handler."""
+        return {LeagueError: self.league_error, HTTPException: self.http_error, Exception: self.internal_error}
+
+    async def league_error(self, request: Request, error: Exception) -> Response:
+        """Handle a LeagueError."""
+        assert isinstance(error, LeagueError)
+        return self.response(request.scope["path"], error)
+
+    def response(self, path: str, error: LeagueError) -> Response:
+        """The error response to a request for `path`."""
+        status = status_of(error)
+        if status >= 500:
+            logger.error("%s: %s", error.code, error)
+        headers = self._headers.get(status)
+        if isinstance(error, RateLimited):
+            headers = {"retry-after": str(max(1, ceil(error.wait)))}
+        self._count(path, error.code)
+        return error_response(path, status, error.code, str(error), headers)
+
+    async def http_error(self, request: Request, error: Exception) -> Response:
+        """Handle an error of Starlette's router."""
+        assert isinstance(error, HTTPException)
+        message = {
+            404: f"no route matches {request.url.path[:200]}",
+            405: f"method {request.method} is not allowed for {request.url.path[:200]}",
+        }.get(error.status_code, error.detail)
+        code = CODES.get(error.status_code, "http_error")
+        self._count(request.scope["path"], code)
+        return error_response(request.scope["path"], error.status_code, code, message, error.headers)
+
+    async def internal_error(self, request: Request, error: Exception) -> Response:
+        """Handle a bug. The traceback goes to the log, not to the client."""
+        logger.error("a request failed", exc_info=error)
+        self._count(request.scope["path"], "internal_error")
+        return error_response(request.scope["path"], 500, "internal_error", "internal server error; see the server log")
+
+
+def error_response(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:
+    """An error as JSON, in the format of the protocol that the path belongs to."""
+    is_open_inference = path.startswith("/v2")
+    body = orjson.dumps({"error": message} if is_open_inference else {"code": code, "message": message})
+    return Response(body, status, headers, media_type="application/json")

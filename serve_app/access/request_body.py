@@ -1,0 +1,73 @@
+"""Reads request bodies without buffering more than the limit."""
+
+from typing import Any
+
+import orjson
+from starlette.types import Receive, Scope
+
+from league.errors import BodyTooLarge
+from serve_app.access.errors import MalformedBody, UnsupportedMediaType
+from serve_app.codecs.observation_codec import json_type
+
+JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")
+"""Media types accepted as JSON. The last is curl's default."""
+BODY_READ = "league.body_is_read"
+"""Scope entry of a request whose body has arrived: a timeout after that is not the client's fault."""
+
+
+async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
+    """Read a JSON body of at most `limit` bytes. Raises BodyTooLarge or UnsupportedMediaType."""
+    for name, value in scope["headers"]:
+        if name == b"content-type":
+            _check_type(value)
+    return await read_bytes(scope, receive, limit)
+
+
+async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
+    """Read a body of at most `limit` bytes. Raises BodyTooLarge as early as possible."""
+    for name, value in scope["headers"]:
+        if name == b"content-length" and int(value) > limit:
+            raise _too_large(limit)
+    message = await receive()
+    body: bytes = message.get("body", b"")
+    if message.get("more_body", False):
+        body = await _read_rest(body, receive, limit)
+    if len(body) > limit:
+        raise _too_large(limit)
+    scope[BODY_READ] = True
+    return body
+
+
+def parse_json_object(body: bytes) -> dict[str, Any]:
+    """Parse a body as a JSON object. Raises MalformedBody."""
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        reason = "it is empty" if not body else str(error)
+        raise MalformedBody(f"the body is not JSON: {reason}") from None
+    if type(document) is not dict:
+        raise MalformedBody(f"the body is {json_type(document)}, expected an object")
+    return document
+
+
+async def _read_rest(body: bytes, receive: Receive, limit: int) -> bytes:
+    parts, size, more = [body], len(body), True
+    while more and size <= limit:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise MalformedBody("the connection closed before the body was complete")
+        parts.append(message.get("body", b""))
+        size += len(parts[-1])
+        more = message.get("more_body", False)
+    return b"".join(parts)
+
+
+def _check_type(value: bytes) -> None:
+    media_type = value.partition(b";")[0].strip().lower()
+    if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
+        given = media_type.decode("latin-1")[:64]
+        raise UnsupportedMediaType(f"the Content-Type is {given!r}, expected application/json")
+
+
+def _too_large(limit: int) -> BodyTooLarge:
+    return BodyTooLarge(f"the body is larger than {limit} bytes")

@@ -1,0 +1,1 @@
+"""Codecs of requests and responses: observations, binary leaves and state tokens."""

@@ -1,0 +1,1 @@
+"""Execution of inference requests: action requests and streams."""

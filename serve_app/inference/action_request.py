@@ -1,0 +1,212 @@
+"""An action request: parsed and checked, executed, and encoded as a reply."""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.errors import BodyTooLarge, InvalidInput, InvalidState
+from league.policies.draws import probabilities
+from league.policies.policy import Actions
+from league.seeds import generator
+from league.spaces import ACTION_MASK
+from serve_app.codecs.observation_codec import json_type, read_state, reject_strings
+from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
+from serve_app.codecs.state_tokens import read_state as state_of_tokens
+from serve_app.models.resolver import version_of
+from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+
+KEYS = frozenset(("observation", "observations", "state", "explore", "seed", "probabilities"))
+OBSERVATIONS = ("observation", "observations")
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedActionRequest:
+    """A request for actions."""
+
+    observations: list[Any]
+    is_batch: bool
+    state: dict[str, Any] | None
+    """Recurrent state as arrays, not decoded yet; empty at the start of episodes if the reply's state shall be
+    arrays."""
+    tokens: list[StateToken | None] | None
+    """Recurrent state as tokens, one per observation; None at the start of an episode."""
+    explore: bool
+    seed: int | list[int] | None
+    probabilities: bool
+    strings: int
+    """Number of strings in the document, including keys, except those in the observations."""
+
+
+def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedActionRequest:
+    """Parse a document that has no keys other than KEYS. Raises BodyTooLarge, InvalidInput or InvalidState."""
+    is_batch = "observations" in document
+    if is_batch == ("observation" in document):
+        both = "both observation and observations" if is_batch else "neither observation nor observations"
+        raise InvalidInput(f"the body has {both}, expected one of them")
+    observations = document["observations"] if is_batch else [document["observation"]]
+    if is_batch:
+        _check_batch(observations, max_batch)
+    explore, probabilities = parse_flag(document, "explore"), parse_flag(document, "probabilities")
+    seed = document.get("seed")
+    _check_seed(seed, len(observations) if is_batch else None)
+    arrays, tokens, strings = None, None, len(document)
+    if (state := document.get("state")) is not None:
+        if type(state) is dict:
+            arrays, strings = state, strings + len(state)
+        else:
+            tokens = _tokens(state, len(observations) if is_batch else None)
+            strings += sum(token is not None for token in tokens)
+    return DecodedActionRequest(observations, is_batch, arrays, tokens, explore, seed, probabilities, strings)
+
+
+def reject_unknown_keys(document: dict[str, Any], known: frozenset[str]) -> None:
+    """Raise InvalidInput if a document has a key that is not in `known`."""
+    if not document.keys() <= known:
+        unknown = min(document.keys() - known)
+        raise InvalidInput(f"the body has the unknown key {unknown[:64]!r}, expected {', '.join(sorted(known))}")
+
+
+def parse_flag(document: dict[str, Any], key: str) -> bool:
+    """A boolean of a document, false by default. Raises InvalidInput."""
+    flag = document.get(key, False)
+    if type(flag) is not bool:
+        raise InvalidInput(f"{key} is {json_type(flag)}, expected true or false")
+    return flag
+
+
+def pinned_version(request: DecodedActionRequest, model: str, requested: str) -> str:
+    """The version of `model` that must answer: that of the state tokens, otherwise the requested one.
+
+    Raises InvalidState if the two differ, or if a token belongs to another league. An alias never conflicts with a
+    token, because aliases move while episodes stay with their version.
+    """
+    tokens = [token for token in request.tokens or () if token is not None]
+    if not tokens:
+        return requested
+    league = model.partition(".")[0]
+    for token in tokens:
+        if token.model.partition(".")[0] != league:
+            raise InvalidState(f"state is of {token.model[:64]}, expected {model[:64]}")
+    version = common_version(tokens)
+    if version_of(requested) not in (version, requested):
+        raise InvalidState(
+            f"state is of version {version}, but the request is for version {requested}: an episode stays with one"
+            " version"
+        )
+    return str(version)
+
+
+def _tokens(state: Any, batch: int | None) -> list[StateToken | None]:
+    if batch is None:
+        return [read_token(state)]
+    if type(state) is not list:
+        raise InvalidState(f"state is {json_type(state)}, expected a list with the state of each observation, or null")
+    if len(state) != batch:
+        raise InvalidState(f"state has {len(state)} items, expected {batch}: one per observation")
+    return [None if each is None else read_token(each) for each in state]
+
+
+def _check_seed(seed: Any, batch: int | None) -> None:
+    if seed is None:
+        return
+    if batch is not None and type(seed) is list and len(seed) != batch:
+        raise InvalidInput(f"seed has {len(seed)} integers, expected {batch}: one per observation")
+    seeds = seed if batch is not None and type(seed) is list else [seed]
+    if any(type(each) is not int or not 0 <= each < 2**63 for each in seeds):
+        raise InvalidInput("seed must be null or an integer from 0 to 2^63 - 1, or in a batch a list of such integers")
+
+
+def _check_batch(observations: Any, max_batch: int) -> None:
+    if type(observations) is not list:
+        raise InvalidInput(f"observations is {json_type(observations)}, expected a list of observations")
+    if not observations:
+        raise InvalidInput("observations is empty, expected at least one")
+    if len(observations) > max_batch:
+        raise BodyTooLarge(f"observations has {len(observations)} items, expected at most {max_batch}")
+
+
+Arrays = dict[str, NDArray]
+
+
+def is_plain(request: DecodedActionRequest, policy: LoadedPolicy, quotes: int) -> bool:
+    """Whether no value is a string, from the number of quotation marks in the body: two per string.
+
+    More strings than keys mean that a key is wrong or a leaf is base64.
+    """
+    return quotes == 2 * (request.strings + len(request.observations) * policy.reader.keys)
+
+
+def decode_state(
+    request: DecodedActionRequest, version: LoadedVersion, policy: LoadedPolicy, has_strings: bool = True
+) -> Arrays | None:
+    """Decode the recurrent state of the request. Raises ObservationError or InvalidState."""
+    if not request.state and not any(request.tokens or ()):
+        return None
+    if not policy.state:
+        raise InvalidState("state must be null: this policy is not recurrent")
+    if request.tokens is not None:
+        return state_of_tokens(request.tokens, version.model(policy), version.sha256, policy.state)
+    if has_strings:
+        reject_strings(request.state)
+    return read_state(request.state, policy.state, len(request.observations))
+
+
+def encode_state(answer: Actions, version: LoadedVersion, policy: LoadedPolicy) -> list[str]:
+    """Encode the new state as tokens."""
+    assert answer.state is not None
+    return write_tokens(version.model(policy), version.number, version.sha256, answer.state)
+
+
+async def execute(
+    policy: LoadedPolicy,
+    observations: Arrays,
+    state: Arrays | None,
+    rng: Sequence[np.random.Generator] | None = None,
+    with_distribution: bool = False,
+) -> Actions:
+    """Run the graph, in a thread if the batch is large. rng: explore, with one generator per row."""
+
+    def run() -> Actions:
+        if with_distribution and rng is None:
+            return policy.policy.distribution(observations, state=state)
+        return policy.policy.act(observations, state=state, explore=rng is not None, rng=rng)
+
+    rows = len(next(iter(observations.values())))
+    return run() if rows <= policy.inline_rows else await asyncio.to_thread(run)
+
+
+async def execute_request(
+    request: DecodedActionRequest, policy: LoadedPolicy, observations: Arrays, state: Arrays | None
+) -> Actions:
+    """Run the graph with the request's seed."""
+    rng = generators(request.seed, len(request.observations)) if request.explore else None
+    return await execute(policy, observations, state, rng, request.probabilities)
+
+
+def build_reply(
+    request: DecodedActionRequest, answer: Actions, observations: Arrays, policy: LoadedPolicy
+) -> dict[str, Any]:
+    """The reply's `action` or `actions`, and its `probabilities`."""
+    actions = answer.actions.tolist()
+    reply = {"actions": actions} if request.is_batch else {"action": actions[0]}
+    if request.probabilities:
+        assert answer.dist_inputs is not None
+        likely = probabilities(answer.dist_inputs, policy.manifest.action, observations.get(ACTION_MASK))
+        reply["probabilities"] = likely if request.is_batch else likely[0]
+    return reply
+
+
+def generators(seed: int | list[int] | None, rows: int) -> Sequence[np.random.Generator]:
+    """One generator per row, so that an action does not depend on the batch."""
+    if seed is None:
+        return [np.random.default_rng() for _ in range(rows)]
+    if isinstance(seed, list):
+        return [generator(own, 0) for own in seed]
+    return [generator(seed, row) for row in range(rows)]
+
+
+REPLICA = b"x-league-replica"

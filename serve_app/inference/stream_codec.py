@@ -1,0 +1,136 @@
+"""Encodes the binary messages of a stream: a header of 16 bytes followed by tensors, little-endian.
+
+    request   format 1 · flags · 0 · rows · seed             if flagged, one byte per row: 1 starts an episode
+              then each input of the policy in the order of its manifest, without recurrent state: rows × its shape
+    reply     format 1 · 0 · 0 · rows · version · 0          then the actions: rows × the shape of an action
+
+With 16 bytes the first tensor is aligned in memory and can be used without a copy.
+"""
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import prod
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.errors import BodyTooLarge, InvalidInput, ObservationError
+from league.policies.onnx import ACTION
+from league.spaces import ACTION_MASK, Leaf
+from league.spaces.arrays import check, check_mask
+from serve_app.models.version_cache import LoadedPolicy
+
+FRAMING = 1
+REQUEST = struct.Struct("<BBHIQ")
+REPLY = struct.Struct("<BBHIII")
+EXPLORE, HAS_SEED, RESET, HAS_RESETS = 1, 2, 4, 8
+FLAGS = EXPLORE | HAS_SEED | RESET | HAS_RESETS
+
+
+class BinaryRequest(NamedTuple):
+    """A request with a parsed header."""
+
+    rows: int
+    explore: bool
+    seed: int | None
+    reset: bool
+    resets: NDArray | None
+    """(rows,) bool: where an episode starts."""
+    tensors: memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class _Input:
+    """One tensor of a request."""
+
+    name: str
+    leaf: Leaf
+    dtype: np.dtype
+    size: int
+    """Bytes per row."""
+
+
+class BinaryCodec:
+    """Decodes requests and encodes replies of one policy."""
+
+    def __init__(self, policy: LoadedPolicy) -> None:
+        self._inputs = [_input(name, leaf) for name, _, leaf in policy.reader.leaves]
+        self._row = sum(each.size for each in self._inputs)
+        self._is_masked = policy.reader.is_masked
+        self._action = _little(next(tensor.dtype for tensor in policy.manifest.outputs if tensor.name == ACTION))
+
+    def read(self, request: BinaryRequest) -> dict[str, NDArray]:
+        """Decode the graph's inputs, without state. Raises ObservationError or IllegalMask."""
+        if len(request.tensors) != (size := request.rows * self._row):
+            parts = " + ".join(f"{each.size} {each.name}" for each in self._inputs)
+            raise ObservationError(
+                f"the tensors have {len(request.tensors)} bytes, expected {size}: {request.rows} rows of {parts}"
+            )
+        arrays, at = {}, 0
+        for each in self._inputs:
+            end = at + request.rows * each.size
+            arrays[each.name] = _array(request.tensors[at:end], each, request.rows)
+            at = end
+        if self._is_masked:
+            check_mask(arrays[ACTION_MASK])
+        return arrays
+
+    def write(self, actions: NDArray, version: int) -> bytes:
+        """Encode the reply."""
+        return REPLY.pack(FRAMING, 0, 0, len(actions), version, 0) + actions.astype(self._action, copy=False).tobytes()
+
+
+def parse_request(message: bytes, max_batch: int) -> BinaryRequest:
+    """Parse the header of a message. Raises InvalidInput or BodyTooLarge."""
+    if len(message) < REQUEST.size:
+        raise InvalidInput(f"the message has {len(message)} bytes, expected a header of {REQUEST.size}")
+    framing, flags, zero, rows, seed = REQUEST.unpack_from(message)
+    if framing != FRAMING or zero or flags & ~FLAGS:
+        raise InvalidInput(f"the header starts with {message[:4].hex(' ')}, expected {FRAMING:02x}, flags, 00 00")
+    if not 1 <= rows <= max_batch:
+        refusal = BodyTooLarge if rows else InvalidInput
+        raise refusal(f"the message has {rows} rows, expected 1 to {max_batch}")
+    has_seed = bool(flags & HAS_SEED)
+    if seed >= 2**63 or (seed and not has_seed):
+        raise InvalidInput("seed must be less than 2^63, and 0 if there is none")
+    begin, resets = REQUEST.size, None
+    if flags & HAS_RESETS:
+        begin += rows
+        resets = _resets(message[REQUEST.size : begin], rows)
+    tensors = memoryview(message)[begin:]
+    return BinaryRequest(rows, bool(flags & EXPLORE), seed if has_seed else None, bool(flags & RESET), resets, tensors)
+
+
+def _resets(data: bytes, rows: int) -> NDArray:
+    if len(data) != rows or data.strip(b"\0\1"):
+        raise InvalidInput(f"resets must be {rows} bytes of 0 or 1")
+    return np.frombuffer(data, np.bool_)
+
+
+def _array(data: memoryview, each: _Input, rows: int) -> NDArray:
+    array = np.frombuffer(data, each.dtype)
+    if each.dtype.kind == "b" and (array.view(np.uint8) > 1).any():
+        raise ObservationError(f"{each.name} has bytes other than 0 and 1, expected bool")
+    if not array.flags.aligned:  # kernels of the graph require alignment
+        array = array.copy()
+    return check(each.name, array.reshape(rows, *each.leaf.shape), each.leaf)
+
+
+def _input(name: str, leaf: Leaf) -> _Input:
+    dtype = _little(leaf.dtype)
+    return _Input(name, leaf, dtype, dtype.itemsize * prod(leaf.shape))
+
+
+def _little(dtype: str) -> np.dtype:
+    return np.dtype(dtype).newbyteorder("<")
+
+
+def encode_request(
+    tensors: Iterable[NDArray], rows: int, seed: int | None = None, explore: bool = False, reset: bool = False
+) -> bytes:
+    """Encode a message as a client does."""
+    flags = explore * EXPLORE | (seed is not None) * HAS_SEED | reset * RESET
+    head = REQUEST.pack(FRAMING, flags, 0, rows, seed or 0)
+    return head + b"".join(tensor.tobytes() for tensor in tensors)

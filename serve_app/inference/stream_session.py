@@ -1,0 +1,277 @@
+"""A stream session: answers each message with the version and recurrent state that the stream keeps.
+
+A stream is pinned to a version, or follows an alias. A stream that follows an alias switches versions of a recurrent
+policy only when all its episodes start anew.
+"""
+
+from dataclasses import dataclass
+from math import ceil
+from time import perf_counter_ns
+from typing import Any, NamedTuple
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, Unauthenticated
+from league.policies.policy import Actions
+from league.refs import CHAMPION
+from serve_app.access.access_control import AccessControl
+from serve_app.access.api_keys import ApiKey
+from serve_app.access.errors import MalformedBody, status_of
+from serve_app.access.request_body import parse_json_object
+from serve_app.codecs.observation_codec import json_type
+from serve_app.codecs.state_tokens import read_state, write_tokens
+from serve_app.inference.action_request import (
+    KEYS,
+    Arrays,
+    DecodedActionRequest,
+    build_reply,
+    execute,
+    execute_request,
+    generators,
+    is_plain,
+    parse_action_request,
+    parse_flag,
+    pinned_version,
+    reject_unknown_keys,
+)
+from serve_app.inference.stream_codec import BinaryCodec, parse_request
+from serve_app.models.alias_slots import AliasSlots
+from serve_app.models.resolver import ModelResolver, policy_ref
+from serve_app.models.shadow import Shadow
+from serve_app.models.traffic_split import Headers, TrafficSplit
+from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.observability.metrics import Metrics
+from serve_app.runtime.ray_serve import logger
+from serve_app.runtime.uvicorn_websocket import CloseStream, StreamMessage
+from serve_app.settings import ServeSettings
+
+STREAM_ONLY_KEYS = frozenset(("reset", "return_state"))
+"""Keys that the action route does not accept."""
+POLICY_VIOLATION = 1008
+INVALID_PAYLOAD = 1007
+API = "stream"
+"""Name of stream messages in metrics."""
+INTERNAL_ERROR = {"code": "internal_error", "message": "internal server error; see the server log", "status": 500}
+
+
+class ServedPolicy(NamedTuple):
+    """The version and policy that answer, with the codec for binary messages."""
+
+    version: LoadedVersion
+    policy: LoadedPolicy
+    codec: BinaryCodec
+    signature: dict[str, Any]
+    """Identifies the version in each JSON reply."""
+
+    @classmethod
+    def of(cls, model: str, version: LoadedVersion, policy: LoadedPolicy) -> "ServedPolicy":
+        signature = {"model": model, "version": version.number, "sha256": version.sha256}
+        return cls(version, policy, BinaryCodec(policy), signature)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamDependencies:
+    """Objects that all streams of a replica share."""
+
+    models: ModelResolver
+    slots: AliasSlots
+    traffic: TrafficSplit
+    shadow: Shadow
+    metrics: Metrics
+    access: AccessControl
+    settings: ServeSettings
+
+
+class StreamSession:
+    """The session of one connection; messages are passed in one at a time.
+
+    follows: the alias to follow; None pins the version of `served`. headers: those of the handshake; the caller's key
+    may route a stream that follows the champion to the canary.
+    """
+
+    def __init__(
+        self,
+        dependencies: StreamDependencies,
+        model: str,
+        served: tuple[LoadedVersion, LoadedPolicy],
+        follows: str | None,
+        headers: Headers,
+        key: ApiKey | None,
+    ) -> None:
+        self._dependencies = dependencies
+        self._model = model
+        self._ref = policy_ref(model)
+        self._path = f"/v1/policies/{model}/stream"
+        self._follows = follows
+        self._headers = headers
+        self._key = key
+        self._served = ServedPolicy.of(model, *served)
+        self._state: Arrays | None = None
+        """Recurrent state, one row per observation of the last message; None at the start of episodes."""
+        self._is_batch = False
+
+    async def answer(self, data: bytes, is_text: bool) -> StreamMessage:
+        """The answer to a message, or an error message. Raises CloseStream."""
+        try:
+            self._dependencies.access.admit_message(self._key)
+            return await (self._answer_text(data) if is_text else self._answer_binary(data))
+        except Unauthenticated as error:
+            self._dependencies.metrics.count_error(self._path, error.code)
+            raise CloseStream(POLICY_VIOLATION, str(error)) from None
+        except LeagueError as error:
+            self._dependencies.metrics.count_error(self._path, error.code)
+            return error_message(error, self._dependencies.settings.retry)
+        except CloseStream:
+            raise
+        except Exception as error:
+            logger.error("a message of a stream failed", exc_info=error)
+            self._dependencies.metrics.count_error(self._path, str(INTERNAL_ERROR["code"]))
+            return _text(INTERNAL_ERROR)
+
+    def closing_message(self) -> StreamMessage | None:
+        """What a client needs to continue on another replica: the recurrent state, if any."""
+        if self._state is None:
+            return None
+        return _text({"closing": True, "state": self._tokens()} | self._served.signature)
+
+    async def _answer_text(self, data: bytes) -> StreamMessage:
+        begun = perf_counter_ns()
+        document = _parsed(data)
+        reject_unknown_keys(document, KEYS | STREAM_ONLY_KEYS)
+        own = document.keys() & STREAM_ONLY_KEYS
+        if document.keys() == {"reset"} and parse_flag(document, "reset"):
+            self._served, self._state = self._current(), None
+            return _text({"reset": True} | self._served.signature)
+        return_state, reset = parse_flag(document, "return_state"), document.get("reset", False)
+        for key in own:
+            del document[key]
+        request = parse_action_request(document, self._dependencies.settings.max_batch)
+        if request.state is not None:
+            raise InvalidState("state is an object, expected a token: streams do not accept arrays")
+        is_anew = reset is True or ("state" in document and document["state"] is None)
+        served, state = await self._select(request, is_anew, _resets(reset, request))
+        quotes = data.count(b'"') - 2 * len(own)
+        observations = served.policy.reader.read(request.observations, is_plain(request, served.policy, quotes))
+        answer = await execute_request(request, served.policy, observations, state)
+        self._mirror(served, observations, state, None if request.explore else answer.actions)
+        self._store_state(served, answer, request.is_batch)
+        reply = build_reply(request, answer, observations, served.policy) | served.signature
+        if return_state and self._state is not None:
+            reply["state"] = self._tokens()
+        message = _text(reply)
+        self._count(served, len(request.observations), begun)
+        return message
+
+    async def _answer_binary(self, data: bytes) -> StreamMessage:
+        begun = perf_counter_ns()
+        request = parse_request(data, self._dependencies.settings.max_batch)
+        served, state = self._continue(request.rows, request.reset, request.resets)
+        observations = served.codec.read(request)
+        rng = generators(request.seed, request.rows) if request.explore else None
+        answer = await execute(served.policy, observations, state, rng)
+        self._mirror(served, observations, state, None if request.explore else answer.actions)
+        self._store_state(served, answer, is_batch=request.rows > 1)
+        message = StreamMessage(served.codec.write(answer.actions, served.version.number), False)
+        self._count(served, request.rows, begun)
+        return message
+
+    async def _select(
+        self, request: DecodedActionRequest, is_anew: bool, resets: NDArray | None
+    ) -> tuple[ServedPolicy, Arrays | None]:
+        """The version that answers, and the recurrent state. Raises InvalidState and the errors of
+        `ModelResolver.find`.
+        """
+        if request.tokens is None or not any(request.tokens):
+            return self._continue(len(request.observations), is_anew or request.tokens is not None, resets)
+        if is_anew or resets is not None:
+            raise InvalidState("reset and state are mutually exclusive: an episode starts or continues")
+        if not self._served.policy.state:
+            raise InvalidState("state must be null: this policy is not recurrent")
+        number = pinned_version(request, self._model, self._follows or str(self._served.version.number))
+        served = self._served
+        if int(number) != served.version.number:
+            served = ServedPolicy.of(self._model, *await self._dependencies.models.find(self._model, number))
+        model = served.version.model(served.policy)
+        return served, read_state(request.tokens, model, served.version.sha256, served.policy.state)
+
+    def _continue(self, rows: int, is_anew: bool, resets: NDArray | None) -> tuple[ServedPolicy, Arrays | None]:
+        if self._state is None or is_anew or (resets is not None and resets.all()):
+            return self._current(), None
+        held = len(next(iter(self._state.values())))
+        if held != rows:
+            raise InvalidState(f"the last message had {held} observations, this one has {rows}: a reset is required")
+        if resets is None or not resets.any():
+            return self._served, self._state
+        state = {name: array.copy() for name, array in self._state.items()}
+        for array in state.values():
+            array[resets] = 0
+        return self._served, state
+
+    def _current(self) -> ServedPolicy:
+        """The version that answers new episodes."""
+        if self._follows is None:
+            return self._served
+        version = self._dependencies.slots.get(self._ref.league, self._follows) or self._served.version
+        if self._follows == CHAMPION and self._dependencies.traffic.canaries:
+            version = self._dependencies.traffic.route(version, self._headers)
+        if version is self._served.version:
+            return self._served
+        return ServedPolicy.of(self._model, version, version.policy(self._ref.policy))
+
+    def _mirror(
+        self, served: ServedPolicy, observations: Arrays, state: Arrays | None, actions: NDArray | None
+    ) -> None:
+        mirror = self._dependencies.shadow.mirror_for(self._model, served.version)
+        if mirror is not None:
+            mirror(observations, state, actions)
+
+    def _count(self, served: ServedPolicy, rows: int, begun: int) -> None:
+        self._dependencies.metrics.count_request(API, self._model, served.version, rows, perf_counter_ns() - begun)
+
+    def _store_state(self, served: ServedPolicy, answer: Actions, is_batch: bool) -> None:
+        self._served, self._state, self._is_batch = served, answer.state, is_batch
+
+    def _tokens(self) -> str | list[str]:
+        assert self._state is not None
+        version, policy, *_ = self._served
+        tokens = write_tokens(version.model(policy), version.number, version.sha256, self._state)
+        return tokens if self._is_batch else tokens[0]
+
+
+def error_message(error: LeagueError, retry: float) -> StreamMessage:
+    """An error as a message. retry: seconds to wait after NotReady."""
+    document: dict[str, Any] = {"code": error.code, "message": str(error), "status": status_of(error)}
+    if document["status"] >= 500:
+        logger.error("%s: %s", error.code, error)
+    if document["status"] in (429, 503):
+        wait = error.wait if isinstance(error, RateLimited) else 1.0 if document["status"] == 429 else retry
+        document["retry_after"] = max(1, ceil(wait))
+    return _text(document)
+
+
+def _parsed(data: bytes) -> dict[str, Any]:
+    try:
+        return parse_json_object(data)
+    except MalformedBody:
+        try:
+            data.decode()
+        except UnicodeDecodeError:
+            raise CloseStream(INVALID_PAYLOAD, "a text message is not valid UTF-8") from None
+        raise
+
+
+def _resets(reset: Any, request: DecodedActionRequest) -> NDArray | None:
+    """The rows in which an episode starts, if given per row. Raises InvalidInput."""
+    if type(reset) is bool:
+        return None
+    if not request.is_batch or type(reset) is not list:
+        raise InvalidInput(f"reset is {json_type(reset)}, expected true or false, or in a batch a list of booleans")
+    if len(reset) != len(request.observations) or any(type(each) is not bool for each in reset):
+        raise InvalidInput(f"reset must have {len(request.observations)} booleans: one per observation")
+    return np.array(reset)
+
+
+def _text(document: dict[str, Any]) -> StreamMessage:
+    return StreamMessage(orjson.dumps(document), True)

@@ -1,0 +1,198 @@
+"""Encodes REST bodies of the protocol: JSON with optional binary tensors, optionally compressed.
+
+    Inference-Header-Content-Length: length of the JSON         (absent without binary tensors)
+    {"inputs": [{…, "parameters": {"binary_data_size": size}}, {…, "data": [ … ]}], "outputs": […]}  bytes  bytes …
+
+The size limit applies to the decompressed body; decompression stops there. Classification and shared memory are not
+supported.
+"""
+
+import asyncio
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+import orjson
+
+from league.errors import BodyTooLarge, InvalidInput
+from serve_app.access.errors import MalformedBody, UnsupportedMediaType
+from serve_app.access.request_body import parse_json_object
+from serve_app.codecs.observation_codec import json_type
+from serve_app.inference_protocol.inference import InferRequest, InferResponse
+from serve_app.inference_protocol.tensors import RequestTensor, datatype_of, to_bytes
+
+WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
+"""zlib's `wbits`, which select the format."""
+LEVEL = 1
+"""The fastest level."""
+MIN_COMPRESSED_BYTES = 1024
+"""Smaller replies are not compressed."""
+
+
+async def decompressed(body: bytes, encoding: bytes, limit: int) -> bytes:
+    """Decode a body's Content-Encoding. Raises UnsupportedMediaType, MalformedBody or BodyTooLarge."""
+    encoding = encoding.strip().lower()
+    if encoding in (b"", b"identity"):
+        return body
+    if encoding not in WINDOW_BITS:
+        given = encoding.decode("latin-1")[:64]
+        raise UnsupportedMediaType(f"the Content-Encoding is {given!r}, expected gzip, deflate or identity")
+    return await asyncio.to_thread(_inflate, body, WINDOW_BITS[encoding], limit)
+
+
+async def compressed(body: bytes, accepted: bytes) -> tuple[bytes, bytes | None]:
+    """Compress a body as Accept-Encoding permits; returns it with its Content-Encoding."""
+    encoding = _choose_encoding(accepted) if len(body) >= MIN_COMPRESSED_BYTES else None
+    if encoding is None:
+        return body, None
+    return await asyncio.to_thread(_deflate, body, WINDOW_BITS[encoding]), encoding
+
+
+def _choose_encoding(accepted: bytes) -> bytes | None:
+    """The first accepted encoding that is supported. Weights are ignored, except `q=0`."""
+    for item in accepted.lower().split(b","):
+        name, _, quality = item.partition(b";")
+        if name.strip() in (b"gzip", b"deflate") and quality.replace(b" ", b"").strip(b"0.") != b"q=":
+            return name.strip()
+    return None
+
+
+def _inflate(body: bytes, window_bits: int, limit: int) -> bytes:
+    inflater = zlib.decompressobj(window_bits)
+    try:
+        inflated = inflater.decompress(body, limit + 1)
+    except zlib.error as error:
+        raise MalformedBody(f"the body cannot be decompressed: {error}") from None
+    if len(inflated) > limit:
+        raise BodyTooLarge(f"the decompressed body is larger than {limit} bytes")
+    if not inflater.eof or inflater.unused_data:
+        raise MalformedBody("the compressed body is truncated or followed by other data")
+    return inflated
+
+
+def _deflate(body: bytes, window_bits: int) -> bytes:
+    deflater = zlib.compressobj(LEVEL, wbits=window_bits)
+    return deflater.compress(body) + deflater.flush()
+
+
+SIZE = "binary_data_size"
+SEQUENCE = "sequence_id"
+UNSUPPORTED = ("shared_memory_region", "classification")
+DUMP = orjson.OPT_SERIALIZE_NUMPY
+
+
+class RestRequest(NamedTuple):
+    """A request, with the outputs to send as binary data."""
+
+    infer: InferRequest
+    is_binary: bool
+    """Default for outputs that are not in `binary`."""
+    binary: dict[str, bool]
+
+
+def read_request(model: str, version: str, body: bytes, header_length: int | None) -> RestRequest:
+    """Decode a body; `header_length` is the length of its JSON, None if it is all JSON.
+
+    Raises MalformedBody or InvalidInput.
+    """
+    document, rest = _split(body, header_length)
+    parameters = _parameters(document, "the request")
+    outputs = _list(document, "outputs", required=False)
+    names, binary = [], {}
+    for output in outputs:
+        name = _string(output, "name", "an output")
+        names.append(name)
+        own = _parameters(output, "an output")
+        if "binary_data" in own:
+            binary[name] = _flag(own, "binary_data")
+    request = InferRequest(
+        model=model,
+        version=version,
+        id=_string(document, "id", "the request") if "id" in document else "",
+        inputs=_tensors(_list(document, "inputs", required=True), rest),
+        outputs=names,
+        is_sequence=bool(parameters.get(SEQUENCE)),
+    )
+    is_binary = "binary_data_output" in parameters and _flag(parameters, "binary_data_output")
+    return RestRequest(request, is_binary, binary)
+
+
+def write_response(response: InferResponse, request: RestRequest) -> tuple[bytes, int | None]:
+    """Encode a response; returns the body, and the length of its JSON if binary data follows."""
+    outputs, parts = [], []
+    for name, array in response.outputs.items():
+        output: dict[str, Any] = {"name": name, "datatype": datatype_of(array), "shape": array.shape}
+        if request.binary.get(name, request.is_binary):
+            parts.append(to_bytes(array))
+            output["parameters"] = {SIZE: len(parts[-1])}
+        else:
+            output["data"] = np.ascontiguousarray(array).reshape(-1)
+        outputs.append(output)
+    document: dict[str, Any] = {"model_name": response.model, "model_version": response.version}
+    if response.id:
+        document["id"] = response.id
+    head = orjson.dumps(document | {"outputs": outputs}, option=DUMP)
+    return (b"".join((head, *parts)), len(head)) if parts else (head, None)
+
+
+def _split(body: bytes, header_length: int | None) -> tuple[dict[str, Any], memoryview]:
+    if header_length is None:
+        return parse_json_object(body), memoryview(b"")
+    if header_length > len(body):
+        raise MalformedBody(f"Inference-Header-Content-Length is {header_length}, but the body has {len(body)} bytes")
+    return parse_json_object(body[:header_length]), memoryview(body)[header_length:]
+
+
+def _tensors(inputs: list[Any], rest: memoryview) -> list[RequestTensor]:
+    tensors, begin = [], 0
+    for document in inputs:
+        name = _string(document, "name", "an input")
+        shape = document.get("shape")
+        if type(shape) is not list or not all(type(size) is int for size in shape):
+            raise InvalidInput(f"the shape of input {name[:64]!r} is not a list of integers")
+        size = _parameters(document, "an input").get(SIZE)
+        data = document.get("data")
+        if size is None:
+            if type(data) is not list:
+                raise InvalidInput(f"input {name[:64]!r} has neither {SIZE} nor a list as its data")
+        elif type(size) is not int or size < 0 or data is not None:
+            raise InvalidInput(f"{SIZE} of input {name[:64]!r} must be a number of bytes, and data must be absent")
+        else:
+            data, begin = rest[begin : begin + size], begin + size
+        tensors.append(RequestTensor(name, _string(document, "datatype", "an input"), shape, data))
+    if begin != len(rest):
+        raise InvalidInput(f"{len(rest)} bytes follow the JSON, but the inputs declare {begin}")
+    return tensors
+
+
+def _list(document: dict[str, Any], key: str, required: bool) -> list[Any]:
+    items = document.get(key)
+    if items is None and not required:
+        return []
+    if type(items) is not list or not all(type(item) is dict for item in items):
+        raise InvalidInput(f"{key} is {json_type(items)}, expected a list of objects")
+    return items
+
+
+def _string(document: dict[str, Any], key: str, of: str) -> str:
+    if type(text := document.get(key)) is not str:
+        raise InvalidInput(f"the {key} of {of} is {json_type(text)}, expected a string")
+    return text
+
+
+def _flag(parameters: dict[str, Any], key: str) -> bool:
+    if type(flag := parameters[key]) is not bool:
+        raise InvalidInput(f"{key} is {json_type(flag)}, expected true or false")
+    return flag
+
+
+def _parameters(document: dict[str, Any], of: str) -> dict[str, Any]:
+    parameters = document.get("parameters")
+    if parameters is None:
+        return {}
+    if type(parameters) is not dict:
+        raise InvalidInput(f"the parameters of {of} are {json_type(parameters)}, expected an object")
+    for name in UNSUPPORTED:
+        if name in parameters:
+            raise InvalidInput(f"{of} requests {name}, which this server does not support")
+    return parameters

@@ -1,0 +1,1 @@
+"""Served versions: alias watcher, version cache, hot swap, canary and shadow."""

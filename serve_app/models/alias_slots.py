@@ -1,0 +1,99 @@
+"""Holds the version that answers for each alias of each league; a hot swap replaces one reference.
+
+alias moves → load in a thread (verify, load, warm up) → swap → the old version is freed after its last request
+                                 ↘ error: the old version stays, and the error is reported
+"""
+
+import asyncio
+from collections import Counter
+
+from league.errors import LeagueError
+from league.refs import CHAMPION
+from serve_app.models.version_cache import LoadedVersion, VersionCache
+from serve_app.runtime.ray_serve import logger
+
+Alias = tuple[str, str]
+"""(league, alias)"""
+
+
+class AliasSlots:
+    """The slots of a replica. All methods run on the event loop."""
+
+    def __init__(self, versions: VersionCache) -> None:
+        self._versions = versions
+        self._slots: dict[Alias, LoadedVersion] = {}
+        self._wanted: dict[Alias, int] = {}
+        self._faults: dict[Alias, str] = {}
+        self.swaps: Counter[str] = Counter()
+        """league → number of hot swaps"""
+
+    def get(self, league: str, alias: str) -> LoadedVersion | None:
+        """The version that answers for an alias."""
+        return self._slots.get((league, alias))
+
+    def leagues(self) -> list[str]:
+        """The leagues that have an alias."""
+        return sorted({league for league, _ in self._wanted})
+
+    def knows(self, league: str) -> bool:
+        """Whether a league has an alias."""
+        return any(league == known for known, _ in self._wanted)
+
+    def champion(self, league: str) -> LoadedVersion | None:
+        """The version that answers if a request names none."""
+        return self.get(league, CHAMPION)
+
+    def numbers(self, league: str) -> dict[str, int]:
+        """alias → the version that answers for it."""
+        return {alias: version.number for (of, alias), version in self._slots.items() if of == league}
+
+    def is_served(self, alias: Alias) -> bool:
+        """Whether an alias answers with the version that it names now."""
+        return alias in self._wanted and self._serves(alias, self._wanted[alias])
+
+    def fault(self, league: str) -> str | None:
+        """Why aliases of the league are not served as the registry requires."""
+        faults = {alias: fault for (of, alias), fault in self._faults.items() if of == league}
+        return "; ".join(f"{alias}: {fault}" for alias, fault in sorted(faults.items())) or None
+
+    async def update(self, wanted: dict[Alias, int]) -> None:
+        """Make each alias answer with the version that it names now, unless that fails to load."""
+        self._wanted = wanted
+        for gone in self._slots.keys() - wanted.keys():
+            del self._slots[gone]
+        for gone in self._faults.keys() - wanted.keys():
+            del self._faults[gone]
+        self._keep_loaded()
+        late = [alias for alias, number in wanted.items() if not self._serves(alias, number)]
+        await asyncio.gather(*(self._swap(alias, wanted[alias]) for alias in late))
+        self._keep_loaded()
+
+    def _keep_loaded(self) -> None:
+        live = {(league, version.number) for (league, _), version in self._slots.items()}
+        self._versions.pin(live | {(league, number) for (league, _), number in self._wanted.items()})
+
+    def _serves(self, alias: Alias, number: int) -> bool:
+        version = self._slots.get(alias)
+        return version is not None and version.number == number and alias not in self._faults
+
+    async def _swap(self, alias: Alias, number: int) -> None:
+        league, name = alias
+        try:
+            version = await self._versions.get(league, number)
+        except LeagueError as error:
+            self._stay(alias, number, str(error))
+            return
+        if self._slots.get(alias) is not version:
+            self.swaps[league] += 1
+        self._slots[alias] = version
+        self._faults.pop(alias, None)
+        logger.info("%s@%s is now version %d", league, name, number)
+
+    def _stay(self, alias: Alias, number: int, reason: str) -> None:
+        if self._faults.get(alias) == reason:
+            return
+        self._faults[alias] = reason
+        old = self._slots.get(alias)
+        stays = f"version {old.number} stays" if old else "no version is served"
+        # Ray Serve buffers lower levels.
+        logger.error("%s@%s cannot switch to version %d, %s: %s", *alias, number, stays, reason)

@@ -1,0 +1,73 @@
+"""Polls the registry with exponential backoff."""
+
+import asyncio
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
+
+from league.errors import LeagueError
+from serve_app.runtime.ray_serve import logger
+from serve_app.settings import ServeSettings
+
+JITTER = 0.1
+"""Relative variation of a pause, so that replicas do not poll at the same time."""
+
+
+class Polling:
+    """Calls `poll` in a task on the event loop. `subject` names the polled data in log lines: `aliases`."""
+
+    def __init__(self, poll: Callable[[], Awaitable[None]], subject: str, settings: ServeSettings) -> None:
+        self._poll = poll
+        self._subject = subject
+        self._settings = settings
+        self._random = random.Random()
+        self._has_seen = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self._pause = settings.poll
+        self._fault: str | None = None
+        """The last error that was logged; None after a success."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether a poll has succeeded and the task is running."""
+        return self._has_seen.is_set() and self._task is not None and not self._task.done()
+
+    def mark_ready(self) -> None:
+        """Called by `poll` as soon as it has read the data, because later steps may fail."""
+        self._has_seen.set()
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Poll while the context is active; enters after the first `mark_ready`."""
+        self._task = asyncio.create_task(self._run())
+        try:
+            await self._has_seen.wait()
+            yield
+        finally:
+            self._task.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._task
+
+    async def _run(self) -> None:
+        while True:
+            try:
+                await self._poll()
+            except Exception as error:
+                self._back_off(error)
+            else:
+                self._recover()
+            await asyncio.sleep(self._pause * self._random.uniform(1 - JITTER, 1 + JITTER))
+
+    def _back_off(self, error: Exception) -> None:
+        """Increase the pause. Only a bug raises anything but a LeagueError; it must not stop polling."""
+        bug = None if isinstance(error, LeagueError) else error
+        if str(error) != self._fault:
+            logger.error("cannot poll %s, keeping the last known state: %s", self._subject, error, exc_info=bug)
+        self._fault = str(error)
+        self._pause = min(2 * self._pause, self._settings.poll_slowest)
+
+    def _recover(self) -> None:
+        if self._fault is not None:
+            logger.error("polling %s again", self._subject)
+        self._fault = None
+        self._pause = self._settings.poll

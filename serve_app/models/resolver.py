@@ -1,0 +1,70 @@
+"""Resolves the model and version of a request to the policy that answers it."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar
+
+from league.errors import NotReady, UnknownAlias, VersionRetired
+from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
+from league.registry.registry import Registry
+from serve_app.models.alias_slots import AliasSlots
+from serve_app.models.traffic_split import Headers, TrafficSplit
+from serve_app.models.version_cache import LoadedPolicy, LoadedVersion, VersionCache
+
+T = TypeVar("T")
+
+# Requests repeat the same few names.
+policy_ref = lru_cache(maxsize=1024)(PolicyRef.parse)
+version_of = lru_cache(maxsize=1024)(parse_version)
+
+
+class ModelResolver:
+    """Resolves models from alias slots, then the version cache, then the registry."""
+
+    def __init__(self, registry: Registry, slots: AliasSlots, versions: VersionCache, traffic: TrafficSplit) -> None:
+        self._registry = registry
+        self._slots = slots
+        self._traffic = traffic
+        self._versions = versions
+        self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="registry")
+
+    async def find(
+        self, model: str, version: str = CHAMPION, headers: Headers = ()
+    ) -> tuple[LoadedVersion, LoadedPolicy]:
+        """The version and policy of `model` (`{league}` or `{league}.{policy}`) at `version`, a number or an alias.
+
+        headers: those of the request; the caller's key may route a request for the champion to the canary. Raises
+        InvalidReference, UnknownLeague, UnknownVersion, VersionRetired, UnknownAlias, UnknownPolicy, ArtifactCorrupt or
+        StorageError; NotReady for a league without a champion.
+        """
+        ref, requested = policy_ref(model), version_of(version)
+        if isinstance(requested, int):
+            loaded = self._versions.cached(ref.league, requested) or await self._versions.get(ref.league, requested)
+        else:
+            loaded = self._slots.get(ref.league, requested) or await self._resolve(ref.league, requested)
+            if requested == CHAMPION and self._traffic.canaries:
+                loaded = self._traffic.route(loaded, headers)
+        return loaded, loaded.policy(ref.policy)
+
+    async def query(self, function: Callable[[Registry], T]) -> T:
+        """Query the registry in a thread."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, self._registry)
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def _resolve(self, league: str, alias: str) -> LoadedVersion:
+        """Resolve an alias without a slot: unknown, created since the last poll, or impossible to load."""
+        try:
+            row = await self.query(lambda registry: registry.versions.resolve(CheckpointRef(league, alias)))
+        except UnknownAlias as error:
+            if alias != CHAMPION:
+                raise
+            raise NotReady(f"league {league} has no champion: promote a version first") from error
+        try:
+            return await self._versions.get(league, row.number)
+        except VersionRetired as error:
+            raise NotReady(f"{league}@{alias} names a retired version: {row.number}") from error

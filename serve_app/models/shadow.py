@@ -1,0 +1,248 @@
+"""Mirrors requests that the champion has answered to a candidate, and compares their actions.
+
+    request → champion → reply
+                 ↘ bounded queue → thread: candidate → same action? latency? → counts
+
+Callers are unaffected. Requests are batched in a thread that pauses between batches to stay within its share of a core;
+requests that exceed it are dropped and counted. The first request of a batch runs alone and is timed in CPU time, so
+that neither other requests nor waiting for the GIL count as the candidate's latency.
+"""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from random import random
+from time import thread_time_ns
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.errors import one_line
+from league.histograms import Histogram
+from league.policies.policy import Arrays
+from league.policies.probes import same
+from league.registry.storage.rows import ShadowCounts
+from serve_app.models.alias_slots import AliasSlots
+from serve_app.models.resolver import policy_ref
+from serve_app.models.traffic_split import TrafficSplit
+from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.runtime.ray_serve import logger
+from serve_app.settings import ServeSettings
+
+BATCH_WINDOW = 0.05
+"""Seconds for which requests are collected. Fewer wake-ups take less time from the event loop."""
+TOLERANCE = 0.01
+"""Continuous actions are equal if they differ by less than this share of their range."""
+MAX_WAITING_BYTES = 16 * 2**20
+"""Maximum size of queued observations."""
+MAX_ROWS = 256
+"""Maximum observations per batch, unless one request has more."""
+
+MirrorFunction = Callable[[Arrays, Arrays | None, NDArray | None], None]
+"""Takes the observations of a request, its recurrent state, and the champion's greedy actions, or None if the champion
+explored."""
+
+
+class MirroredRequest(NamedTuple):
+    """A queued request."""
+
+    candidate: LoadedVersion
+    champion: LoadedVersion
+    policy: str | None
+    observations: Arrays
+    actions: NDArray | None
+
+
+@dataclass(slots=True)
+class Tally:
+    """Running counts of a candidate compared with a champion; see league.registry.storage.rows.ShadowCounts."""
+
+    requests: int = 0
+    observations: int = 0
+    agreed: int = 0
+    failed: int = 0
+    dropped: int = 0
+    skipped: int = 0
+    latency: Histogram = field(default_factory=Histogram)
+
+
+@dataclass(slots=True)
+class ShadowResult:
+    """The result of requests for one policy of one candidate and champion."""
+
+    pair: tuple[str, int, int]
+    requests: int = 0
+    observations: int = 0
+    agreed: int = 0
+    failed: int = 0
+    ns: int | None = None
+    """CPU time of a request that ran alone."""
+    fault: str | None = None
+
+
+class Shadow:
+    """Mirrors requests to candidates. All methods run on the event loop."""
+
+    def __init__(self, slots: AliasSlots, traffic: TrafficSplit, settings: ServeSettings) -> None:
+        self._slots = slots
+        self._traffic = traffic
+        self._settings = settings
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="shadow")
+        self._counts: dict[tuple[str, int, int], Tally] = {}
+        self._waiting: list[MirroredRequest] = []
+        self._bytes = 0
+        self._is_scheduled = False
+
+    def mirror_for(self, model: str, version: LoadedVersion) -> MirrorFunction | None:
+        """The function that mirrors a request of `model` answered by `version`; None if it is not mirrored."""
+        target = self._traffic.shadows.get(version.league)
+        if target is None or (target.share < 1 and random() >= target.share):
+            return None
+        candidate = self._slots.get(version.league, target.slot)
+        if candidate is None or candidate is version or version is not self._slots.champion(version.league):
+            return None
+        policy = policy_ref(model).policy
+
+        def mirror(observations: Arrays, state: Arrays | None, actions: NDArray | None) -> None:
+            self._enqueue(MirroredRequest(candidate, version, policy, observations, actions), is_first=state is None)
+
+        return mirror
+
+    def shadowings(self) -> list[ShadowCounts]:
+        """All counts since this replica started."""
+        return [
+            ShadowCounts(
+                *pair,
+                counts.requests,
+                counts.observations,
+                counts.agreed,
+                counts.failed,
+                counts.dropped,
+                counts.skipped,
+                tuple(counts.latency.counts),
+                counts.latency.ns,
+            )
+            for pair, counts in sorted(self._counts.items())
+        ]
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def _enqueue(self, request: MirroredRequest, is_first: bool) -> None:
+        """Queue a request. is_first: whether it has no recurrent state, which would be another network's."""
+        counts = self._counts_of(_pair(request))
+        if not is_first:
+            counts.skipped += 1
+            return
+        size = sum(array.nbytes for array in request.observations.values())
+        if len(self._waiting) >= self._settings.shadow_waiting or self._bytes + size > MAX_WAITING_BYTES:
+            counts.dropped += 1
+            return
+        self._waiting.append(request)
+        self._bytes += size
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            asyncio.get_running_loop().call_later(BATCH_WINDOW, self._start_batch)
+
+    def _start_batch(self) -> None:
+        requests, self._waiting, self._bytes = self._waiting, [], 0
+        if not requests:
+            self._is_scheduled = False
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            computing = loop.run_in_executor(self._thread, compare, requests)
+        except RuntimeError:  # closed in the meantime
+            return
+        computing.add_done_callback(self._finish_batch)
+
+    def _finish_batch(self, computing: asyncio.Future[tuple[list[ShadowResult], float]]) -> None:
+        if computing.cancelled():
+            return
+        outcomes, seconds = computing.result()
+        for outcome in outcomes:
+            counts = self._counts_of(outcome.pair)
+            if outcome.fault is not None and not counts.failed:
+                logger.error("%s@%d failed to answer a mirrored request: %s", *outcome.pair[:2], outcome.fault)
+            counts.requests += outcome.requests
+            counts.observations += outcome.observations
+            counts.agreed += outcome.agreed
+            counts.failed += outcome.failed
+            if outcome.ns is not None:
+                counts.latency.add(outcome.ns)
+        rest = max(BATCH_WINDOW, seconds * (1 / self._settings.shadow_load - 1))
+        asyncio.get_running_loop().call_later(rest, self._start_batch)
+
+    def _counts_of(self, pair: tuple[str, int, int]) -> Tally:
+        if (counts := self._counts.get(pair)) is None:
+            counts = self._counts[pair] = Tally()
+        return counts
+
+
+def compare(requests: Sequence[MirroredRequest]) -> tuple[list[ShadowResult], float]:
+    """Run candidates on requests; returns the results and the CPU time in seconds."""
+    begun = thread_time_ns()
+    alike: dict[tuple[int, int, str | None], list[MirroredRequest]] = {}
+    for request in requests:
+        alike.setdefault((id(request.candidate), id(request.champion), request.policy), []).append(request)
+    outcomes = []
+    for group in alike.values():
+        first, rest = group[:1], group[1:]
+        outcomes.append(_compare_batch(first, is_timed=True))
+        outcomes += [_compare_batch(part, is_timed=False) for part in _batches(rest)]
+    return outcomes, (thread_time_ns() - begun) / 1e9
+
+
+def _batches(requests: Sequence[MirroredRequest]) -> list[list[MirroredRequest]]:
+    """Requests in batches of at most MAX_ROWS, in order."""
+    parts: list[list[MirroredRequest]] = []
+    rows = MAX_ROWS
+    for request in requests:
+        if (rows := rows + _rows(request)) > MAX_ROWS:
+            parts.append([])
+            rows = _rows(request)
+        parts[-1].append(request)
+    return parts
+
+
+def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> ShadowResult:
+    outcome = ShadowResult(_pair(requests[0]))
+    try:
+        candidate = requests[0].candidate.policy(requests[0].policy)
+        observations = _concatenate([request.observations for request in requests])
+        begun = thread_time_ns()
+        actions = candidate.policy.act(observations).actions
+        taken = thread_time_ns() - begun
+        expected = _champion_actions(requests, requests[0].champion.policy(requests[0].policy), observations)
+        outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
+    except Exception as error:  # any failure is counted against the candidate
+        outcome.failed, outcome.fault = len(requests), one_line(error, with_type=True)
+        return outcome
+    outcome.requests, outcome.observations = len(requests), len(actions)
+    outcome.ns = taken if is_timed else None
+    return outcome
+
+
+def _champion_actions(requests: Sequence[MirroredRequest], champion: LoadedPolicy, observations: Arrays) -> NDArray:
+    """The champion's greedy actions, recomputed if it explored."""
+    known = [request.actions for request in requests if request.actions is not None]
+    if len(known) < len(requests):
+        return champion.policy.act(observations).actions
+    return np.concatenate(known)
+
+
+def _concatenate(batches: Sequence[Arrays]) -> Arrays:
+    if len(batches) == 1:
+        return batches[0]
+    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+
+
+def _rows(request: MirroredRequest) -> int:
+    return len(next(iter(request.observations.values())))
+
+
+def _pair(request: MirroredRequest) -> tuple[str, int, int]:
+    return request.champion.league, request.candidate.number, request.champion.number

@@ -1,0 +1,104 @@
+"""Splits traffic of a league between champion and canary, and selects the shadow.
+
+The alias watcher reads the settings from the registry. The version of a canary or shadow has a slot like any alias; a
+version that is named by number has a slot under that number, which is not a valid alias.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from league.refs import CHAMPION
+from league.registry.storage.rows import Portion
+from league.registry.storage.rows import Traffic as Setting
+from serve_app.models.alias_slots import Alias, AliasSlots
+from serve_app.models.version_cache import LoadedVersion
+
+KEY = b"x-league-key"
+"""Header that names what must stay with one version, such as a player or an episode."""
+Headers = Iterable[tuple[bytes, bytes]]
+
+
+class SplitTarget(NamedTuple):
+    """A slot and its share of requests."""
+
+    slot: str
+    share: float
+
+
+class TrafficSplit:
+    """The traffic settings that a replica applies. All methods run on the event loop."""
+
+    def __init__(self, slots: AliasSlots) -> None:
+        self._slots = slots
+        self._settings: dict[str, Setting] = {}
+        self.canaries: dict[str, SplitTarget] = {}
+        """league → its canary"""
+        self.shadows: dict[str, SplitTarget] = {}
+        """league → its shadow"""
+        self.canary_requests: Counter[tuple[str, int]] = Counter()
+        """(league, version) → requests answered as canary"""
+
+    def update(self, settings: Mapping[str, Setting]) -> None:
+        """Apply these settings from now on."""
+        self._settings = dict(settings)
+        self.canaries = _targets({league: setting.canary for league, setting in settings.items()})
+        self.shadows = _targets({league: setting.shadow for league, setting in settings.items()})
+
+    def applied_setting(self, league: str) -> int | None:
+        """The id of the league's setting, once all versions that it names are loaded."""
+        setting = self._settings.get(league)
+        if setting is None or any(not self._slots.is_served(slot) for slot in slots(setting)):
+            return None
+        return setting.id
+
+    def route(self, champion: LoadedVersion, headers: Headers) -> LoadedVersion:
+        """The version that answers a request for a champion: the champion, or the canary if the caller's key is in its
+        share.
+        """
+        league = champion.league
+        target = self.canaries.get(league)
+        if target is None:
+            return champion
+        key = next((value for name, value in headers if name == KEY), None)
+        if key is None or key_position(league, key) >= target.share:
+            return champion
+        canary = self._slots.get(league, target.slot)
+        if canary is None:
+            return champion
+        self.canary_requests[league, canary.number] += 1
+        return canary
+
+
+def slots(setting: Setting) -> dict[Alias, int | None]:
+    """The slots that a setting requires → the number of a version that only the setting names."""
+    portions = [portion for portion in (setting.canary, setting.shadow) if portion is not None]
+    return {
+        (setting.league, str(portion.version)): portion.version if isinstance(portion.version, int) else None
+        for portion in portions
+    }
+
+
+def pinned_slots(settings: Mapping[str, Setting]) -> dict[Alias, int]:
+    """The slots of versions that settings name by number."""
+    needed = (slots(setting) for setting in settings.values())
+    return {slot: number for each in needed for slot, number in each.items() if number is not None}
+
+
+def key_position(league: str, key: bytes) -> float:
+    """Position of a key among all keys of a league, in [0, 1); keys below the canary's share go to the canary.
+
+    It depends on league and key only, so a key keeps its side while the share is unchanged, and a larger share only
+    adds keys.
+    """
+    digest = hashlib.blake2b(league.encode() + b"\0" + key, digest_size=8).digest()
+    return int.from_bytes(digest[:6], "big") / 2**48  # exact as a double, so the result is less than 1
+
+
+def _targets(portions: Mapping[str, Portion | None]) -> dict[str, SplitTarget]:
+    return {
+        league: SplitTarget(str(portion.version), portion.share)
+        for league, portion in portions.items()
+        if portion is not None and portion.share and portion.version != CHAMPION
+    }

@@ -1,0 +1,190 @@
+"""Loads versions from the artefact store, verifies their probes, and caches them."""
+
+import asyncio
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Set
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from league.errors import ArtifactCorrupt, InvalidInput, UnknownPolicy, VersionRetired
+from league.policies.onnx import OnnxPolicy
+from league.policies.policy import Policy
+from league.policies.probes import Probes
+from league.registry.registry import Registry
+from league.registry.storage.manifest import PolicyManifest
+from league.spaces import Box, Leaf
+from serve_app.codecs.observation_codec import ObservationReader
+
+WARM_BATCH = 64
+"""Large enough to measure the time per row, small enough to run in milliseconds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class LoadedPolicy:
+    """One policy, ready for inference."""
+
+    policy: OnnxPolicy
+    manifest: PolicyManifest
+    reader: ObservationReader
+    state: tuple[tuple[str, Leaf], ...]
+    """Recurrent inputs; empty for a feed-forward policy."""
+    inline_rows: int
+    """The largest batch that is fast enough to run on the event loop."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedVersion:
+    """A version of a league, verified, loaded and warmed up."""
+
+    league: str
+    number: int
+    sha256: str
+    """Digest of the version's manifest.json, which contains the digests of all its files."""
+    policies: dict[str, LoadedPolicy]
+
+    def policy(self, name: str | None) -> LoadedPolicy:
+        """A policy by name; None selects the only policy. Raises UnknownPolicy."""
+        if name is None and len(self.policies) == 1:
+            return next(iter(self.policies.values()))
+        if name not in self.policies:
+            problem = f"has no policy {name!r}" if name else f"has several policies: request {self.league}.POLICY"
+            raise UnknownPolicy(f"{self.league}@{self.number} {problem}; known: {', '.join(self.policies)}")
+        return self.policies[name]
+
+    def model(self, policy: LoadedPolicy) -> str:
+        """`{league}.{policy}`, the name of one of its policies."""
+        return f"{self.league}.{next(name for name, one in self.policies.items() if one is policy)}"
+
+
+def load(registry: Registry, league: str, number: int, inline: float) -> LoadedVersion:
+    """Load a version. Blocks; `inline` is the time in seconds that inference may take on the event loop.
+
+    Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
+    """
+    version = registry.versions.get(league, number)
+    if registry.artifacts.is_purged(league, number):
+        raise VersionRetired(
+            f"{version.ref} was retired and its files were removed: start a new episode with another version"
+        )
+    registry.artifacts.verify(league, number, version.sha256)
+    policies = {}
+    for name, manifest in version.manifest.policies.items():
+        # Verify again while reading: the file may have changed since.
+        graph = registry.artifacts.read(version.manifest, manifest.file)
+        policy = OnnxPolicy(graph, manifest)
+        if manifest.probes is not None:
+            probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
+            probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
+        try:
+            policies[name] = _warm_up(policy, manifest, inline)
+        except InvalidInput as error:
+            raise ArtifactCorrupt(f"policy {name} of {version.ref} does not run: {error}") from error
+    return LoadedVersion(league, number, version.sha256, policies)
+
+
+def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float) -> LoadedPolicy:
+    """Run the graph to allocate its memory, and measure how many rows fit into `inline` seconds."""
+    reader = ObservationReader(manifest.observation)
+    one, many = (_measure(policy, reader, rows) for rows in (1, WARM_BATCH))
+    per_row = max(many - one, 1e-9) / (WARM_BATCH - 1)
+    rows = 0 if one > inline else 1 + int((inline - one) / per_row)
+    state = tuple(
+        (tensor.name, Box(dtype=tensor.dtype, shape=_sizes(tensor.shape[1:]), low=None, high=None))
+        for tensor in manifest.state
+    )
+    return LoadedPolicy(policy, manifest, reader, state, rows)
+
+
+def _measure(policy: Policy, reader: ObservationReader, rows: int) -> float:
+    """Seconds of the fastest of a few runs: slower ones shared the processor."""
+    observations = reader.zeros(rows)
+    taken = []
+    for _ in range(4):
+        start = time.perf_counter()
+        policy.act(observations)
+        taken.append(time.perf_counter() - start)
+    return float(np.min(taken))
+
+
+def _sizes(shape: tuple[int | None, ...]) -> tuple[int, ...]:
+    assert None not in shape, "only the batch dimension is dynamic"
+    return tuple(size for size in shape if size is not None)
+
+
+VersionKey = tuple[str, int]
+"""(league, number)"""
+
+
+class VersionCache:
+    """Loads versions in threads, each only once at a time, and keeps up to `capacity` versions that are not pinned.
+
+    load: blocks; raises LeagueError. retry: seconds until a corrupt version is tried again. All methods run on the
+    event loop.
+    """
+
+    def __init__(self, load: Callable[[str, int], LoadedVersion], capacity: int, retry: float) -> None:
+        self._load = load
+        self._capacity = capacity
+        self._retry = retry
+        self._threads = ThreadPoolExecutor(max_workers=2, thread_name_prefix="load")
+        self._loaded: OrderedDict[VersionKey, LoadedVersion] = OrderedDict()
+        self._pinned: set[VersionKey] = set()
+        self._loading: dict[VersionKey, asyncio.Task[LoadedVersion]] = {}
+        self._corrupt: dict[VersionKey, tuple[float, ArtifactCorrupt]] = {}
+
+    def pin(self, pinned: set[VersionKey]) -> None:
+        """Replace the versions that must stay in memory, whether loaded yet or not."""
+        self._pinned = pinned
+        self._evict()
+
+    def cached(self, league: str, number: int) -> LoadedVersion | None:
+        """A version if it is in memory; marks it as used."""
+        if (version := self._loaded.get((league, number))) is not None:
+            self._loaded.move_to_end((league, number))
+        return version
+
+    def cached_keys(self) -> Set[VersionKey]:
+        """The versions in memory, without marking them as used."""
+        return self._loaded.keys()
+
+    async def get(self, league: str, number: int) -> LoadedVersion:
+        """A version, loaded if necessary. Raises UnknownLeague, UnknownVersion, ArtifactCorrupt or StorageError."""
+        if (version := self.cached(league, number)) is not None:
+            return version
+        key = (league, number)
+        self._refuse_corrupt(key)
+        task = self._loading.get(key)
+        if task is None:
+            task = self._loading[key] = asyncio.create_task(self._fill(key))
+            task.add_done_callback(lambda _: self._loading.pop(key, None))
+        # Another caller may wait for the same version when this one is cancelled.
+        return await asyncio.shield(task)
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def _fill(self, key: VersionKey) -> LoadedVersion:
+        try:
+            version = await asyncio.get_running_loop().run_in_executor(self._threads, self._load, *key)
+        except ArtifactCorrupt as error:
+            self._corrupt[key] = (time.monotonic() + self._retry, error)
+            raise
+        self._loaded[key] = version
+        self._evict()
+        return version
+
+    def _evict(self) -> None:
+        spare = [key for key in self._loaded if key not in self._pinned]
+        for key in spare[: max(0, len(spare) - self._capacity)]:
+            del self._loaded[key]
+
+    def _refuse_corrupt(self, key: VersionKey) -> None:
+        now = time.monotonic()
+        self._corrupt = {known: fault for known, fault in self._corrupt.items() if fault[0] > now}
+        if key in self._corrupt:
+            error = self._corrupt[key][1]
+            raise type(error)(*error.args)

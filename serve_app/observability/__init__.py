@@ -1,0 +1,1 @@
+"""Metrics of replicas: counting, reporting to the registry, and the Prometheus format."""

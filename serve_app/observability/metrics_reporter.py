@@ -1,0 +1,122 @@
+"""Writes a replica's metrics and request rates to the registry."""
+
+import asyncio
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from time import monotonic
+
+from league.errors import LeagueError
+from league.registry.registry import Registry
+from league.registry.storage.rows import ShadowCounts
+from serve_app.models.alias_watcher import SHUTDOWN_TIMEOUT
+from serve_app.models.polling import Polling
+from serve_app.models.shadow import Shadow
+from serve_app.observability.metrics import Metrics, Report, Samples
+from serve_app.settings import ServeSettings
+
+SECONDS = "league_request_seconds"
+RATE = "league_requests_per_second"
+
+
+@dataclass(frozen=True, slots=True)
+class RequestCounts:
+    """Requests of one league, over all replicas that report."""
+
+    count: int = 0
+    """Since the replicas started."""
+    rate: float = 0.0
+    """Per second, between their last two reports."""
+
+
+class RequestRates:
+    """Request rates of a replica between reports."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._at = monotonic()
+
+    def since_last(self, report: Report) -> Samples:
+        """league → requests per second since the last call."""
+        counts, now = _counts(report), monotonic()
+        seconds = max(now - self._at, 1e-3)
+        # Counts of policies that were not used for long are dropped.
+        rates: Samples = [
+            [[league], max(count - self._counts[league], 0) / seconds] for league, count in counts.items()
+        ]
+        self._counts, self._at = counts, now
+        return rates
+
+
+def request_counts(reports: Iterable[Report]) -> dict[str, RequestCounts]:
+    """league → its requests, for leagues with any."""
+    counts: Counter[str] = Counter()
+    rates: Counter[str] = Counter()
+    for report in reports:
+        counts += _counts(report)
+        for (league,), rate in report.get(RATE, ()):
+            rates[league] += rate
+    return {league: RequestCounts(count, float(rates[league])) for league, count in counts.items()}
+
+
+def _counts(report: Report) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for (league, *_), value in report.get(SECONDS, ()):
+        counts[league] += sum(value["counts"])
+    return counts
+
+
+class MetricsReporter:
+    """Reports in its own task, so that no report delays a promotion. Counting continues while the database is
+    unavailable.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        metrics: Metrics,
+        shadow: Shadow,
+        in_flight: Callable[[], dict[str, int]],
+        replica: str,
+        settings: ServeSettings,
+    ) -> None:
+        self._registry = registry
+        self._metrics = metrics
+        self._shadow = shadow
+        self._in_flight = in_flight
+        self._replica = replica
+        slowest = max(settings.heartbeat, settings.poll_slowest)
+        pace = settings.model_copy(update={"poll": settings.heartbeat, "poll_slowest": slowest})
+        self._polling = Polling(self.report, "reports", pace)
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="report")
+        self._rates = RequestRates()
+        self._written: dict[tuple[str, int, int], ShadowCounts] = {}
+
+    @asynccontextmanager
+    async def reporting(self) -> AsyncIterator[None]:
+        """Report while the context is active, and once more on exit."""
+        try:
+            async with self._polling.running():
+                yield
+        finally:
+            with suppress(LeagueError, TimeoutError):
+                await asyncio.wait_for(self.report(), SHUTDOWN_TIMEOUT)
+            self._thread.shutdown(wait=False, cancel_futures=True)
+
+    async def report(self) -> None:
+        """Write all metrics, and the shadow counts that changed. Raises StorageError."""
+        self._polling.mark_ready()
+        self._metrics.in_flight = self._in_flight()
+        shadowings = [
+            one
+            for one in self._shadow.shadowings()
+            if self._written.get((one.league, one.candidate, one.champion)) != one
+        ]
+        report = self._metrics.report()
+        report |= {RATE: self._rates.since_last(report)}
+        write = partial(self._registry.replicas.write_report, self._replica, report, shadowings)
+        await asyncio.get_running_loop().run_in_executor(self._thread, write)
+        self._written |= {(one.league, one.candidate, one.champion): one for one in shadowings}

@@ -1,0 +1,35 @@
+// One step of a game: its picture, the moves, and the probabilities of the actions.
+
+import { html } from "./vendor/preact-htm.js";
+import { percent, shortRef } from "./format.js";
+
+/** The reference of the user in a game against a policy. */
+const PERSON = "person";
+
+export function Picture({ src, alt, children }) {
+  return html`<div class="picture">${src
+    ? html`<img src=${src} alt=${alt} />`
+    : html`<p class="blank muted">This environment does not render pictures.</p>`}${children}</div>`;
+}
+
+/** The moves of a step as text. */
+export function describe(step) {
+  if (!step) return "";
+  if (!step.moves.length) return step.step === 0 ? "Start of the game." : "No moves.";
+  return step.moves.map((move) => `${move.agent} plays ${move.action}`).join("; ") + (step.opening ? " (random opening)" : "");
+}
+
+/** The moves of a step with their probabilities. */
+export function Moves({ step }) {
+  if (!step?.moves.length) return html`<p class="muted">${describe(step)}</p>`;
+  return html`<ul class="moves">${step.moves.map((move) => html`<li key=${move.agent}>
+    <p><strong>${move.agent}</strong> <span class="muted ref">${move.ref === PERSON ? "you" : shortRef(move.ref)}</span> plays <strong>${String(move.action)}</strong>${step.opening && html`<span class="muted"> · random opening</span>`}</p>
+    ${move.chances?.length > 0 && html`<${Probabilities} values=${move.chances} taken=${move.action} />`}</li>`)}</ul>`;
+}
+
+/** Probabilities of actions, as bars with numbers. `values`: [action, probability] pairs. */
+export function Probabilities({ values, taken }) {
+  return html`<ul class="probabilities" aria-label="Probabilities">${values.map(([action, probability]) => html`
+    <li class=${String(action) === String(taken) ? "taken" : ""}><span class="action">${String(action)}</span>
+      <progress max="1" value=${probability} aria-hidden="true"></progress><span class="value">${percent(probability, probability < 0.1 ? 1 : 0)}</span></li>`)}</ul>`;
+}

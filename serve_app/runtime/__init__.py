@@ -1,0 +1,1 @@
+"""Integration with Ray Serve, uvicorn and HAProxy, including all uses of their internals."""

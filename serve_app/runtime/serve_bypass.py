@@ -1,0 +1,57 @@
+"""Bypasses Ray Serve's request path for inference.
+
+    HAProxy → uvicorn ┬→ /v1/policies/…, /v2/models/…, …/events → the application
+                      └→ other paths → Ray Serve → the application
+
+Serve's work per request takes as long as everything else together, and inference needs none of it: it finishes before
+it could be cancelled, and the routes limit concurrency themselves. A server that stops finishes requests in progress
+and closes streams with 1012. Event streams bypass Serve because it would wait for them to end.
+
+RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH names `middlewares`; without it, all requests go through Serve.
+"""
+
+import re
+
+from starlette.middleware import Middleware
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+INFERENCE_PREFIXES = ("/v1/policies/", "/v2/models/")
+"""Paths of actions, streams and the Open Inference Protocol."""
+EVENT_STREAM_PATH = re.compile("/v1/leagues/[^/]+/(evaluations/[^/]+/)?events")
+"""Paths of event streams."""
+PROTOCOLS = ("http", "websocket")
+_application: ASGIApp | None = None
+
+
+def install(application: ASGIApp) -> None:
+    """Send requests that bypass Serve in this process to `application`."""
+    global _application
+    _application = application
+
+
+def middlewares() -> list[Middleware]:
+    """ASGI middlewares of every replica, and of Serve's own proxies, where nothing is installed."""
+    return [Middleware(ServeBypass)]
+
+
+class ServeBypass:
+    """Sends inference requests to the application of this process, and others to Ray Serve."""
+
+    def __init__(self, onward: ASGIApp) -> None:
+        self._onward = onward
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Dispatch a request."""
+        if _application is not None and scope["type"] in PROTOCOLS and _bypasses_serve(scope["path"]):
+            await _application(scope, receive, send)
+        else:
+            await self._onward(scope, receive, send)
+
+
+def is_event_stream(path: str) -> bool:
+    """Whether a path is that of an event stream, which has no end of its own."""
+    return path.endswith("/events") and EVENT_STREAM_PATH.fullmatch(path) is not None
+
+
+def _bypasses_serve(path: str) -> bool:
+    return path.startswith(INFERENCE_PREFIXES) or is_event_stream(path)

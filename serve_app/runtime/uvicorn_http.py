@@ -1,0 +1,128 @@
+"""uvicorn's HTTP protocol with batched accepts, notification of shutdown, and the length of the accept queue.
+
+uvloop accepts one connection per turn of the event loop, and a turn handles the requests of all open connections. If
+many clients connect at once with slow requests, the last one would wait for minutes. Therefore each new connection
+accepts all others that wait.
+
+A server that stops finishes requests in progress. Event streams are notified so that they end.
+"""
+
+import asyncio
+import os
+import socket
+import stat
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+from weakref import WeakKeyDictionary
+
+from uvicorn.config import Config
+from uvicorn.protocols.http import auto
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.server import ServerState
+
+TCP_INFO_BYTES = 28
+UNACKED = slice(24, 28)
+"""Offset of `tcpi_unacked` in struct tcp_info (linux/tcp.h): for a listening socket, the length of its accept queue."""
+
+
+class AcceptQueue:
+    """The accept queue of the socket of this process that listens on a port; always empty if there is none."""
+
+    __slots__ = ("_listener",)
+
+    def __init__(self, port: int) -> None:
+        self._listener = _listener(port)
+
+    def __del__(self) -> None:
+        if self._listener is not None:
+            self._listener.detach()
+
+    def length(self) -> int:
+        """Number of waiting connections. Takes about a microsecond."""
+        if self._listener is None:
+            return 0
+        try:
+            info = self._listener.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO_BYTES)
+        except OSError:  # no longer listening
+            return 0
+        return int.from_bytes(info[UNACKED], "little")
+
+    def take(self) -> socket.socket | None:
+        """Accept the next connection without blocking; None if there is none."""
+        if self._listener is None:
+            return None
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # none waits, or no longer listening
+            return None
+        connection.setblocking(False)
+        return connection
+
+
+def _listener(port: int) -> socket.socket | None:
+    """The socket itself. A duplicate would keep listening after its owner has closed it."""
+    with suppress(OSError, AttributeError):  # no /proc, no TCP_INFO: not Linux
+        for entry in Path("/proc/self/fd").iterdir():
+            with suppress(OSError):
+                if stat.S_ISSOCK(entry.stat().st_mode) and _listens(int(entry.name), port):
+                    return socket.socket(fileno=int(entry.name))
+    return None
+
+
+def _listens(number: int, port: int) -> bool:
+    with socket.socket(fileno=os.dup(number)) as copy:
+        is_tcp = copy.family in (socket.AF_INET, socket.AF_INET6) and copy.type == socket.SOCK_STREAM
+        return (
+            is_tcp and copy.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1 and copy.getsockname()[1] == port
+        )
+
+
+_queues: "WeakKeyDictionary[ServerState, AcceptQueue]" = WeakKeyDictionary()
+"""Accept queue of each server of this process."""
+
+
+def install(when_stopping: Callable[[], None]) -> None:
+    """Make this the default HTTP protocol of uvicorn servers in this process, including Ray Serve's.
+
+    when_stopping: called for each open connection when the server stops.
+    """
+    auto.AutoHTTPProtocol = partial(HttpProtocol, when_stopping)  # type: ignore[assignment]
+
+
+class HttpProtocol(HttpToolsProtocol):
+    """The protocol of one connection."""
+
+    def __init__(
+        self,
+        when_stopping: Callable[[], None],
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._when_stopping = when_stopping
+
+    def shutdown(self) -> None:
+        """Finish the request in progress."""
+        super().shutdown()
+        self._when_stopping()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Start this connection, and accept those that wait."""
+        super().connection_made(cast(asyncio.Transport, transport))
+        if self.server is None or self.server[1] is None:
+            return
+        queue = _queues.get(self.server_state)
+        if queue is None:
+            queue = _queues[self.server_state] = AcceptQueue(self.server[1])
+        while (connection := queue.take()) is not None:
+            begun = self.loop.create_task(self.loop.connect_accepted_socket(self._another, connection))
+            self.server_state.tasks.add(begun)  # type: ignore[arg-type]
+            begun.add_done_callback(self.server_state.tasks.discard)
+
+    def _another(self) -> "HttpProtocol":
+        return HttpProtocol(self._when_stopping, self.config, self.server_state, self.app_state, self.loop)

@@ -1,0 +1,312 @@
+"""uvicorn's WebSocket protocol with a fast path: a message is answered within the call that received it.
+
+uvicorn passes messages to the application through a queue, which costs more than an inference. Here complete frames are
+cut from the received data; single-frame messages go directly to the message handler. Everything else (handshake,
+control frames, fragments, protocol errors) goes to uvicorn's protocol, which uses the websockets library. Compression
+is disabled: it would cost more than the rest. While a message is being answered or the client does not read, nothing is
+read from the connection either, which gives backpressure.
+"""
+
+import asyncio
+import struct
+from collections.abc import Generator
+from functools import partial
+from typing import Any, NamedTuple, Protocol, cast
+
+from uvicorn.config import Config
+from uvicorn.protocols.websockets import auto
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from uvicorn.server import ServerState
+from websockets.frames import Frame
+from websockets.http11 import Request
+from websockets.protocol import State
+from websockets.speedups import apply_mask
+
+from serve_app.runtime.timeouts import resume
+
+STREAM_PROTOCOL = "league.direct"
+"""Name of the ASGI extension with the protocol of this connection, which takes a message handler."""
+TEXT, BINARY = 0x81, 0x82
+"""First byte of a single-frame message (RFC 6455, section 5.2)."""
+DATA_FRAMES = (TEXT, BINARY)
+MASKED = 0x80
+"""Bit of the second byte; the other bits are the length, or 126 or 127 if it follows in 16 or 64 bits."""
+LENGTH_16, LENGTH_64 = struct.Struct(">H"), struct.Struct(">Q")
+SWITCHING = 101
+MAX_MESSAGES_PER_TURN = 16
+"""Messages of one connection that are answered before other connections get a turn."""
+CLOSE_TIMEOUT = 2.0
+"""Seconds for a client to answer a close frame and read earlier messages."""
+SERVICE_RESTART = 1012
+
+
+class StreamMessage(NamedTuple):
+    """A message of a stream."""
+
+    data: bytes
+    is_text: bool
+
+
+class CloseStream(Exception):
+    """Raised to close the stream with a WebSocket close code."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason[:120]
+
+
+class MessageHandler(Protocol):
+    """Answers the messages of a connection."""
+
+    async def answer(self, data: bytes, is_text: bool) -> StreamMessage:
+        """The answer to a message. Raises CloseStream."""
+
+    def closing_message(self) -> StreamMessage | None:
+        """The last message before the server closes the connection, or None."""
+
+
+def install(max_size: int) -> None:
+    """Make this the default WebSocket protocol of uvicorn servers in this process, including Ray Serve's.
+
+    max_size: maximum size of a message in bytes.
+    """
+    auto.AutoWebSocketsProtocol = partial(StreamWebSocketProtocol, max_size)
+
+
+class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
+    """The WebSocket protocol of one connection."""
+
+    def __init__(
+        self,
+        max_size: int,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        config.ws_max_size, config.ws_per_message_deflate = max_size, False
+        super().__init__(config, server_state, app_state, _loop)
+        self._max_size = max_size
+        self._stream: MessageHandler | None = None
+        self._pending = bytearray()
+        """Received data that was not processed yet: a partial frame, or messages that wait."""
+        self._is_busy = False
+        """Whether a message is being answered, or other connections have their turn."""
+        self._writes: list[bytes] = []
+
+    def set_handler(self, stream: MessageHandler) -> None:
+        """Pass messages to `stream` from now on."""
+        self._stream = stream
+        self._resume()
+
+    def handle_connect(self, event: Request) -> None:
+        """Offer this protocol to the application as an extension."""
+        super().handle_connect(event)
+        if self.response.status_code == SWITCHING:
+            cast(dict[str, Any], self.scope["extensions"])[STREAM_PROTOCOL] = self
+
+    def data_received(self, data: bytes) -> None:
+        """Answer complete messages."""
+        if not self.handshake_initiated or not self._is_open_or_pending:
+            super().data_received(data)
+        elif self._pending or self._is_held:
+            self._pending += data
+            if not self._is_held:
+                self._work(self._pending)
+            elif self._stream is None:
+                self.transport.pause_reading()  # until the handshake is complete: clients must not send before
+        else:
+            self._work(data)
+
+    def send_receive_event_to_app(self) -> None:
+        """Answer a message that was fragmented, or that the library had to parse."""
+        data, self.frames = b"".join(self.frames), []
+        if not self.close_sent:
+            self._handle_message(data, self.curr_msg_data_type == "text")
+
+    def pause_writing(self) -> None:
+        """The client does not read."""
+        super().pause_writing()
+        self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """The client reads again."""
+        super().resume_writing()
+        self._resume()
+
+    def handle_close(self, event: Frame) -> None:
+        """Handle a close frame of the client."""
+        super().handle_close(event)
+        self._abort_later()
+
+    def keepalive_timeout(self) -> None:
+        """The client does not answer pings."""
+        super().keepalive_timeout()
+        self._abort_later()
+
+    def handle_parser_exception(self) -> None:
+        """Close after a protocol error or an oversized message, and wait for the client to disconnect."""
+        if self.close_sent:
+            return  # already closing
+        self.stop_keepalive()
+        close = self.conn.close_sent
+        assert close is not None
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        if self.transport.can_write_eof():  # not over TLS
+            self.transport.write_eof()
+        self.close_sent = True
+        self._abort_later()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": close.code, "reason": close.reason})
+
+    def shutdown(self) -> None:
+        """Send the client what it needs to continue on another replica, and close."""
+        if self._stream is None or self.close_sent:
+            super().shutdown()
+            return
+        if (last_message := self._stream.closing_message()) is not None:
+            self._queue_frame(last_message)
+        self._end(SERVICE_RESTART, "the replica is shutting down: reconnect")
+
+    @property
+    def _is_open_or_pending(self) -> bool:
+        """Whether the handshake was accepted, or is pending."""
+        return self.response.status_code == SWITCHING and self.initial_response is None
+
+    @property
+    def _is_held(self) -> bool:
+        """Whether messages must wait."""
+        return self._is_busy or self._stream is None or not self.writable.is_set()
+
+    def _work(self, arrived: bytes | bytearray) -> None:
+        """Answer the complete messages in `arrived`, and keep the rest."""
+        at, messages = 0, 0
+        while not self._is_held and (head := _parse_head(arrived, at)) is not None:
+            size, length = head
+            end = at + size + length
+            if length > self._max_size:
+                end = len(arrived)  # the header is enough for the library to refuse it
+            elif end > len(arrived):
+                break
+            if messages == MAX_MESSAGES_PER_TURN:
+                self._yield_turn()
+                break
+            if (
+                arrived[at] in DATA_FRAMES
+                and arrived[at + 1] & MASKED
+                and length <= self._max_size
+                and self._accepts_new_message
+            ):
+                start = at + size
+                self._handle_message(
+                    apply_mask(bytes(arrived[start:end]), arrived[start - 4 : start]), arrived[at] == TEXT
+                )
+                messages += 1
+            else:
+                self._flush()
+                super().data_received(bytes(arrived[at:end]))
+            at = end
+        self._flush()
+        if arrived is self._pending:
+            del self._pending[:at]
+        else:
+            self._pending += arrived[at:]
+
+    @property
+    def _accepts_new_message(self) -> bool:
+        """Whether a new message may begin: no fragmented message is open, and the connection is not closing."""
+        return self.conn.current_size is None and self.conn.state is State.OPEN
+
+    def _handle_message(self, data: bytes, is_text: bool) -> None:
+        """Answer a message, synchronously if the handler does not suspend."""
+        assert self._stream is not None
+        steps = self._stream.answer(data, is_text).__await__()
+        try:
+            waits_for = steps.send(None)
+        except StopIteration as done:
+            self._queue_frame(done.value)
+        except CloseStream as end:
+            self._end(end.code, end.reason)
+        else:
+            self._is_busy = True
+            self.transport.pause_reading()
+            task = self.loop.create_task(self._finish(steps, waits_for))
+            task.add_done_callback(self.on_task_complete)
+            self.tasks.add(task)
+
+    async def _finish(self, steps: Generator[Any, Any, StreamMessage], waits_for: Any) -> None:
+        try:
+            self._queue_frame(await resume(steps, waits_for))
+        except CloseStream as end:
+            self._end(end.code, end.reason)
+        self._resume_after_turn()
+
+    def _yield_turn(self) -> None:
+        self._is_busy = True
+        self.transport.pause_reading()
+        self.loop.call_soon(self._resume_after_turn)
+
+    def _resume_after_turn(self) -> None:
+        self._is_busy = False
+        self._resume()
+
+    def _resume(self) -> None:
+        """Answer pending messages, then resume reading."""
+        if self.transport.is_closing():
+            return
+        self._work(self._pending)
+        if not self._is_held:
+            self.transport.resume_reading()
+
+    def _queue_frame(self, message: StreamMessage) -> None:
+        if not self.close_sent:
+            self._writes.append(_encode_frame(message))
+
+    def _flush(self) -> None:
+        if self._writes:
+            self.transport.write(b"".join(self._writes))
+            self._writes.clear()
+
+    def _end(self, code: int, reason: str) -> None:
+        """Send a close frame, and wait for the client's."""
+        self._flush()
+        if self.close_sent or self.transport.is_closing():
+            return
+        self.stop_keepalive()
+        self.conn.send_close(code, reason)
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        self._abort_later()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
+
+    def _abort_later(self) -> None:
+        """Abort the connection after a timeout. Aborting at once could lose messages that the client has not read, and
+        waiting for it to read them could take forever.
+        """
+        if self.close_timer is None and not self.disconnected:
+            self.close_timer = self.loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
+
+
+def _parse_head(data: bytes | bytearray, at: int) -> tuple[int, int] | None:
+    """Sizes of the header and the payload of the frame at `at`; None if the header is incomplete."""
+    there = len(data) - at
+    if there < 2:
+        return None
+    length, mask = data[at + 1] & 0x7F, 4 if data[at + 1] & MASKED else 0
+    if length < 126:
+        return 2 + mask, length
+    long = LENGTH_16 if length == 126 else LENGTH_64
+    if there < 2 + long.size:
+        return None
+    return 2 + long.size + mask, long.unpack_from(data, at + 2)[0]
+
+
+def _encode_frame(message: StreamMessage) -> bytes:
+    """A message as one unmasked frame."""
+    data, is_text = message
+    opcode, length = TEXT if is_text else BINARY, len(data)
+    if length < 126:
+        return bytes((opcode, length)) + data
+    if length < 2**16:
+        return bytes((opcode, 126)) + LENGTH_16.pack(length) + data
+    return bytes((opcode, 127)) + LENGTH_64.pack(length) + data

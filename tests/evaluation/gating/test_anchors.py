@@ -1,0 +1,131 @@
+"""Anchors: how they are resolved, and that a candidate inferior to one is not promoted."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import delete
+
+from evaluation.gating.anchors import earlier_champions, resolve_anchors
+from evaluation.gating.nightly import nightly
+from evaluation.gating.verification import verify
+from league.config import LeagueConfig
+from league.errors import ConfigError, UnknownPolicy, VerdictRefuted
+from league.registry.registry import Registry
+from league.registry.storage import tables
+from tests.support import tictactoe
+from tests.support.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    opened = league_of(tmp_path / "home", WEAK, MIDDLING, STRONG, STRONGEST)
+    yield opened
+    opened.close()
+
+
+def config(**gate: Any) -> LeagueConfig:
+    return tictactoe.config(play={"opening_plies": 2, "num_envs": 4}, gate=gate)
+
+
+def promote(registry: Registry, *versions: int) -> None:
+    for version in versions:
+        now = registry.aliases.current(tictactoe.LEAGUE).get("champion")
+        registry.aliases.set(tictactoe.LEAGUE, "champion", version, expected=now, actor="me", reason="test")
+
+
+def refs(registry: Registry, league: LeagueConfig, candidate: int, champion: str) -> list[str]:
+    registry.leagues.register(league, registry.leagues.get(tictactoe.LEAGUE).interface)
+    return [
+        anchor.ref for anchor in resolve_anchors(registry, registry.leagues.get(tictactoe.LEAGUE), candidate, champion)
+    ]
+
+
+def test_configured_anchors_precede_earlier_champions(registry: Registry) -> None:
+    promote(registry, 1, 2, 3)
+    league = config(anchors=["script:random"], earlier_champions=2)
+    assert refs(registry, league, 4, "tictactoe@3") == ["script:random", "tictactoe@2", "tictactoe@1"]
+    assert refs(registry, config(earlier_champions=1), 4, "tictactoe@3") == ["tictactoe@2"]
+    assert refs(registry, config(earlier_champions=0), 4, "tictactoe@3") == []
+
+
+def test_a_candidate_is_not_its_own_anchor_and_aliases_are_pinned(registry: Registry) -> None:
+    promote(registry, 1, 2)
+    registry.aliases.set(tictactoe.LEAGUE, "gold", 3, expected=None, actor="me", reason="test")
+    league = config(anchors=["@gold", "@silver", "@4", "tictactoe@2", "@champion"], earlier_champions=9)
+    assert refs(registry, league, 4, "tictactoe@2") == ["tictactoe@3", "tictactoe@1"]
+
+
+def test_a_rolled_back_champion_is_not_an_anchor(registry: Registry) -> None:
+    promote(registry, 1, 2, 3)
+    registry.aliases.rollback(tictactoe.LEAGUE, actor="me", reason="broken")
+    assert earlier_champions(registry, registry.leagues.get(tictactoe.LEAGUE)) == ["tictactoe@1"]
+
+
+def test_a_former_champion_of_another_environment_is_not_an_anchor(registry: Registry) -> None:
+    promote(registry, 1, 2)
+    changed = registry.leagues.get(tictactoe.LEAGUE)
+    other = dataclasses.replace(changed, environment_digest="0" * 64)
+    assert earlier_champions(registry, changed) == ["tictactoe@1"]
+    assert earlier_champions(registry, other) == []
+
+
+def test_an_unknown_anchor_is_reported_and_no_candidate_is_tested(registry: Registry) -> None:
+    with pytest.raises(UnknownPolicy, match="stockfish"):
+        refs(registry, config(anchors=["script:stockfish"]), 4, "tictactoe@1")
+    report = nightly(config(anchors=["@77"]), registry=registry)
+    assert report.verdicts == ()
+    assert all("77" in fault for fault in report.faults)
+
+
+def test_a_candidate_that_beats_the_champion_but_not_an_anchor_is_not_promoted(tmp_path: Path) -> None:
+    """Version 3 beats the champion but loses to the script that wins and blocks."""
+    registry = league_of(tmp_path / "trap", WEAK, MIDDLING, STRONG)
+    promote(registry, 1, 2)
+    league = config(anchors=["script:one_ply"], earlier_champions=0, elo1=60, margin=30)
+    report = nightly(league, registry=registry)
+    rejected = {verdict.candidate: verdict for verdict in report.verdicts}["tictactoe@3"]
+    assert (rejected.outcome, rejected.promoted) == ("reject", False)
+    assert rejected.note == "it beat the champion, but is weaker than script:one_ply"
+    assert rejected.llr >= rejected.bounds[1]
+    (anchor,) = rejected.anchors
+    assert (anchor.outcome, anchor.margin) == ("inferior", 30)
+    assert anchor.llr <= anchor.bounds[0]
+    assert sum(anchor.counts) == anchor.blocks
+    assert registry.aliases.current(tictactoe.LEAGUE)["champion"] == 2
+    assert verify(rejected.verdict, registry=registry, replays=4).matches > rejected.blocks
+    with registry.database.write() as session:
+        session.execute(delete(tables.MatchTable).filter_by(schedule=anchor.schedule, position=0))
+    with pytest.raises(VerdictRefuted, match="lacks match 0 of"):
+        verify(rejected.verdict, registry=registry)
+
+
+def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry: Registry) -> None:
+    promote(registry, 1, 2)
+    league = config(anchors=["script:random"], earlier_champions=1, margin=60)
+    nightly(league, registry=registry)
+    event = next(event for event in registry.aliases.history(tictactoe.LEAGUE) if event.version == 3)
+    assert "is not inferior to script:random, tictactoe@1" in event.reason
+    row = registry.verdicts.get(str(event.verdict))
+    assert row.evidence is not None
+    assert [anchor["outcome"] for anchor in row.evidence["anchors"]] == ["not inferior", "not inferior"]
+    assert verify(row.id, registry=registry).outcome == "promote"
+
+
+@pytest.mark.parametrize(
+    ("gate", "message"),
+    [
+        ({"anchors": [{"ref": "script:random", "margin": 300}]}, "margins must lie within ±190"),
+        ({"anchors": [{"ref": "script:random", "margins": 3}]}, "did you mean 'margin'"),
+        ({"margin": 0}, "gate.margin"),
+        ({"model": "returns"}, "return_bound"),
+        ({"model": "returns", "return_bound": 2}, "margin must be smaller"),
+        ({"model": "returns", "return_bound": 200, "return0": 3, "return1": 2}, "return0 first"),
+        ({"nights": 0}, "gate.nights"),
+    ],
+)
+def test_an_invalid_gate_is_rejected(gate: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        config(**gate)

@@ -1,0 +1,523 @@
+import json
+import math
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from filelock import FileLock
+from sqlalchemy.orm import Session
+
+from evaluation.gating import verdicts
+from evaluation.gating.nightly import nightly
+from evaluation.gating.verification import verify
+from evaluation.matches import tournament
+from evaluation.reporting.league_report import league_report
+from evaluation.results import NightlyReport, Progress, VerdictReport
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.errors import AlreadyRunning, ConfigError
+from league.histograms import BOUNDS
+from league.registry.registry import Registry
+from league.registry.storage.database import Database
+from league.registry.storage.rows import ShadowCounts
+from league.registry.verdicts import VerdictRepository
+from league.results.ledger import Ledger
+from league.settings import Storage
+from tests.support import tictactoe
+from tests.support.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of
+
+
+@pytest.fixture(autouse=True)
+def few_rating_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise half of a run's games are for ratings."""
+    monkeypatch.setattr("evaluation.gating.nightly.RATING_BLOCKS", 6)
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    opened = league_of(tmp_path / "home", WEAK, MIDDLING, STRONG, MIDDLING)
+    yield opened
+    opened.close()
+
+
+def state(registry: Registry) -> dict[str, Any]:
+    """All data that a nightly run leaves, without its timestamps."""
+    return {
+        "matches": Ledger(registry).matches(league=tictactoe.LEAGUE),
+        "verdicts": [(v.id, v.outcome, v.evidence) for v in registry.verdicts.all(tictactoe.LEAGUE)],
+        "champions": [(e.version, e.previous, e.verdict) for e in registry.aliases.history(tictactoe.LEAGUE)],
+        "nights": [(n.candidates, n.alpha, n.ended_at is None) for n in registry.nightly_runs.all(tictactoe.LEAGUE)],
+    }
+
+
+def outcomes(report: NightlyReport) -> list[tuple[str, str, str, bool]]:
+    return [(v.candidate, v.opponent, v.outcome, v.promoted) for v in report.verdicts]
+
+
+def test_a_nightly_run_promotes_the_strongest_version(registry: Registry) -> None:
+    events: list[Progress | VerdictReport] = []
+    report = nightly(CONFIG, registry=registry, listener=events.append)
+    assert outcomes(report) == [
+        ("tictactoe@1", "script:random", "reject", False),
+        ("tictactoe@2", "script:random", "promote", True),
+        ("tictactoe@3", "tictactoe@2", "promote", True),
+        ("tictactoe@4", "tictactoe@3", "reject", False),
+    ]
+    assert (report.champion_before, report.champion, report.faults) == (None, "tictactoe@3", ())
+    assert registry.aliases.current(tictactoe.LEAGUE) == {"champion": 3}
+    assert [standing.ref for standing in report.leaderboard][:2] == ["script:one_ply", "tictactoe@3"]
+    assert all(standing.rating is not None for standing in report.leaderboard)
+    assert [each for each in events if isinstance(each, VerdictReport)] == list(report.verdicts)
+    assert any(isinstance(each, Progress) and each.llr for each in events)
+    assert json.loads(json.dumps(report.to_json(), allow_nan=False))["champion"] == "tictactoe@3"
+
+
+def test_promotions_have_actor_reason_and_verdict(registry: Registry) -> None:
+    report = nightly(CONFIG, registry=registry)
+    event = registry.aliases.history(tictactoe.LEAGUE)[0]
+    assert event.verdict == report.verdicts[2].verdict
+    assert event.actor == "league nightly"
+    assert "beat tictactoe@2" in event.reason
+
+
+def test_verdicts_have_their_evidence(registry: Registry) -> None:
+    nightly(CONFIG, registry=registry)
+    for row in registry.verdicts.all(tictactoe.LEAGUE):
+        assert row.evidence is not None
+        assert sum(row.evidence["counts"]) == row.evidence["blocks"] == row.evidence["games"] / 2
+        lower, upper = row.evidence["bounds"]
+        assert (row.evidence["llr"] >= upper) == (row.outcome == "promote")
+        assert (row.evidence["llr"] <= lower) == (row.outcome == "reject")
+        assert 0 < row.evidence["unique_games"] <= row.evidence["games"]
+
+
+def test_the_next_run_has_nothing_to_do(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    nightly(CONFIG, registry=registry)
+    state_before = state(registry)
+    monkeypatch.setattr(tournament, "match_worker", None)
+    report = nightly(CONFIG, registry=registry)
+    assert report.verdicts == ()
+    assert (report.champion_before, report.champion) == ("tictactoe@3", "tictactoe@3")
+    assert state(registry) == state_before
+
+
+def test_a_new_version_is_tested_against_the_current_champion(registry: Registry) -> None:
+    nightly(CONFIG, registry=registry)
+    tictactoe.publish(registry, STRONGEST)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=3, actor="me", reason="by hand")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report) == [("tictactoe@5", "tictactoe@2", "promote", True)]
+
+
+def test_an_even_match_keeps_the_champion(tmp_path: Path) -> None:
+    config = tictactoe.config(gate={"elo0": -20, "elo1": 20, "max_blocks": 30})
+    registry = league_of(tmp_path, STRONG, STRONG, config=config)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+    report = nightly(config, registry=registry)
+    assert outcomes(report) == [("tictactoe@2", "tictactoe@1", "inconclusive", False)]
+    assert report.champion == "tictactoe@1"
+
+
+def test_an_identical_policy_is_not_promoted(tmp_path: Path) -> None:
+    """The two games of a block are the same game with exchanged sides: the score is exactly 0.5, and the candidate is
+    rejected.
+    """
+    registry = league_of(tmp_path, STRONG, STRONG)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report) == [("tictactoe@2", "tictactoe@1", "reject", False)]
+    assert report.verdicts[0].score == pytest.approx(0.5)
+    assert report.verdicts[0].unique_games <= report.verdicts[0].games / 2
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path) -> None:
+    local, distributed = (league_of(tmp_path / name, WEAK, MIDDLING, STRONG) for name in ("alone", "many"))
+    nightly(CONFIG, registry=local)
+    nightly(CONFIG, registry=distributed, workers=2)
+    assert state(local) == state(distributed)
+
+
+class ProcessDeath(BaseException):
+    """Simulates the death of the process."""
+
+
+@contextmanager
+def crash_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Crash after the `writes`-th transaction; yields a counter of the transactions."""
+    original, count, caller = Database.write, [0], threading.get_ident()
+
+    @contextmanager
+    def write(database: Database) -> Iterator[Session]:
+        with original(database) as session:
+            yield session
+        if threading.get_ident() != caller:
+            return  # replicas of other tests report their metrics from threads of this process
+        count[0] += 1
+        if count[0] == writes:
+            raise ProcessDeath
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "write", write)
+        yield count
+
+
+@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_run_that_died_after_any_transaction_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
+) -> None:
+    """After a crash at each single transaction, the final state equals that of an uninterrupted run."""
+    gate = {"elo1": 150, "max_blocks": 100, "nights": 2, "alpha": 0.2, "anchors": ["script:random"], "margin": 150}
+    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 4})
+    league_of(tmp_path / "fresh", MIDDLING, STRONG, config=config).close()
+    quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
+    with crash_after(0, monkeypatch) as count:
+        nightly(config, registry=quiet)
+    expected, writes = state(quiet), count[0]
+    assert writes > 15
+    assert [version for version, _, _ in expected["champions"]] == [2, 1]
+    for crash_at in range(writes, 0, -every):
+        registry = _copy(tmp_path / "fresh", tmp_path / str(crash_at))
+        with crash_after(crash_at, monkeypatch), pytest.raises(ProcessDeath):
+            nightly(config, registry=registry)
+        report = nightly(config, registry=registry)
+        assert state(registry) == expected, f"after transaction {crash_at}"
+        assert report.champion == "tictactoe@2"
+        registry.close()
+
+
+def _copy(home: Path, to: Path) -> Registry:
+    shutil.copytree(home, to)
+    return Registry.open(Storage.at(to))
+
+
+KILLED = """
+import os, signal, sys
+from league.registry.registry import Registry
+from league.registry.verdicts import VerdictRepository
+from league.settings import Storage
+from evaluation.gating.nightly import nightly
+from evaluation.results import VerdictReport
+from tests.support.judged_league import CONFIG
+
+verdicts = 0
+def listener(progress):
+    global verdicts
+    verdicts += isinstance(progress, VerdictReport)
+    if verdicts == 2 and not isinstance(progress, VerdictReport) and progress.played:
+        os.kill(os.getpid(), signal.SIGKILL)
+nightly(CONFIG, registry=Registry.open(Storage.at(sys.argv[1])), listener=listener)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_continues(registry: Registry, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", KILLED, str(registry.storage.home)]
+    killed = subprocess.run(command, cwd=Path(__file__).parents[3], timeout=120, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert [verdict.outcome for verdict in registry.verdicts.all(tictactoe.LEAGUE)] == ["reject", "promote", None]
+    report = nightly(CONFIG, registry=registry)
+    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@3", "tictactoe@4"]
+    quiet = league_of(tmp_path / "quiet", WEAK, MIDDLING, STRONG, MIDDLING)
+    nightly(CONFIG, registry=quiet)
+    assert state(registry) == state(quiet)
+
+
+def test_a_concurrent_run_is_rejected(registry: Registry) -> None:
+    home = registry.storage.home
+    (home / "locks").mkdir(exist_ok=True)
+    with FileLock(home / "locks" / "nightly-tictactoe.lock"), pytest.raises(AlreadyRunning, match="tictactoe"):
+        nightly(CONFIG, registry=registry)
+    assert nightly(CONFIG, registry=registry).champion == "tictactoe@3"
+
+
+def test_a_champion_moved_during_the_test_is_not_overruled(registry: Registry) -> None:
+    """The candidate has beaten version 2, but in the meantime a person has promoted version 1."""
+
+    def interfere(event: Progress | VerdictReport) -> None:
+        if isinstance(event, Progress) and event.what == "tictactoe@3 against tictactoe@2" and not event.played:
+            registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=2, actor="me", reason="by hand")
+
+    report = nightly(CONFIG, registry=registry, listener=interfere)
+    rejected = report.verdicts[2]
+    assert (rejected.outcome, rejected.promoted) == ("promote", False)
+    assert rejected.note is not None
+    assert "tictactoe@1 now" in rejected.note
+    assert registry.aliases.history(tictactoe.LEAGUE)[0].version == 4, "version 4 has beaten version 1 later in the run"
+    again = nightly(CONFIG, registry=registry)
+    assert outcomes(again) == [("tictactoe@3", "tictactoe@4", "promote", True)]
+
+
+def test_an_open_verdict_against_a_former_champion_is_voided(registry: Registry) -> None:
+    row = registry.leagues.get(tictactoe.LEAGUE)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=None, actor="me", reason="first")
+    verdict = verdicts.open_verdict(registry, row, 3, "tictactoe@2")
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 4, expected=2, actor="me", reason="by hand")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report)[0] == ("tictactoe@3", "tictactoe@2", "void", False)
+    assert ("tictactoe@3", "tictactoe@4", "promote", True) in outcomes(report)
+    assert registry.verdicts.all(tictactoe.LEAGUE)[0].id == verdict.id
+
+
+def test_a_voided_verdict_is_followed_by_new_games(registry: Registry) -> None:
+    row = registry.leagues.get(tictactoe.LEAGUE)
+    first = verdicts.open_verdict(registry, row, 3, "script:random")
+    registry.verdicts.close(first.id, "void", {})
+    second = verdicts.open_verdict(registry, row, 3, "script:random")
+    assert second.id != first.id
+    assert second.id == verdicts.open_verdict(registry, row, 3, "script:random").id
+
+
+def test_a_rolled_back_promotion_is_not_repeated(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process dies between promotion and closing its verdict, and a person rolls back before the next run."""
+    with monkeypatch.context() as patch:
+        patch.setattr(VerdictRepository, "close", _crash_on_promotion(VerdictRepository.close))
+        with pytest.raises(ProcessDeath):
+            nightly(CONFIG, registry=registry)
+    assert registry.aliases.current(tictactoe.LEAGUE) == {"champion": 3}
+    registry.aliases.rollback(tictactoe.LEAGUE, actor="me", reason="no")
+    report = nightly(CONFIG, registry=registry)
+    assert outcomes(report)[0] == ("tictactoe@3", "tictactoe@2", "promote", True)
+    assert registry.aliases.current(tictactoe.LEAGUE) == {"champion": 2}
+    assert [e.kind for e in registry.aliases.history(tictactoe.LEAGUE)] == ["rollback", "set", "set"]
+
+
+def _crash_on_promotion(close: Any) -> Any:
+    def crash(verdicts: VerdictRepository, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
+        if outcome == "promote" and evidence["candidate"] == "tictactoe@3":
+            raise ProcessDeath
+        close(verdicts, verdict, outcome, evidence)
+
+    return crash
+
+
+def test_a_tampered_version_is_reported_and_the_others_are_tested(registry: Registry) -> None:
+    (registry.artifacts.root / "tictactoe" / "3" / "shared.onnx").write_bytes(STRONGEST)
+    report = nightly(CONFIG, registry=registry)
+    assert report.champion == "tictactoe@2"
+    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@1", "tictactoe@2", "tictactoe@4"]
+    assert any("tictactoe@3" in fault and "shared.onnx" in fault for fault in report.faults)
+
+
+def test_an_empty_league_has_an_empty_report(tmp_path: Path) -> None:
+    report = nightly(CONFIG, registry=league_of(tmp_path))
+    assert (report.verdicts, report.leaderboard, report.champion) == ((), (), None)
+
+
+def test_an_unwritable_home_is_reported_in_one_line(registry: Registry) -> None:
+    locks = registry.storage.home / "locks"
+    locks.write_text("in the way")
+    with pytest.raises(Exception, match="cannot be locked") as error:
+        nightly(CONFIG, registry=registry)
+    assert "\n" not in str(error.value)
+
+
+def test_hypotheses_out_of_range_are_rejected() -> None:
+    with pytest.raises(ConfigError, match="elo1"):
+        tictactoe.config(gate={"elo1": 400})
+
+
+def test_a_candidate_without_the_required_shadow_traffic_is_not_tested(tmp_path: Path) -> None:
+    gate = {"shadow_agreement": 0.5, "latency_ms": 10, "shadow_observations": 10}
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate=gate)
+    registry = league_of(tmp_path / "home", MIDDLING, STRONG, STRONGEST, config=config)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
+    latency = (0, 100, *[0] * (len(BOUNDS) - 1))
+    shown = [ShadowCounts(tictactoe.LEAGUE, 3, 1, 100, 100, 60, 0, 0, 0, latency, 4_000_000)]
+    registry.replicas.write_report("replica-1", {}, shown)
+    report = nightly(config, registry=registry)
+    assert outcomes(report) == [
+        ("tictactoe@2", "tictactoe@1", "void", False),
+        ("tictactoe@3", "tictactoe@1", "promote", True),
+    ]
+    assert report.verdicts[0].games == 0
+    assert "has 0 observations as the champion's shadow" in str(report.verdicts[0].note)
+    registry.close()
+
+
+def test_the_latency_limit_applies_to_the_slowest_requests(tmp_path: Path) -> None:
+    """Nine of ten observations took 50 µs, the others up to 250 ms: the median is within the limit, the tail is not."""
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate={"latency_ms": 10})
+    registry = league_of(tmp_path / "home", MIDDLING, STRONG, config=config)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
+    latency = [0] * (len(BOUNDS) + 1)
+    latency[1], latency[BOUNDS.index(250_000)] = 900, 100
+    shown = [ShadowCounts(tictactoe.LEAGUE, 2, 1, 1000, 1000, 1000, 0, 0, 0, tuple(latency), 4_000_000)]
+    registry.replicas.write_report("replica-1", {}, shown)
+    report = nightly(config, registry=registry)
+    assert outcomes(report) == [("tictactoe@2", "tictactoe@1", "void", False)]
+    assert "ms" in str(report.verdicts[0].note)
+    registry.close()
+
+
+def test_shadow_traffic_is_not_required_without_a_champion(tmp_path: Path) -> None:
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate={"shadow_agreement": 1.0})
+    registry = league_of(tmp_path / "home", STRONG, config=config)
+    assert outcomes(nightly(config, registry=registry)) == [("tictactoe@1", "script:random", "promote", True)]
+    registry.close()
+
+
+def with_yearly_alpha(**gate: Any) -> LeagueConfig:
+    return tictactoe.config(play={"opening_plies": 2, "num_envs": 4}, gate={"nights": 365, "max_blocks": 1000} | gate)
+
+
+def test_the_alpha_of_a_night_is_divided_among_its_candidates(tmp_path: Path) -> None:
+    config = with_yearly_alpha()
+    registry = league_of(tmp_path, MIDDLING, STRONG, config=config)
+    report = nightly(config, registry=registry)
+    assert [verdict.alpha for verdict in report.verdicts] == [pytest.approx(0.05 / 365 / 2)] * 2
+    assert report.alpha_spent == pytest.approx(0.05 / 365)
+    assert report.verdicts[0].bounds[1] == pytest.approx(math.log(0.95 / (0.05 / 730)))
+    assert report.champion == "tictactoe@2"
+    tictactoe.publish(registry, STRONGEST)
+    second = nightly(config, registry=registry)
+    assert [verdict.alpha for verdict in second.verdicts] == [pytest.approx(0.05 / 365)]
+    first_row, second_row = registry.nightly_runs.all(tictactoe.LEAGUE)
+    assert (first_row.candidates, second_row.candidates) == ((1, 2), (3,))
+    assert second_row.report == second.to_json()
+
+
+def test_without_remaining_alpha_nothing_is_tested(tmp_path: Path) -> None:
+    config = with_yearly_alpha(nights=1)
+    registry = league_of(tmp_path, MIDDLING, config=config)
+    nightly(config, registry=registry)
+    tictactoe.publish(registry, STRONG)
+    report = nightly(config, registry=registry)
+    assert (report.verdicts, report.alpha_spent) == ((), pytest.approx(0.05))
+    assert "spent all of gate.alpha (0.05); for more than 1 nightly runs per year" in report.faults[0]
+    enough = with_yearly_alpha(nights=1, alpha=0.1)
+    assert nightly(enough, registry=registry).champion == "tictactoe@2"
+
+
+def test_versions_published_during_a_run_are_tested_in_the_next(tmp_path: Path) -> None:
+    """The run is killed after one of two verdicts; a third version is published before it is resumed."""
+    config = with_yearly_alpha()
+    registry = league_of(tmp_path, MIDDLING, STRONG, config=config)
+
+    def die(event: Progress | VerdictReport) -> None:
+        if isinstance(event, VerdictReport):
+            raise ProcessDeath
+
+    with pytest.raises(ProcessDeath):
+        nightly(config, registry=registry, listener=die)
+    tictactoe.publish(registry, STRONGEST)
+    report = nightly(config, registry=registry)
+    part = 0.05 / 365
+    assert [(v.candidate, v.alpha) for v in report.verdicts] == [
+        ("tictactoe@2", pytest.approx(part / 2)),
+        ("tictactoe@3", pytest.approx(part)),
+    ]
+    assert [row.candidates for row in registry.nightly_runs.all(tictactoe.LEAGUE)] == [(1, 2), (3,)]
+    assert all(row.ended_at for row in registry.nightly_runs.all(tictactoe.LEAGUE))
+
+
+def test_a_verdict_voided_during_its_test_spends_its_alpha(tmp_path: Path) -> None:
+    config = with_yearly_alpha(elo0=-20, elo1=20)
+    registry = league_of(tmp_path, STRONG, STRONG, STRONG, config=config)
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+
+    def stop(event: Progress | VerdictReport) -> None:
+        if isinstance(event, Progress) and event.what == "tictactoe@2 against tictactoe@1" and event.played:
+            verdicts.void(registry, registry.verdicts.all(tictactoe.LEAGUE)[0].id, actor="me", reason="looks bad")
+
+    report = nightly(config, registry=registry, listener=stop)
+    stopped, other = report.verdicts
+    assert (stopped.outcome, stopped.note) == ("void", "voided by me: looks bad")
+    assert 0 < stopped.blocks < 1000
+    assert other.outcome != "void"
+    assert report.alpha_spent == pytest.approx(stopped.alpha + other.alpha) == pytest.approx(0.05 / 365)
+    again = nightly(config, registry=registry)
+    assert [verdict.candidate for verdict in again.verdicts] == ["tictactoe@2"], "tested again with new games"
+    assert again.alpha_spent == pytest.approx(2 * 0.05 / 365)
+
+
+def test_purged_games_are_kept_but_ignored(registry: Registry) -> None:
+    first = nightly(CONFIG, registry=registry).verdicts[1]
+    number = len(Ledger(registry).results(tictactoe.LEAGUE))
+    verdicts.void(registry, first.verdict, actor="me", reason="a broken machine", purge=True)
+    row = registry.verdicts.get(first.verdict)
+    assert row.outcome == "void"
+    own = [row.schedule, row.settings["confirmation"], *(anchor["schedule"] for anchor in row.settings["anchors"])]
+    played = sum(len(Ledger(registry).positions(schedule)) for schedule in own)
+    assert len(Ledger(registry).results(tictactoe.LEAGUE)) == number - played
+    assert len(Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.blocks
+    assert verify(first.verdict, registry=registry).outcome == "void"
+    page = league_report(registry, tictactoe.LEAGUE)
+    assert page.games == sum(result.games for result in Ledger(registry).results(tictactoe.LEAGUE))
+
+
+def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registry) -> None:
+    report = nightly(CONFIG, registry=registry)
+    promoted = [verdict for verdict in report.verdicts if verdict.promoted]
+    assert [gain.verdict for gain in report.confirmations] == [verdict.verdict for verdict in promoted]
+    for gain, verdict in zip(report.confirmations, promoted, strict=True):
+        low, high = gain.interval
+        assert gain.games == 40
+        assert low is not None
+        assert high is not None
+        assert low < gain.elo < high
+        row = registry.verdicts.get(verdict.verdict)
+        fresh = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.settings["confirmation"])
+        counted = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.schedule)
+        assert {match.seed for match in fresh}.isdisjoint(match.seed for match in counted)
+    assert nightly(CONFIG, registry=registry).confirmations == ()
+
+
+def test_returns_are_tested_by_betting_if_configured(tmp_path: Path) -> None:
+    """For a league with one side: returns of mpe2.simple are between -100 and 0 here."""
+    gate = {"model": "returns", "return_bound": 100, "margin": 10, "nights": None, "confirmation_blocks": 10}
+    environment = {"entry_point": "mpe2.simple_v3", "kwargs": {"max_cycles": 12}}
+    config = LeagueConfig.from_mapping({"league": "kind", "environment": environment, "gate": gate})
+    registry = Registry.open(Storage.at(tmp_path))
+    registry.leagues.register(config, interface(config))
+    spaces = registry.leagues.get("kind").interface.of_policy("shared")
+    for graph in (tictactoe.linear(spaces, 3), tictactoe.chase_landmark(spaces), tictactoe.linear(spaces, 3)):
+        tictactoe.publish(registry, graph, "kind")
+    registry.aliases.set("kind", "champion", 1, expected=None, actor="me", reason="first")
+    report = nightly(config, registry=registry, workers=0)
+    assert report.faults == ()
+    better, worse = report.verdicts
+    assert (better.outcome, better.bounds) == ("promote", pytest.approx((-math.log(20), math.log(20))))
+    assert better.difference is not None
+    assert better.difference.mean > 0
+    assert worse.outcome == "reject"
+    assert report.confirmations[0].difference is not None
+    for verdict in report.verdicts:
+        verify(verdict.verdict, registry=registry, replays=3)
+
+
+def test_a_return_beyond_the_bound_is_reported_and_the_verdict_can_be_voided(tmp_path: Path) -> None:
+    gate = {"model": "returns", "return_bound": 0.5, "margin": 0.2}
+    config = tictactoe.config(gate=gate)
+    registry = league_of(tmp_path, STRONG, config=config)
+    report = nightly(config, registry=registry)
+    assert report.verdicts == ()
+    assert "gate.return_bound is 0.5, but the returns of a block differ by" in report.faults[0]
+    verdicts.void(registry, registry.verdicts.all(tictactoe.LEAGUE)[0].id, actor="me", reason="bound")
+    mended = tictactoe.config(gate=gate | {"return_bound": 2})
+    assert nightly(mended, registry=registry).verdicts[0].outcome == "promote"
+
+
+def test_a_forfeit_prevents_promotion_unless_the_gate_allows_it(tmp_path: Path) -> None:
+    """The version plays well, but sometimes marks a taken square."""
+    config = tictactoe.config(gate={"elo1": 60})
+    registry = league_of(
+        tmp_path, WEAK, tictactoe.graph(True, True, tictactoe.CENTRE_FIRST, faulty=True), config=config
+    )
+    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
+    (rejected,) = nightly(config, registry=registry).verdicts
+    assert (rejected.outcome, rejected.promoted) == ("reject", False)
+    assert re.fullmatch(r"it forfeited \d+ games, but the gate allows none", str(rejected.note))
+    assert rejected.llr >= rejected.bounds[1]
+    verify(rejected.verdict, registry=registry)
+    lenient = tictactoe.config(gate={"elo1": 60, "forfeits": True})
+    verdicts.void(registry, rejected.verdict, actor="me", reason="the gate was too strict")
+    assert nightly(lenient, registry=registry).champion == "tictactoe@2"

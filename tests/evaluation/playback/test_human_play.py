@@ -1,0 +1,220 @@
+"""A person's game depends on its seed and choices, and equals the game that policies would have played."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper, numpy_helper
+
+from evaluation.playback.human_play import PERSON, GameState, human_play
+from evaluation.playback.single_game import GameStep, play_game
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.environments.lockstep import stepping
+from league.environments.stepping import BatchedEnvironment
+from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput
+from league.interface import Interface
+from league.policies.loading import contestant
+from league.policies.onnx import OnnxPolicy
+from league.policies.policy import Actions, Arrays, Policy
+from league.service_requests import HumanPlayRequest
+from league.spaces import inputs
+from tests.support import tictactoe
+
+TICTACTOE = "pettingzoo.classic.tictactoe_v3"
+CONNECT_FOUR = "pettingzoo.classic.connect_four_v3"
+SPREAD = "mpe2.simple_spread_v3"
+BRIEF = {"max_cycles": 8}
+
+
+@cache
+def league_and_environment(entry_point: str, **kwargs: Any) -> tuple[LeagueConfig, Interface, BatchedEnvironment]:
+    """A league, and an environment that is reused for several games."""
+    config = LeagueConfig.from_mapping(
+        {"league": "home", "environment": {"entry_point": entry_point, "kwargs": dict(kwargs)}}
+    )
+    return config, interface(config), stepping(config.environment, 1)
+
+
+def all_agents(described: Interface, policy: Policy) -> dict[str, Policy]:
+    return dict.fromkeys(described.agents, policy)
+
+
+def scripted_players(described: Interface, name: str = "random") -> dict[str, Policy]:
+    return {agent: policy for agent, (_, policy) in contestant(f"script:{name}", None, described).items()}
+
+
+def play_request(
+    entry_point: str, players: Mapping[str, Policy], agent: str, actions: Sequence[int] = (), **options: Any
+) -> GameState:
+    kwargs = options.pop("kwargs", {})
+    config, described, environment = league_and_environment(entry_point, **kwargs)
+    request = HumanPlayRequest(opponent="script:random", agent=agent, actions=tuple(actions), **options)
+    return human_play(request, config, described, players, environment, draws=False)
+
+
+class Scripted:
+    """Returns the choices of a person."""
+
+    def __init__(self, choices: Sequence[int]) -> None:
+        self._choices = iter(choices)
+
+    def act(self, observations: Arrays, *, state: Any = None, explore: bool = False, rng: Any = None) -> Actions:
+        return Actions(np.array([next(self._choices)]))
+
+
+def moves_of(steps: Sequence[GameStep]) -> list[list[tuple[str, Any]]]:
+    return [[(move.agent, move.action) for move in step.moves] for step in steps]
+
+
+def moves_in(state: GameState) -> list[list[tuple[str, Any]]]:
+    return [[(move.agent, move.action) for move in step.moves] for step in state.steps]
+
+
+@pytest.mark.parametrize(("entry_point", "kwargs"), [(TICTACTOE, {}), (CONNECT_FOUR, {}), (SPREAD, BRIEF)])
+@settings(max_examples=25)
+@given(data=st.data())
+def test_a_game_is_reproducible_for_any_prefix_and_equals_one_of_policies(
+    entry_point: str, kwargs: dict[str, Any], data: st.DataObject
+) -> None:
+    _, described, environment = league_and_environment(entry_point, **kwargs)
+    agent = data.draw(st.sampled_from(list(described.agents)))
+    seed = data.draw(st.integers(0, 2**63 - 1))
+    players, choices = scripted_players(described), list[int]()
+    so_far = [play_request(entry_point, players, agent, seed=seed, kwargs=kwargs)]
+    while not so_far[-1].over:
+        choices.append(data.draw(st.sampled_from(so_far[-1].legal)))
+        so_far.append(play_request(entry_point, players, agent, choices, seed=seed, kwargs=kwargs))
+    whole = so_far[-1]
+    for number in data.draw(st.lists(st.integers(0, len(choices)), max_size=4)):
+        again = play_request(entry_point, players, agent, choices[:number], seed=seed, kwargs=kwargs)
+        assert again == so_far[number]
+        assert whole.steps[: len(again.steps)] == again.steps
+    played = list(play_game(environment, {**players, agent: Scripted(choices)}, seed))
+    assert moves_in(whole) == moves_of(played)
+    assert whole.returns == played[-1].returns
+    assert {move.ref for step in whole.steps for move in step.moves if move.agent == agent} == {PERSON}
+
+
+@pytest.mark.parametrize("memory", [False, True], ids=["without memory", "with memory"])
+def test_playing_like_the_opponent_equals_self_play_of_the_opponent(memory: bool) -> None:
+    _, described, environment = league_and_environment(SPREAD, **BRIEF)
+    spaces = described.of_policy("shared")
+    players = all_agents(described, OnnxPolicy(tictactoe.linear(spaces, seed=3, memory=memory)))
+    choices: list[int] = []
+    while not (state := play_request(SPREAD, players, "agent_1", choices, chances=True, kwargs=BRIEF)).over:
+        assert sum(chance for _, chance in state.chances) == pytest.approx(1, abs=1e-5)
+        choices.append(state.chances[0][0])
+    played = list(play_game(environment, players, 0))
+    assert moves_in(state) == moves_of(played)
+    assert len(set(choices)) > 1 or not memory
+    assert all(move.chances[0][0] == move.action for step in state.steps for move in step.moves)
+
+
+def next_action_graph(width: int, actions: int) -> bytes:
+    """A recurrent graph that prefers the action after its previous one."""
+    nodes = [
+        helper.make_node("Mod", ["state_in_action", "count"], ["next"], fmod=1),
+        helper.make_node("Sub", ["all", "next"], ["away"]),
+        helper.make_node("Abs", ["away"], ["far"]),
+        helper.make_node("Neg", ["far"], ["action_dist_inputs"]),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["column"], axis=1, keepdims=1),
+        helper.make_node("Cast", ["column"], ["taken"], to=TensorProto.FLOAT),
+        helper.make_node("Add", ["taken", "one"], ["state_out_action"]),
+    ]
+    weights = {"count": [[actions]], "all": [list(range(actions))], "one": [[1]]}
+    taken, given = {"observation": width, "state_in_action": 1}, {"action_dist_inputs": actions, "state_out_action": 1}
+    graph = helper.make_graph(
+        nodes,
+        "following",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in taken.items()],
+        [
+            helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
+            *(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in given.items()),
+        ],
+        [numpy_helper.from_array(np.array(value, np.float32), name) for name, value in weights.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return bytes(model.SerializeToString())
+
+
+def test_advice_depends_on_the_actions_actually_played() -> None:
+    _, described, _ = league_and_environment(SPREAD, **BRIEF)
+    width = inputs(described.of_policy("shared").observation)["observation"].shape[0]
+    players = all_agents(described, OnnxPolicy(next_action_graph(width, actions=5)))
+
+    def advice_after(*actions: int) -> int:
+        return play_request(SPREAD, players, "agent_0", actions, chances=True, kwargs=BRIEF).chances[0][0]
+
+    assert [advice_after(), advice_after(0), advice_after(3), advice_after(3, 1), advice_after(3, 4)] == [0, 1, 4, 2, 0]
+
+
+def test_probabilities_are_returned_on_request_only() -> None:
+    _, described, _ = league_and_environment(TICTACTOE)
+    players = all_agents(described, OnnxPolicy(tictactoe.graph(wins=True)))
+    state = play_request(TICTACTOE, players, "player_2")
+    assert (state.chances, {move.chances for step in state.steps for move in step.moves}) == ((), {()})
+    assert play_request(TICTACTOE, scripted_players(described), "player_2", chances=True).chances == ()
+
+
+def test_the_state_has_the_legal_actions_of_the_person() -> None:
+    players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph()))
+    first = play_request(TICTACTOE, players, "player_1")
+    assert (first.legal, first.acting, first.over, len(first.steps)) == (tuple(range(9)), ("player_1",), False, 1)
+    second = play_request(TICTACTOE, players, "player_1", [4])
+    assert moves_in(second)[1:] == [[("player_1", 4)], [("player_2", 1)]]
+    assert second.legal == (0, 2, 3, 5, 6, 7, 8)
+
+
+@pytest.mark.parametrize(("opponent", "choices", "score"), [("first", [2, 4, 6], 1.0), ("first", [3, 4, 8], 0.0)])
+def test_the_result_of_a_game_is_reported(opponent: str, choices: list[int], score: float) -> None:
+    state = play_request(
+        TICTACTOE, scripted_players(league_and_environment(TICTACTOE)[1], opponent), "player_1", choices
+    )
+    assert (state.over, state.score, state.legal, state.acting) == (True, score, (), ())
+    assert state.returns == {"player_1": 2 * score - 1, "player_2": 1 - 2 * score}
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"), [([4, 4], r"\[1\]: 4 is illegal"), ([9], r"\[0\]: 9 is illegal"), ([-1], "-1")]
+)
+def test_an_illegal_choice_is_rejected_with_the_legal_ones(actions: list[int], message: str) -> None:
+    players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph()))
+    with pytest.raises(IllegalAction, match=f"{message}.*expected one of .*2.*3.*8$"):
+        play_request(TICTACTOE, players, "player_1", actions)
+
+
+def test_choices_after_the_end_are_rejected() -> None:
+    players = scripted_players(league_and_environment(TICTACTOE)[1], "first")
+    with pytest.raises(InvalidInput, match="ended after 3 of 5"):
+        play_request(TICTACTOE, players, "player_1", [2, 4, 6, 7, 8])
+
+
+def test_a_person_can_play_only_agents_with_discrete_actions() -> None:
+    players = scripted_players(league_and_environment(TICTACTOE)[1])
+    with pytest.raises(InvalidInput, match="unknown agent 'white'; known: player_1, player_2"):
+        play_request(TICTACTOE, players, "white")
+    kwargs = BRIEF | {"continuous_actions": True}
+    players = scripted_players(league_and_environment(SPREAD, **kwargs)[1])
+    with pytest.raises(EnvironmentMismatch, match="agent_0 has Box"):
+        play_request(SPREAD, players, "agent_0", kwargs=kwargs)
+
+
+def test_an_opponent_without_a_legal_action_forfeits() -> None:
+    players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph(faulty=True)))
+    state = play_request(TICTACTOE, players, "player_1", [1, 5, 8])
+    assert state.forfeits == ({"agent": "player_2", "ref": "script:random", "reason": "illegal_action"},)
+    assert state.score == 1.0
+
+
+def test_an_exception_of_the_environment_is_reported() -> None:
+    players = scripted_players(league_and_environment("tests.support.hanging:Raising")[1])
+    with pytest.raises(GameCrashed, match="ValueError: the board is gone"):
+        play_request("tests.support.hanging:Raising", players, "player_1", [4])

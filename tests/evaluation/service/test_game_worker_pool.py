@@ -1,0 +1,285 @@
+"""Worker processes for games with people: a failing league does not affect the others."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from evaluation.matches.tournament import evaluate
+from evaluation.service import game_worker_pool
+from evaluation.service.game_worker_pool import GameWorkerPool
+from league.environments.building import interface
+from league.errors import (
+    EnvironmentMismatch,
+    GameCrashed,
+    GameHung,
+    IllegalAction,
+    NotFound,
+    NotReady,
+    Overloaded,
+    UnknownVersion,
+    WorkerLost,
+)
+from league.registry.registry import Registry
+from league.results.ledger import Ledger
+from league.service_requests import (
+    GameRequest,
+    GameResponse,
+    HumanPlayRequest,
+    PlayabilityRequest,
+    RecordingRequest,
+    VideoRequest,
+)
+from tests.support import tictactoe
+from tests.support.tictactoe import LEAGUE
+
+LONG = 120.0
+
+
+@pytest.fixture(scope="module")
+def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
+    """Tic-tac-toe with a version and a match, and leagues whose first move hangs, raises or ends the process."""
+    opened = tictactoe.registry(tmp_path_factory.mktemp("stages") / "home")
+    tictactoe.publish(opened, tictactoe.graph(wins=True))
+    evaluate(LEAGUE, ["tictactoe@1", "script:random"], registry=opened, blocks=1)
+    for name in ("Hanging", "Raising", "Dying", "BlockingSignals"):
+        config = tictactoe.config(league=name.lower(), environment={"entry_point": f"tests.support.hanging:{name}"})
+        opened.leagues.register(config, interface(config))
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (
+            ("LEAGUE_HOME", opened.storage.home),
+            ("LEAGUE_DATABASE_URL", opened.storage.database_url),
+            ("LEAGUE_ARTIFACTS", opened.storage.artifacts),
+        ):
+            patch.setenv(name, str(value))
+        yield opened
+    opened.close()
+
+
+@contextmanager
+def running(**settings: Any) -> Iterator[GameWorkerPool]:
+    pool = GameWorkerPool(**settings)
+    try:
+        yield pool
+    finally:
+        pool.close()
+
+
+@pytest.fixture(scope="module")
+def shared(registry: Registry) -> Iterator[GameWorkerPool]:
+    with running() as pool:
+        yield pool
+
+
+def game_request(operation: Any, league: str = LEAGUE) -> GameRequest:
+    return GameRequest(league=league, environment="digest", operation=operation)
+
+
+def submit(pool: GameWorkerPool, operation: Any, league: str = LEAGUE, timeout: float = LONG) -> GameResponse:
+    return asyncio.run(pool.submit(game_request(operation, league), timeout))
+
+
+def play_request(
+    *actions: int, opponent: str = "tictactoe@1", agent: str = "player_1", seed: int = 0
+) -> HumanPlayRequest:
+    return HumanPlayRequest(opponent=opponent, agent=agent, actions=actions, seed=seed, chances=True)
+
+
+def document_of(answer: GameResponse) -> dict[str, Any]:
+    assert answer.media_type == "application/json"
+    return dict(json.loads(answer.content))
+
+
+def worker_processes() -> list[int]:
+    """The worker processes of this process."""
+    paths = Path(f"/proc/{os.getpid()}/task").glob("*/children")
+    found = [int(child) for path in paths for child in path.read_text().split()]
+    return [
+        child for child in found if b"evaluation.service.game_worker" in Path(f"/proc/{child}/cmdline").read_bytes()
+    ]
+
+
+def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
+    assert document_of(submit(shared, PlayabilityRequest())) == {
+        "league": LEAGUE,
+        "playable": True,
+        "why": None,
+        "agents": [{"agent": f"player_{i}", "side": f"player_{i}", "actions": 9, "start": 0} for i in (1, 2)],
+        "opponents": ["tictactoe@1", "script:random", "script:one_ply"],
+        "draws": True,
+    }
+
+
+def test_a_recorded_game_has_images_and_a_video(shared: GameWorkerPool, registry: Registry) -> None:
+    match = Ledger(registry).matches(league=LEAGUE)[0]
+    record = document_of(submit(shared, RecordingRequest(match=match.id, game=1, first=1, end=3)))
+    assert [step["step"] for step in record["steps"]] == [1, 2]
+    assert all(step["picture"].startswith("data:image/png;base64,") for step in record["steps"])
+    video = submit(shared, VideoRequest(match=match.id, game=1))
+    assert video.media_type == "image/gif"
+    assert Image.open(BytesIO(video.content)).n_frames == record["length"] + 1
+
+
+def test_a_game_against_a_version_is_played(shared: GameWorkerPool) -> None:
+    state = document_of(submit(shared, play_request(4)))
+    assert [step["moves"][0]["action"] for step in state["steps"][1:]] == [4, state["steps"][2]["moves"][0]["action"]]
+    assert state["picture"].startswith("data:image/png;base64,")
+    assert state["chances"][0][0] in state["legal"]
+    assert len(worker_processes()) == 1, "one process per league"
+
+
+def test_errors_keep_their_type(shared: GameWorkerPool) -> None:
+    for operation, error, message in (
+        (play_request(4, 4), IllegalAction, r"actions\[1\]: 4 is illegal"),
+        (play_request(opponent="tictactoe@9"), UnknownVersion, "tictactoe"),
+        (VideoRequest(match="nowhere/0", game=0), NotFound, "nowhere"),
+    ):
+        with pytest.raises(error, match=message):
+            submit(shared, operation)
+
+
+def test_immutable_answers_are_cached(shared: GameWorkerPool) -> None:
+    assert submit(shared, play_request(4)) is submit(shared, play_request(4))
+    assert submit(shared, PlayabilityRequest()) is not submit(shared, PlayabilityRequest())
+
+
+def test_a_slow_request_can_be_repeated(registry: Registry) -> None:
+    with running() as pool:
+
+        async def submit_until_ready() -> tuple[int, GameResponse]:
+            tries = 0
+            while True:
+                try:
+                    return tries, await pool.submit(game_request(play_request(0)), timeout=0.05)
+                except NotReady:
+                    tries += 1
+
+        tries, answer = asyncio.run(submit_until_ready())
+    assert tries > 0, "a process must take longer than 50 ms to start"
+    assert document_of(answer)["over"] is False
+
+
+def test_a_hanging_game_is_aborted_and_others_are_played(registry: Registry) -> None:
+    with running(seconds=4.0) as pool:
+
+        async def both() -> None:
+            hung = asyncio.create_task(
+                pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), LONG)
+            )
+            await pool.submit(game_request(play_request(0)), LONG)
+            with pytest.raises(GameHung, match="a game of hanging did not end within 4 s"):
+                await hung
+            with pytest.raises(NotReady):  # the hang is not cached
+                await pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), 0.01)
+
+        asyncio.run(both())
+
+
+def test_native_code_that_does_not_return_ends_the_process(registry: Registry) -> None:
+    with running(seconds=4.0, grace=2.0) as pool:
+        with pytest.raises(GameHung, match="its process was killed after 6 s"):
+            submit(pool, play_request(0, opponent="script:random"), "blockingsignals")
+        assert document_of(submit(pool, PlayabilityRequest(), "blockingsignals"))["playable"]
+
+
+def test_a_process_that_dies_is_reported_and_replaced(registry: Registry) -> None:
+    with running() as pool:
+        with pytest.raises(WorkerLost, match="plays games of dying died"):
+            submit(pool, play_request(0, opponent="script:random"), "dying")
+        assert document_of(submit(pool, PlayabilityRequest(), "dying"))["playable"]
+        (process,) = worker_processes()[-1:]
+        os.kill(process, signal.SIGKILL)
+        assert document_of(submit(pool, play_request(opponent="script:random"), "dying"))["legal"]
+
+
+def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(shared: GameWorkerPool) -> None:
+    for _ in range(2):
+        with pytest.raises(GameCrashed, match="the board is gone"):
+            submit(shared, play_request(0, opponent="script:random"), "raising")
+    assert document_of(submit(shared, play_request(opponent="script:random"), "raising"))["legal"] == list(range(9))
+
+
+def test_an_environment_that_cannot_be_created_is_a_server_error(shared: GameWorkerPool, registry: Registry) -> None:
+    lost = tictactoe.config(league="lost", environment={"entry_point": "games.none:none"})
+    registry.leagues.register(lost, registry.leagues.get(LEAGUE).interface)
+    with pytest.raises(GameCrashed, match=r"the environment of lost cannot be created: .*games\.none"):
+        submit(shared, PlayabilityRequest(), "lost")
+
+
+def test_a_changed_environment_is_used_for_the_next_game(registry: Registry) -> None:
+    league = tictactoe.config(league="moving")
+    registry.leagues.register(league, interface(league))
+    with running() as pool:
+        operation = play_request(0, opponent="script:first")
+        assert len(document_of(submit(pool, operation, "moving"))["steps"]) == 3
+        other = tictactoe.config(league="moving", environment={"entry_point": "tests.support.hanging:Raising"})
+        registry.leagues.register(other, interface(other))
+        with pytest.raises(GameCrashed):
+            asyncio.run(pool.submit(GameRequest(league="moving", environment="another", operation=operation), LONG))
+
+
+def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> None:
+    with running(most=1, seconds=4.0) as pool:
+
+        async def submit_several() -> None:
+            hung = asyncio.create_task(
+                pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), LONG)
+            )
+            await asyncio.sleep(0)
+            with pytest.raises(Overloaded, match="games of 1 other leagues are being played"):
+                await pool.submit(game_request(PlayabilityRequest()), LONG)
+            with pytest.raises(GameHung):
+                await hung
+            await pool.submit(game_request(PlayabilityRequest()), LONG)
+
+        before = worker_processes()
+        asyncio.run(submit_several())
+        assert len(set(worker_processes()) - set(before)) == 1
+
+
+def test_the_number_of_waiting_requests_is_limited(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(game_worker_pool, "MOST_WAITING", 2)
+    with running() as pool:
+
+        async def submit_many() -> list[Any]:
+            requests = [pool.submit(game_request(play_request(seed=seed)), LONG) for seed in range(3)]
+            return list(await asyncio.gather(*requests, return_exceptions=True))
+
+        *answered, rejected = asyncio.run(submit_many())
+    assert all(isinstance(each, GameResponse) for each in answered)
+    assert isinstance(rejected, Overloaded)
+
+
+def test_the_size_of_the_cache_is_limited(shared: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = submit(shared, play_request(1))
+    monkeypatch.setattr(game_worker_pool, "CACHE_BYTES", len(first.content))
+    submit(shared, play_request(2))
+    submit(shared, play_request(3))
+    assert submit(shared, play_request(1)) is not first
+
+
+def test_only_leagues_with_discrete_actions_are_playable(registry: Registry, shared: GameWorkerPool) -> None:
+    config = tictactoe.config(
+        league="spread",
+        environment={
+            "entry_point": "mpe2.simple_spread_v3",
+            "kwargs": {"max_cycles": 4, "continuous_actions": True},
+        },
+        play={"opening_plies": 0},
+    )
+    registry.leagues.register(config, interface(config))
+    document = document_of(submit(shared, PlayabilityRequest(), "spread"))
+    assert (document["playable"], document["agents"]) == (False, [])
+    assert document["why"] == "human play needs Discrete actions, but its agents have Box"
+    with pytest.raises(EnvironmentMismatch, match="agent_0 has Box"):
+        submit(shared, play_request(opponent="script:random", agent="agent_0"), "spread")

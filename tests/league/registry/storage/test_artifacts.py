@@ -1,0 +1,60 @@
+"""Only bytes with the digest of the manifest are used."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from league.errors import ArtifactCorrupt, UnknownVersion
+from league.registry.registry import Registry
+from tests.support.registries import GRAPH, LEAGUE, publish
+
+
+def _flip_a_bit(directory: Path) -> None:
+    content = bytearray((directory / "shared.onnx").read_bytes())
+    content[5] ^= 1
+    (directory / "shared.onnx").write_bytes(content)
+
+
+def _link_training_elsewhere(directory: Path) -> None:
+    (directory / "training").rename(directory.parent / "elsewhere")
+    (directory / "training").symlink_to(directory.parent / "elsewhere")
+
+
+def _forge_the_manifest(directory: Path) -> None:
+    manifest = directory / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"steps": 1000', '"steps": 9000'))
+
+
+TAMPERING: list[tuple[Callable[[Path], object], str]] = [
+    (_flip_a_bit, r"shared\.onnx was changed"),
+    (lambda directory: (directory / "training" / "state.bin").unlink(), r"state\.bin is missing"),
+    (lambda directory: (directory / "training" / "more.pkl").touch(), r"more\.pkl does not belong to"),
+    (_link_training_elsewhere, r"training does not belong to"),
+    (_forge_the_manifest, r"manifest\.json was changed"),
+    (lambda directory: directory.rename(directory.parent / "gone"), r"manifest\.json is missing"),
+]
+
+
+@pytest.mark.parametrize(("tamper", "message"), TAMPERING)
+def test_tampering_is_detected_and_the_file_named(
+    local: Registry, tamper: Callable[[Path], object], message: str
+) -> None:
+    publish(local, "run/1")
+    tamper(local.versions.fetch(LEAGUE, 1))
+    with pytest.raises(ArtifactCorrupt, match=message) as caught:
+        local.versions.fetch(LEAGUE, 1)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_single_file_is_verified(local: Registry) -> None:
+    version = publish(local, "run/1")
+    assert local.artifacts.read(version.manifest, "shared.onnx") == GRAPH
+    _flip_a_bit(local.artifacts.path(LEAGUE, 1))
+    with pytest.raises(ArtifactCorrupt, match=r"shared\.onnx was changed"):
+        local.artifacts.read(version.manifest, "shared.onnx")
+
+
+def test_a_version_that_is_not_ready_cannot_be_fetched(local: Registry) -> None:
+    with pytest.raises(UnknownVersion):
+        local.versions.fetch(LEAGUE, 1)

@@ -1,0 +1,71 @@
+"""Notes on versions."""
+
+import pytest
+
+from league.errors import InvalidInput, UnknownAlias, UnknownLeague, UnknownVersion
+from league.refs import CheckpointRef
+from league.registry.aliases import ANY
+from league.registry.registry import Registry
+from league.registry.versions import MAX_NOTE_LENGTH
+from tests.support.registries import LEAGUE, registered
+
+
+@pytest.fixture
+def versioned(registry: Registry) -> Registry:
+    registered(registry, "chess", versions=1)
+    return registered(registry, LEAGUE, versions=3)
+
+
+def texts(registry: Registry, league: str = LEAGUE) -> list[str | None]:
+    return [row.note and row.note.text for row in registry.versions.all(league)]
+
+
+def test_the_latest_note_of_each_version_is_shown(versioned: Registry) -> None:
+    assert texts(versioned) == [None, None, None]
+    versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "first", actor="ada")
+    written = versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "  more entropy\n", actor="bob").note
+    versioned.versions.set_note(CheckpointRef(LEAGUE, 1), "another", actor="ada")
+    assert texts(versioned) == ["another", "more entropy", None]
+    assert texts(versioned, "chess") == [None]
+    assert written is not None
+    assert (written.text, written.actor) == ("more entropy", "bob")
+    assert versioned.versions.get(LEAGUE, 2).note == written
+    assert [row.note for row in versioned.versions.newest(LEAGUE, limit=2)] == [None, written]
+
+
+def test_an_empty_note_removes_it(versioned: Registry) -> None:
+    versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "first", actor="ada")
+    assert versioned.versions.set_note(CheckpointRef(LEAGUE, 2), " ", actor="ada").note is None
+    assert texts(versioned) == [None, None, None]
+    versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "again", actor="ada")
+    assert texts(versioned) == [None, "again", None]
+
+
+def test_an_unchanged_note_has_no_effect(versioned: Registry) -> None:
+    first = versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "a try", actor="ada").note
+    seen = versioned.changes.token(LEAGUE)
+    assert versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "a try ", actor="bob").note == first
+    assert versioned.versions.set_note(CheckpointRef(LEAGUE, 1), "", actor="bob").note is None
+    assert versioned.changes.token(LEAGUE) == seen
+
+
+def test_an_alias_selects_its_current_version(versioned: Registry) -> None:
+    versioned.aliases.set(LEAGUE, "champion", 3, expected=ANY, actor="test", reason="test")
+    assert versioned.versions.set_note(CheckpointRef(LEAGUE, "champion"), "won", actor="ada").number == 3
+    versioned.aliases.set(LEAGUE, "champion", 1, expected=ANY, actor="test", reason="test")
+    assert texts(versioned) == [None, None, "won"]
+
+
+def test_an_invalid_note_changes_nothing(versioned: Registry) -> None:
+    versioned.versions.set_note(CheckpointRef(LEAGUE, 1), "x" * MAX_NOTE_LENGTH, actor="ada")
+    for ref, text, error in (
+        (CheckpointRef(LEAGUE, 1), "x" * (MAX_NOTE_LENGTH + 1), InvalidInput),
+        (CheckpointRef(LEAGUE, 1), "a\0b", InvalidInput),
+        (CheckpointRef(LEAGUE, 1), "a\udcffb", InvalidInput),
+        (CheckpointRef(LEAGUE, 9), "x", UnknownVersion),
+        (CheckpointRef(LEAGUE, "candidate"), "x", UnknownAlias),
+        (CheckpointRef("nobody", 1), "x", UnknownLeague),
+    ):
+        with pytest.raises(error):
+            versioned.versions.set_note(ref, text, actor="ada")
+    assert texts(versioned) == ["x" * MAX_NOTE_LENGTH, None, None]

@@ -1,0 +1,95 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import ray
+
+from league.errors import ConfigError
+from league.ray_cluster import LocalRay, connected, join
+from league.settings import Storage
+
+DEADLINE = 120
+SHARED = Storage(Path("/home/x"), "postgresql://db/league", Path("/mnt/artifacts"))
+
+
+def nodes(*addresses: str, alive: bool = True) -> list[dict[str, object]]:
+    return [{"NodeManagerAddress": address, "Alive": alive} for address in addresses]
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_several_machines_need_shared_storage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray, "nodes", lambda: nodes("192.0.2.1", "192.0.2.2"))
+    with (
+        pytest.raises(ConfigError, match=r"2 machines: set LEAGUE_DATABASE_URL .* LEAGUE_ARTIFACTS"),
+        connected(None, Storage.at(tmp_path)),
+    ):
+        pass
+    with connected(None, SHARED):
+        pass
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_dead_nodes_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = nodes("192.0.2.1") + nodes("192.0.2.2", alive=False)
+    monkeypatch.setattr(ray, "nodes", lambda: found)
+    with connected(None, Storage.at(tmp_path)):
+        pass
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_ray_of_the_caller_remains_running(tmp_path: Path) -> None:
+    with connected(None, Storage.at(tmp_path)):
+        pass
+    assert ray.is_initialized()
+
+
+LOCAL = """
+import json, httpx, ray
+from pathlib import Path
+from league.settings import Storage
+from league.ray_cluster import LocalRay, connected
+with connected(None, Storage.at("here"), LocalRay(cpus=1, object_store=100, dashboard=True)) as url:
+    print(json.dumps({
+        "resources": ray.cluster_resources(), "status": httpx.get(url, timeout=60).status_code, "url": url,
+    }))
+assert not ray.is_initialized()
+"""
+
+
+@pytest.mark.slow
+def test_a_local_ray_has_limits_and_a_dashboard() -> None:
+    process = subprocess.run([sys.executable, "-c", LOCAL], capture_output=True, text=True, timeout=DEADLINE)
+    assert process.returncode == 0, process.stderr
+    found = json.loads(process.stdout)
+    assert found["resources"]["CPU"] == 1
+    assert found["resources"]["object_store_memory"] == 100 * 10**6
+    assert found["url"].startswith("http://127.0.0.1:")
+    assert found["status"] == 200
+
+
+@pytest.mark.parametrize("limits", [LocalRay(cpus=1), LocalRay(object_store=100), LocalRay(dashboard=True)])
+def test_limits_apply_to_a_local_ray_only(tmp_path: Path, limits: LocalRay) -> None:
+    with pytest.raises(ConfigError, match="for a local Ray"), connected("auto", Storage.at(tmp_path), limits):
+        pass
+
+
+def test_an_object_store_that_is_too_small_is_rejected(tmp_path: Path) -> None:
+    process = subprocess.run(
+        [sys.executable, "-c", LOCAL.replace("=100", "=50")], capture_output=True, text=True, timeout=DEADLINE
+    )
+    assert "ConfigError: --object-store: at least 80 MB, got 50" in process.stderr
+
+
+def test_an_unreachable_cluster_is_reported_at_once() -> None:
+    with pytest.raises(ConfigError, match=r"no Ray cluster at '127\.0\.0\.1:1'"):
+        join("127.0.0.1:1")
+
+
+def test_only_one_module_initializes_ray() -> None:
+    root = Path(__file__).parents[2]
+    packages = ("cli", "evaluation", "examples", "league", "serve_app", "training")
+    callers = [path for name in packages for path in (root / name).rglob("*.py") if "ray.init(" in path.read_text()]
+    assert callers == [root / "league/ray_cluster.py"]

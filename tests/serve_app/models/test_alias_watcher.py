@@ -1,0 +1,147 @@
+"""A replica follows the registry, acknowledges its versions, and serves on without the registry."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+from sqlalchemy.orm import Session
+from starlette.testclient import TestClient
+
+from league.errors import StorageError
+from league.registry.registry import Registry
+from league.registry.storage.rows import Acknowledgement
+from league.settings import Storage
+from serve_app.app import Replica
+from tests.support.actions import BOARD, act
+from tests.support.replicas import QUICK, replica
+from tests.support.served_leagues import promote
+from tests.support.waiting import until
+
+
+def acknowledgement(registry: Registry, league: str = "board") -> Acknowledgement | None:
+    found = registry.replicas.acknowledgements(league, since=timedelta(minutes=1))
+    return found[0] if found else None
+
+
+def serves(registry: Registry, version: int) -> bool:
+    return (row := acknowledgement(registry)) is not None and row.version == version
+
+
+def test_a_started_replica_serves_and_has_acknowledged(client: TestClient, registry: Registry) -> None:
+    until(lambda: serves(registry, 1))
+    row = acknowledgement(registry)
+    assert row is not None
+    assert (row.replica, row.sha256, row.fault) == ("replica-1", registry.versions.get("board", 1).sha256, None)
+    assert acknowledgement(registry, "headless") is None
+    assert client.get("/v1/health/ready").status_code == 200
+
+
+def test_a_promotion_is_acknowledged_once_it_is_served(client: TestClient, registry: Registry) -> None:
+    for version in (2, 3, 2):
+        promote(registry, "board", version)
+        until(lambda version=version: serves(registry, version))
+        assert act(client, observation=BOARD)["version"] == version
+
+
+def test_a_rollback_is_followed(client: TestClient, registry: Registry) -> None:
+    promote(registry, "board", 3)
+    until(lambda: serves(registry, 3))
+    registry.aliases.rollback("board", actor="test", reason="test")
+    until(lambda: serves(registry, 1))
+    assert act(client, observation=BOARD)["version"] == 1
+
+
+@pytest.mark.usefixtures("client")
+def test_a_replica_acknowledges_repeatedly(registry: Registry) -> None:
+    until(lambda: acknowledgement(registry))
+
+    def seen_at() -> datetime:
+        row = acknowledgement(registry)
+        assert row is not None
+        return row.seen_at
+
+    first = seen_at()
+    until(lambda: seen_at() > first)
+
+
+def test_a_stopped_replica_is_deleted(registry: Registry) -> None:
+    with replica(registry.storage):
+        until(lambda: acknowledgement(registry))
+    assert acknowledgement(registry) is None
+
+
+def test_a_tampered_champion_is_reported(client: TestClient, registry: Registry) -> None:
+    (registry.artifacts.path("board", 2) / "shared.onnx").write_bytes(b"tampered")
+    promote(registry, "board", 2)
+    until(lambda: (row := acknowledgement(registry)) and row.fault)
+    league = client.get("/v1/leagues/board").json()
+    assert league["champion"] == 2
+    assert [(row["version"], "shared.onnx was changed" in row["fault"]) for row in league["replicas"]] == [(1, True)]
+    assert league["faults"]
+    assert act(client, observation=BOARD)["version"] == 1
+    reply = client.post("/v1/policies/board/action?version=2", json={"observation": BOARD})
+    assert (reply.status_code, reply.json()["code"]) == (503, "artifact_corrupt")
+
+
+def test_serving_continues_without_the_database(registry: Registry) -> None:
+    server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
+    with TestClient(server.application()) as client:
+        act(client, version=2, observation=BOARD)
+        with outage(server.registry):
+            until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")
+            reply = client.get("/v1/leagues")
+            assert (reply.status_code, int(reply.headers["retry-after"])) == (503, 1)
+            assert act(client, observation=BOARD)["version"] == 1
+            assert act(client, version=2, observation=BOARD)["version"] == 2
+            reply = client.post("/v1/policies/board/action?version=3", json={"observation": BOARD})
+            assert (reply.status_code, reply.json()["code"]) == (503, "storage_error")
+            assert client.get("/v1/health/ready").status_code == 200
+            promote(registry, "board", 3)
+        until(lambda: serves(registry, 3))
+        assert act(client, observation=BOARD)["version"] == 3
+
+
+@contextmanager
+def outage(registry: Registry) -> Iterator[None]:
+    """Let each transaction of `registry` fail."""
+
+    @contextmanager
+    def transaction() -> Iterator[Session]:
+        raise StorageError("the database cannot be used: it is gone")
+        yield
+
+    database = registry.database
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(database, "read", transaction)
+        patch.setattr(database, "write", transaction)
+        yield
+
+
+def test_serving_continues_without_the_artifacts(client: TestClient, registry: Registry) -> None:
+    registry.artifacts.root.rename(registry.artifacts.root.with_name("elsewhere"))
+    promote(registry, "board", 2)
+    until(lambda: (row := acknowledgement(registry)) and row.fault)
+    assert act(client, observation=BOARD)["version"] == 1
+    registry.artifacts.root.with_name("elsewhere").rename(registry.artifacts.root)
+    until(lambda: serves(registry, 2))
+
+
+def test_an_empty_registry_replacing_the_followed_one_is_ignored(
+    registry: Registry, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with replica(registry.storage) as client:
+        assert act(client, observation=BOARD)["version"] == 1
+        Registry.open(Storage.at(tmp_path / "other")).close()
+        home = registry.storage.home
+        home.rename(tmp_path / "away")
+        (tmp_path / "other").rename(home)
+        until(lambda: "it is a different database" in caplog.text)
+        assert client.get("/v1/leagues").json() == {"leagues": [], "next": None}
+        assert act(client, observation=BOARD)["version"] == 1
+        shutil.rmtree(home)
+        (tmp_path / "away").rename(home)
+        promote(registry, "board", 2)
+        until(lambda: act(client, observation=BOARD)["version"] == 2)

@@ -1,0 +1,183 @@
+"""A shadow receives the requests of the champion, is compared with it, and does not affect other requests."""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from league.policies.onnx import OnnxPolicy
+from league.registry.registry import Registry
+from league.registry.storage.rows import Portion
+from serve_app.app import Replica
+from serve_app.models.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
+from tests.support.actions import BOARD, act, boards
+from tests.support.graphs import masked_mlp
+from tests.support.replicas import QUICK
+from tests.support.served_leagues import promote
+from tests.support.shadows import set_shadow, wait_for
+from tests.support.waiting import until
+
+
+@pytest.fixture
+def server(registry: Registry) -> Replica:
+    return Replica(Registry.open(registry.storage), QUICK, "replica-1")
+
+
+@pytest.fixture
+def client(server: Replica) -> Iterator[TestClient]:
+    with TestClient(server.application()) as client:
+        yield client
+
+
+def test_agreement_equals_that_of_the_graphs(client: TestClient, registry: Registry) -> None:
+    set_shadow(registry)
+    observations = boards(40)
+    for board in observations[:20]:
+        assert act(client, observation=board)["version"] == 1
+    for start in (20, 30):
+        act(client, observations=observations[start : start + 8])
+    found = wait_for(registry, lambda one: one.requests == 22)
+    compared = observations[:28] + observations[30:38]
+    batch = {name: np.array([board[name] for board in compared], np.int8) for name in BOARD}
+    first, second = (OnnxPolicy(masked_mlp(seed=seed)).act(batch).actions for seed in (0, 1))
+    assert (found.candidate, found.champion, found.observations) == (2, 1, 36)
+    assert 0 < found.agreed == int((first == second).sum()) < 36
+    assert (found.failed, found.dropped, found.skipped) == (0, 0, 0)
+    assert 0 < sum(found.latency) <= 22, "only rows computed alone have a latency"
+    assert found.ns > 0
+
+
+def test_explored_requests_are_compared_by_greedy_actions(client: TestClient, registry: Registry) -> None:
+    promote(registry, "board", 3)
+    until(lambda: act(client, observation=BOARD)["version"] == 3)
+    set_shadow(registry, version=1)
+    observations = boards(20)
+    for board in observations:
+        act(client, observation=board, explore=True, seed=1)
+    found = wait_for(registry, lambda one: one.observations >= 20, candidate=1)
+    batch = {name: np.array([board[name] for board in observations], np.int8) for name in BOARD}
+    third, first = (OnnxPolicy(masked_mlp(seed=seed)).act(batch).actions for seed in (2, 0))
+    assert (found.observations, found.agreed) == (20, int((third == first).sum()))
+
+
+def test_pinned_requests_are_not_mirrored(client: TestClient, registry: Registry) -> None:
+    set_shadow(registry)
+    for _ in range(5):
+        act(client, version=3, observation=BOARD)
+    act(client, observation=BOARD)
+    assert wait_for(registry, lambda one: one.requests > 0).requests == 1
+
+
+def test_state_of_another_network_is_not_mirrored(registry: Registry, client: TestClient) -> None:
+    from tests.support.graphs import counting
+    from tests.support.served_leagues import publish
+
+    publish(registry, "memory", {"shared": counting()}, "run/2")
+    set_shadow(registry, league="memory")
+    state = act(client, "memory", observation=[1])["state"]
+    act(client, "memory", observation=[1], state=state)
+    found = wait_for(registry, lambda one: one.requests + one.skipped == 2, league="memory")
+    assert (found.requests, found.agreed, found.skipped) == (1, 1, 1)
+
+
+def test_a_failing_candidate_is_counted_and_does_not_affect_requests(
+    client: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_shadow(registry)
+    candidate = server.versions.cached("board", 2)
+    assert candidate is not None
+
+    class Failing:
+        def act(self, *_: Any, **__: Any) -> None:
+            raise MemoryError("no room")
+
+    monkeypatch.setitem(candidate.policies, "shared", type("Policy", (), {"policy": Failing()}))
+    for _ in range(10):
+        assert act(client, observation=BOARD)["version"] == 1
+    found = wait_for(registry, lambda one: one.failed == 10)
+    assert (found.requests, found.agreed) == (0, 0)
+
+
+async def replica_with_shadow(registry: Registry) -> tuple[Replica, Shadow]:
+    server = Replica(registry, QUICK.model_copy(update={"shadow_waiting": 4}), "replica-1")
+    server.traffic.update({"board": registry.traffic.set("board", shadow=Portion(2, 1), actor="test", reason="test")})
+    await server.alias_slots.update({("board", "champion"): 1, ("board", "2"): 2})
+    return server, server.shadow
+
+
+@pytest.mark.anyio
+async def test_requests_beyond_the_queue_limit_are_dropped(registry: Registry) -> None:
+    server, shadow = await replica_with_shadow(registry)
+    champion = server.alias_slots.champion("board")
+    assert champion is not None
+    mirror = shadow.mirror_for("board", champion)
+    assert mirror is not None
+    observations = {name: np.array([value], np.int8) for name, value in BOARD.items()}
+    for _ in range(10):
+        mirror(observations, None, np.array([0]))
+    assert [one.dropped for one in shadow.shadowings()] == [6]
+    async with asyncio.timeout(10):
+        while shadow.shadowings()[0].requests < 4:
+            await asyncio.sleep(0.001)
+    mirror(observations, None, np.array([0]))
+    async with asyncio.timeout(10):
+        while shadow.shadowings()[0].requests < 5:
+            await asyncio.sleep(0.001)
+    server.shadow.close()
+
+
+@pytest.mark.anyio
+async def test_observations_beyond_the_size_limit_of_the_queue_are_dropped(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, shadow = await replica_with_shadow(registry)
+    champion = server.alias_slots.champion("board")
+    assert champion is not None
+    mirror = shadow.mirror_for("board", champion)
+    assert mirror is not None
+    observations = {name: np.array([value], np.int8) for name, value in BOARD.items()}
+    size = sum(array.nbytes for array in observations.values())
+    monkeypatch.setattr("serve_app.models.shadow.MAX_WAITING_BYTES", 2 * size)
+    for _ in range(3):
+        mirror(observations, None, np.array([0]))
+    assert [one.dropped for one in shadow.shadowings()] == [1]
+    server.shadow.close()
+
+
+@pytest.mark.anyio
+async def test_a_share_of_one_half_mirrors_about_half(registry: Registry) -> None:
+    server, shadow = await replica_with_shadow(registry)
+    half = registry.traffic.set("board", shadow=Portion(2, 0.5), actor="test", reason="test")
+    server.traffic.update({"board": half})
+    champion = server.alias_slots.champion("board")
+    assert champion is not None
+    assert 350 < sum(shadow.mirror_for("board", champion) is not None for _ in range(1000)) < 650
+
+
+@pytest.mark.anyio
+async def test_the_number_of_rows_computed_at_once_is_limited(registry: Registry, tmp_path: Path) -> None:
+    server, _ = await replica_with_shadow(registry)
+    champion, candidate = server.alias_slots.champion("board"), server.alias_slots.get("board", "2")
+    assert champion is not None
+    assert candidate is not None
+    random = np.random.default_rng(0)
+
+    def request(rows: int) -> MirroredRequest:
+        batch = {
+            "observation": random.integers(0, 2, (rows, 6, 7, 2), dtype=np.int8),
+            "action_mask": np.ones((rows, 7), np.int8),
+        }
+        return MirroredRequest(candidate, champion, None, batch, champion.policy(None).policy.act(batch).actions)
+
+    requests = [request(rows) for rows in (1, 200, 56, 1, 300, 5)]
+    outcomes, seconds = compare(requests)
+    assert [outcome.observations for outcome in outcomes] == [1, MAX_ROWS, 1, 300, 5]
+    assert [outcome.requests for outcome in outcomes] == [1, 2, 1, 1, 1]
+    assert [outcome.ns is not None for outcome in outcomes] == [True, False, False, False, False]
+    assert seconds > 0
+    alone = [compare([each])[0][0].agreed for each in requests]
+    assert sum(alone) == sum(outcome.agreed for outcome in outcomes)

@@ -1,0 +1,221 @@
+"""Event streams: their events, their end, and polling only with listeners."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+from jsonschema import Draft202012Validator
+
+from league.registry.changes import ChangeRepository
+from league.registry.registry import Registry
+from league.registry.storage.rows import ChangeToken
+from serve_app.app import Replica
+from serve_app.openapi.document import document
+from serve_app.routes import events
+from serve_app.routes.events import EventBroker
+from tests.support.event_streams import LEAGUE, listen
+from tests.support.replicas import QUICK
+from tests.support.served_leagues import promote
+from tests.support.streaming import Listening, listening
+from tests.support.waiting import until
+
+SOON = QUICK.model_copy(update={"poll_events": 0.02})
+
+
+@pytest.fixture
+def server(registry: Registry) -> Iterator[Listening]:
+    with listening(registry.storage, SOON) as server:
+        yield server
+
+
+def test_a_stream_starts_with_the_current_state_and_reports_each_change(server: Listening, registry: Registry) -> None:
+    with listen(server) as stream:
+        assert stream.reply.headers["content-type"] == "text/event-stream; charset=utf-8"
+        assert stream.reply.headers["cache-control"] == "no-store"
+        assert [(name, found["aliases"]) for name, found in stream.events] == [("league", {"champion": 1})]
+        promote(registry, "board", 3)
+        until(lambda: stream.last["aliases"] == {"champion": 3})
+        registry.traffic.set("board", canary=None, actor="test", reason="test")
+        until(lambda: stream.last["traffic"] is not None)
+        described = document(QUICK, [])
+        schema = described["components"]["schemas"]["LeagueState"] | {"components": described["components"]}
+        Draft202012Validator(schema).validate(stream.last)
+
+
+def test_an_evaluation_is_reported_until_it_has_ended(server: Listening, registry: Registry) -> None:
+    number = registry.evaluations.submit("board", {"kind": "tournament"}, actor="test", max_active=9).id
+    path = f"/v1/leagues/board/evaluations/{number}"
+    with listen(server, f"{path}/events") as stream, listen(server) as league:
+        assert [(name, found["state"]) for name, found in stream.events] == [("evaluation", "queued")]
+        assert registry.evaluations.claim("me", 1) is not None
+        progress = {"what": "2 contestants", "played": 3, "of": 8, "llr": None, "bounds": None}
+        registry.evaluations.heartbeat(number, "me", progress)
+        until(lambda: stream.last["progress"] == progress)
+        until(lambda: league.last["evaluations"] == [{"evaluation": number, "state": "running", "progress": progress}])
+        registry.evaluations.finish(number, "me", "done", result={"games": 16})
+        until(lambda: stream.is_over)
+        assert stream.last == httpx.get(f"{server.url}{path}").json()
+        assert (stream.last["state"], stream.last["result"]) == ("done", {"games": 16})
+        until(lambda: league.last["evaluations"] == [])
+        assert league.last["evaluation"] == number
+    with listen(server, f"{path}/events") as again:
+        until(lambda: again.is_over)
+        assert len(again.events) == 1, "a finished evaluation has one event"
+
+
+def test_keep_alive_comments_are_sent_without_changes(server: Listening, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "KEEPALIVE_INTERVAL", 0.01)
+    with listen(server) as stream:
+        until(lambda: stream.lines.count(": keep-alive") > 3)
+
+
+@pytest.mark.anyio
+async def test_a_change_while_an_event_is_sent_is_reported_next(registry: Registry) -> None:
+    broker = EventBroker(Replica(registry, QUICK, "replica-1").models, QUICK)
+    states = iter([{"state": 1}, {"state": 2}])
+    async with broker.subscribe("counter", lambda _: next(states)) as updates:
+        assert await anext(updates) == {"state": 1}
+        await broker._poll()  # the listener has not asked for the next event yet
+        assert await anext(updates) == {"state": 2}
+
+
+def test_all_listeners_share_a_poll_and_there_is_none_without_listeners(
+    server: Listening, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    polls: list[str] = []
+    token = ChangeRepository.token
+
+    def count_polls(self: ChangeRepository, league: str, **options: Any) -> ChangeToken:
+        polls.append(league)
+        return token(self, league, **options)
+
+    def wait_for_polls(league: str, times: int) -> None:
+        polls.clear()
+        until(lambda: polls.count(league) >= times)
+
+    monkeypatch.setattr(ChangeRepository, "token", count_polls)
+    with listen(server, "/v1/leagues/memory/events"):
+        with ExitStack() as stack:
+            listeners = [stack.enter_context(listen(server)) for _ in range(5)]
+            assert server.server.events.open == 6
+            wait_for_polls("memory", 10)
+            assert polls.count("board") <= 11
+            promote(registry, "board", 2)
+            until(lambda: all(each.last["aliases"] == {"champion": 2} for each in listeners))
+        until(lambda: server.server.events.topics == 1)
+        wait_for_polls("memory", 3)
+        assert polls.count("board") <= 1, "a poll may have been in progress"
+
+
+def test_the_number_of_listeners_is_limited(registry: Registry) -> None:
+    with listening(registry.storage, SOON.model_copy(update={"max_listeners": 1})) as server:
+        with listen(server), listen(server) as rejected:
+            assert (rejected.reply.status_code, rejected.reply.headers["retry-after"]) == (429, "1")
+        until(lambda: server.server.events.open == 0)
+        with listen(server) as stream:
+            assert stream.reply.status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "code"),
+    [
+        ("/v1/leagues/nobody/events", 404, "unknown_league"),
+        ("/v1/leagues/NO/events", 400, "invalid_reference"),
+        ("/v1/leagues/board/evaluations/7/events", 404, "unknown_evaluation"),
+        ("/v1/leagues/board/evaluations/x/events", 404, "unknown_evaluation"),
+    ],
+)
+def test_an_unknown_resource_is_reported_before_a_stream_starts(
+    server: Listening, path: str, status: int, code: str
+) -> None:
+    reply = httpx.get(f"{server.url}{path}")
+    assert (reply.status_code, reply.json()["code"]) == (status, code)
+    assert server.server.events.open == 0
+
+
+def test_a_head_request_is_answered_at_once(server: Listening) -> None:
+    reply = httpx.head(f"{server.url}{LEAGUE}")
+    assert (reply.status_code, reply.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+
+
+def test_the_timeout_of_requests_does_not_apply_to_streams(registry: Registry) -> None:
+    with (
+        listening(registry.storage, SOON.model_copy(update={"timeout": 0.5})) as server,
+        listen(server, **{"x-request-timeout-ms": "1"}) as stream,
+    ):
+        for version in (2, 3, 1):
+            promote(registry, "board", version)
+            until(lambda version=version: stream.last["aliases"] == {"champion": version})
+        until(lambda: stream.lines.count(": keep-alive") > 0)
+        assert not stream.is_over
+
+
+def test_a_stopping_replica_ends_its_streams(registry: Registry) -> None:
+    with listening(registry.storage, SOON) as server, listen(server) as stream:
+        server.drain()
+        until(lambda: stream.is_over)
+        with pytest.raises(httpx.TransportError):
+            httpx.get(f"{server.url}{LEAGUE}")
+
+
+def test_a_stopping_replica_rejects_new_streams(server: Listening) -> None:
+    server.server.events.end()
+    reply = httpx.get(f"{server.url}{LEAGUE}")
+    assert (reply.status_code, reply.json()["code"]) == (503, "not_ready")
+
+
+def test_a_registry_that_does_not_respond_times_out(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = threading.Event()
+    monkeypatch.setattr(ChangeRepository, "token", lambda *_, **__: answer.wait(20))
+    with listening(registry.storage, SOON.model_copy(update={"timeout": 0.05})) as server:
+        reply = httpx.get(f"{server.url}{LEAGUE}")
+        answer.set()
+        assert (reply.status_code, reply.json()["code"]) == (504, "deadline_exceeded")
+        assert server.server.events.open == 0
+
+
+def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "KEEPALIVE_INTERVAL", 0.05)
+    _, token = registry.keys.create("page", ["read"])
+    _, other = registry.keys.create("other", ["read"])
+    with listening(registry.storage, SOON) as server:
+        with listen(server, **{"x-api-key": token}) as stream, listen(server, **{"x-api-key": other}) as unaffected:
+            assert stream.reply.status_code == 200
+            registry.keys.revoke("page")
+            until(lambda: stream.is_over)
+            before = len(unaffected.lines)
+            until(lambda: len(unaffected.lines) > before)
+        with listen(server) as stranger:
+            assert stranger.reply.status_code == 401
+
+
+def test_a_stream_without_a_key_ends_when_keys_are_required(
+    server: Listening, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "KEEPALIVE_INTERVAL", 0.05)
+    with listen(server) as stream:
+        registry.keys.create("first", ["read"])
+        until(lambda: stream.is_over)
+
+
+def test_streams_survive_a_temporarily_missing_database(
+    server: Listening, registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
+    home = registry.storage.home
+    with listen(server) as stream:
+        home.rename(home.with_name("elsewhere"))
+        until(lambda: "cannot poll event streams" in caplog.text)
+        home.with_name("elsewhere").rename(home)
+        promote(registry, "board", 2)
+        until(lambda: stream.last["aliases"] == {"champion": 2})
+
+
+def test_closed_streams_are_removed(server: Listening) -> None:
+    with ExitStack() as stack:
+        for path in (LEAGUE, LEAGUE, "/v1/leagues/memory/events"):
+            stack.enter_context(listen(server, path))
+        assert (server.server.events.open, server.server.events.topics) == (3, 2)
+    until(lambda: (server.server.events.open, server.server.events.topics) == (0, 0))

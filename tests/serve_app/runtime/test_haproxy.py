@@ -1,0 +1,79 @@
+"""Each server has its own HAProxy: its files, its ports, and its end."""
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from league.errors import NotReady
+from serve_app.runtime import haproxy
+
+NODE = "n" * 56
+"""The directory that Ray inserts between HAProxy's directory and its socket."""
+
+
+@pytest.fixture(autouse=True)
+def directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(haproxy, "DIRECTORIES", tmp_path)
+    return tmp_path
+
+
+def test_the_directory_exists_while_the_context_lasts(directories: Path) -> None:
+    with haproxy.private_directory() as directory:
+        assert directory.stat().st_mode & 0o077 == 0, "the directory is private"
+    assert list(directories.iterdir()) == []
+
+
+def test_the_path_of_the_socket_is_short_enough_for_haproxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    with haproxy.private_directory() as directory:
+        path = Path(haproxy.environment(directory)["RAY_SERVE_HAPROXY_SOCKET_PATH"])
+        assert len(str(path.parent / NODE / path.name)) <= 97
+
+
+def test_two_servers_share_nothing() -> None:
+    with haproxy.private_directory() as one, haproxy.private_directory() as other:
+        private = [
+            {
+                value
+                for name, value in haproxy.environment(directory).items()
+                if name.endswith("_PORT") or value.startswith("/")
+            }
+            for directory in (one, other)
+        ]
+        assert one.exists(), "the directory of a live server is kept"
+    assert not private[0] & private[1]
+
+
+def test_the_files_of_a_killed_server_are_removed(directories: Path) -> None:
+    abandoned = directories / f"{haproxy.PREFIX}dead"
+    abandoned.mkdir()
+    (abandoned / haproxy.LOCK).touch()
+    # A process named haproxy with its configuration in the directory.
+    configuration = abandoned / "haproxy.cfg"
+    configuration.write_text("import signal; print(flush=True); signal.pause()")
+    left = subprocess.Popen(["haproxy", str(configuration)], executable=sys.executable, stdout=subprocess.PIPE)
+    assert left.stdout is not None
+    left.stdout.readline()
+    assert haproxy.processes(abandoned) == [left.pid]
+    with haproxy.private_directory():
+        assert left.wait(10) != 0
+        assert not abandoned.exists()
+    left.stdout.close()
+
+
+def test_free_ports_are_free() -> None:
+    (port,) = haproxy.free_ports(1, "127.0.0.1")
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", port))
+        server.listen()
+        assert not haproxy.is_free("127.0.0.1", port)
+    assert len(set(haproxy.free_ports(5))) == 5
+
+
+def test_missing_free_ports_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(haproxy, "is_free", lambda *_: False)
+    with pytest.raises(NotReady, match="fewer than 2 free ports"):
+        haproxy.free_ports(2)

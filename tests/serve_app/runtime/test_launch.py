@@ -1,0 +1,53 @@
+"""Faults are reported in one sentence before Ray starts."""
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
+from league.settings import Storage
+from serve_app.runtime.launch import DEPLOY_YAML, running
+
+
+@pytest.mark.parametrize("which", ["port", "grpc_port"])
+def test_a_port_in_use_is_reported(storage: Storage, which: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with (
+            pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is in use"),
+            running(storage, **{which: port}),  # type: ignore[arg-type]
+        ):
+            pass
+
+
+def test_invalid_settings_are_reported(storage: Storage, tmp_path: Path) -> None:
+    deploy = tmp_path / "deploy.yaml"
+    deploy.write_text(DEPLOY_YAML.read_text().replace("    args:\n", "    args:\n      max_body: 1\n"))
+    with pytest.raises(ConfigError, match="max_body"), running(storage, deploy=deploy):
+        pass
+
+
+@pytest.mark.parametrize("text", ["", "applications: []", "http_options: {}", "a: [", "- 1"])
+def test_an_invalid_deploy_yaml_is_reported(storage: Storage, tmp_path: Path, text: str) -> None:
+    deploy = tmp_path / "deploy.yaml"
+    deploy.write_text(text)
+    with pytest.raises(ConfigError, match=r"deploy\.yaml"), running(storage, deploy=deploy):
+        pass
+
+
+def test_a_missing_deploy_yaml_is_reported(storage: Storage, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml"), running(storage, deploy=tmp_path / "nowhere.yaml"):
+        pass
+
+
+def test_an_unusable_home_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a directory")
+    with pytest.raises(StorageError, match="file"), running(Storage.at(tmp_path / "file" / "home")):
+        pass
+
+
+def test_a_missing_haproxy_is_reported(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", "/nowhere/haproxy")
+    with pytest.raises(NotReady, match="HAProxy is missing"), running(storage):
+        pass

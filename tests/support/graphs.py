@@ -1,0 +1,94 @@
+"""ONNX graphs written by hand, with the interface of exported graphs."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+OBSERVATION = ("observation", TensorProto.INT8)
+MASK = ("action_mask", TensorProto.INT8)
+
+
+def masked_mlp(
+    shape: Sequence[int] = (6, 7, 2), actions: int = 7, hidden: Sequence[int] = (16,), seed: int = 0, start: int = 0
+) -> bytes:
+    """Observation and mask (int8) to logits, -1e9 for illegal actions, and their arg max plus `start`."""
+    random, width, name = np.random.default_rng(seed), int(np.prod(shape)), "flat"
+    nodes = [
+        helper.make_node("Cast", ["observation"], ["cast"], to=TensorProto.FLOAT),
+        helper.make_node("Flatten", ["cast"], ["flat"], axis=1),
+    ]
+    constants = {
+        "start": np.int64(start),
+        "zero": np.int8(0),
+        "low": np.float32(-1e9),
+    }
+    for i, units in enumerate((*hidden, actions)):
+        constants[f"w{i}"] = (random.normal(size=(width, units)) / np.sqrt(width)).astype(np.float32)
+        nodes.append(helper.make_node("MatMul", [name, f"w{i}"], [f"z{i}"]))
+        nodes.append(helper.make_node("Tanh", [f"z{i}"], [f"a{i}"]))
+        width, name = units, f"a{i}"
+    nodes += [
+        helper.make_node("Equal", ["action_mask", "zero"], ["illegal"]),
+        helper.make_node("Where", ["illegal", "low", name], ["action_dist_inputs"]),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["best"], axis=1, keepdims=0),
+        helper.make_node("Add", ["best", "start"], ["action"]),
+    ]
+    inputs = [
+        helper.make_tensor_value_info(*OBSERVATION, ["batch", *shape]),
+        helper.make_tensor_value_info(*MASK, ["batch", actions]),
+    ]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
+        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", actions]),
+    ]
+    return _serialized(nodes, inputs, outputs, constants)
+
+
+def counting() -> bytes:
+    """A recurrent graph: `state_out_0` is the sum of all observations; the action is whether it exceeds 2."""
+    nodes = [
+        helper.make_node("Add", ["observation", "state_in_0"], ["state_out_0"]),
+        helper.make_node("Concat", ["two", "state_out_0"], ["action_dist_inputs"], axis=1),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
+    ]
+    nodes.insert(0, helper.make_node("Mul", ["observation", "zero"], ["zeros"]))
+    nodes.insert(1, helper.make_node("Add", ["zeros", "limit"], ["two"]))
+    inputs = [
+        helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", 1]),
+        helper.make_tensor_value_info("state_in_0", TensorProto.FLOAT, ["batch", 1]),
+    ]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
+        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
+        helper.make_tensor_value_info("state_out_0", TensorProto.FLOAT, ["batch", 1]),
+    ]
+    return _serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
+
+
+def continuous() -> bytes:
+    """A graph whose action is a vector: it copies its observation."""
+    nodes = [
+        helper.make_node("Identity", ["observation"], ["action"]),
+        helper.make_node("Concat", ["observation", "observation"], ["action_dist_inputs"], axis=1),
+    ]
+    inputs = [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", 2])]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", 2]),
+        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 4]),
+    ]
+    return _serialized(nodes, inputs, outputs, {})
+
+
+def _serialized(
+    nodes: list[onnx.NodeProto],
+    inputs: list[onnx.ValueInfoProto],
+    outputs: list[onnx.ValueInfoProto],
+    constants: dict[str, np.ndarray],
+) -> bytes:
+    initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
+    graph = helper.make_graph(nodes, "policy", inputs, outputs, initializers)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()

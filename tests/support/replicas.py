@@ -1,0 +1,33 @@
+"""A replica's application, without Ray."""
+
+from starlette.testclient import TestClient
+
+from league.errors import NoEvaluationService
+from league.registry.registry import Registry
+from league.service_requests import GameRequest, GameResponse
+from league.settings import Storage
+from serve_app.app import Replica
+from serve_app.settings import ServeSettings
+
+QUICK = ServeSettings(poll=0.03, poll_slowest=0.05, retry=0.05, heartbeat=0.2, max_body=64 * 1024, max_batch=8)
+"""Settings of a replica for tests: short intervals and low limits."""
+READ_ONLY = QUICK.model_copy(update={"poll": 1.0, "poll_slowest": 1.0, "heartbeat": 2.0})
+"""Settings of a replica that many tests share and none changes: fast polls would slow down all tests of the process."""
+
+
+def replica(storage: Storage, settings: ServeSettings = QUICK) -> TestClient:
+    """The application of a new replica; enter it to start."""
+    return TestClient(
+        Replica(Registry.open(storage), settings, "replica-1", evaluation_client=UnavailableEvaluation()).application()
+    )
+
+
+class UnavailableEvaluation:
+    """An evaluation service that does not respond."""
+
+    def notify(self) -> None:
+        """Do nothing."""
+
+    async def request_game(self, request: GameRequest) -> GameResponse:
+        """Raise NoEvaluationService."""
+        raise NoEvaluationService("nobody is at work")

@@ -1,0 +1,236 @@
+"""Versions with small handwritten graphs instead of trained ones.
+
+Those of tic-tac-toe have a known strength. On each of the eight lines, a graph sees whether its own side or the
+opponent has two marks, and prefers the squares of such lines over a fixed order of squares. `wins` and `blocks` select
+which of the two it uses.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
+
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.interface import AgentInterface
+from league.registry.registry import Registry
+from league.registry.storage.manifest import Manifest, Parity, PolicyManifest, Tensor
+from league.registry.storage.rows import LeagueRow, VersionRow
+from league.settings import Storage
+from league.spaces import OBSERVATION, Box, Discrete, inputs
+
+LEAGUE = "tictactoe"
+LINES = ((0, 1, 2), (3, 4, 5), (6, 7, 8), (0, 3, 6), (1, 4, 7), (2, 5, 8), (0, 4, 8), (2, 4, 6))
+CENTRE_FIRST = (4, 0, 2, 6, 8, 1, 3, 5, 7)
+EDGES_FIRST = (1, 3, 5, 7, 8, 6, 2, 0, 4)
+
+
+def config(**parts: object) -> LeagueConfig:
+    document = {
+        "league": LEAGUE,
+        "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
+        "play": {"opening_plies": 2},
+    }
+    gate = {"elo1": 100, "max_blocks": 300, "nights": None, "confirmation_blocks": 20}
+    gate |= parts.pop("gate", {})  # type: ignore[arg-type]
+    return LeagueConfig.from_mapping(document | parts | {"gate": gate})
+
+
+def registry(home: Path, **parts: object) -> Registry:
+    """A registry with the league, without versions."""
+    league = config(**parts)
+    opened = Registry.open(Storage.at(home))
+    opened.leagues.register(league, interface(league))
+    return opened
+
+
+def publish(registry: Registry, graph: bytes, league: str = LEAGUE) -> VersionRow:
+    """Publish a version with one graph for all policies of the league."""
+    number = len(registry.versions.all(league))
+    return registry.publisher.publish(
+        league, _builder(registry.leagues.get(league), graph), source=f"hand/{number}", parent=None
+    )
+
+
+def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: NDArray | None = None) -> bytes:
+    """A graph for vector observations: a linear map to the inputs of the distribution.
+
+    chosen: its weights, (observations, inputs); by default they are random, with a random bias. memory: the graph
+    counts its steps in its state, and its preferences change with them.
+    """
+    rng, width, outputs = np.random.default_rng(seed), inputs(spaces.observation)[OBSERVATION].shape[0], _logits(spaces)
+    weights = {
+        "weights": (rng.normal(size=(width, outputs)) if chosen is None else chosen).astype(np.float32),
+        "bias": (rng.normal(size=outputs) if chosen is None else np.zeros(outputs)).astype(np.float32),
+        "one": np.array(1, np.float32),
+        "rates": np.arange(1, outputs + 1, dtype=np.float32)[None],
+        "strength": np.array(20, np.float32),
+    }
+    taken, given = [_info(OBSERVATION, TensorProto.FLOAT, width)], []
+    nodes = [
+        helper.make_node("MatMul", [OBSERVATION, "weights"], ["seen"]),
+        helper.make_node("Add", ["seen", "bias"], ["steady"]),
+    ]
+    if memory:
+        taken.append(_info("state_in_0", TensorProto.FLOAT, 1))
+        given.append(_info("state_out_0", TensorProto.FLOAT, 1))
+        nodes += [
+            helper.make_node("Add", ["state_in_0", "one"], ["state_out_0"]),
+            helper.make_node("MatMul", ["state_in_0", "rates"], ["angles"]),
+            helper.make_node("Sin", ["angles"], ["turned"]),
+            helper.make_node("Mul", ["turned", "strength"], ["turning"]),
+            helper.make_node("Add", ["steady", "turning"], ["preferred"]),
+        ]
+    else:
+        nodes.append(helper.make_node("Identity", ["steady"], ["preferred"]))
+    if isinstance(spaces.action, Box):
+        low, high = float(spaces.action.low), float(spaces.action.high)
+        weights |= {"low": np.array(low, np.float32), "span": np.array(high - low, np.float32)}
+        nodes += [
+            helper.make_node("Sigmoid", ["preferred"], ["share"]),
+            helper.make_node("Mul", ["share", "span"], ["above"]),
+            helper.make_node("Add", ["above", "low"], ["action"]),
+            helper.make_node("Concat", ["preferred", "preferred"], ["action_dist_inputs"], axis=1),
+        ]
+        given = [_info("action", TensorProto.FLOAT, outputs), _info("action_dist_inputs", 1, 2 * outputs), *given]
+    else:
+        nodes += [
+            helper.make_node("Identity", ["preferred"], ["action_dist_inputs"]),
+            helper.make_node("ArgMax", ["preferred"], ["action"], axis=1, keepdims=0),
+        ]
+        given = [_info("action", TensorProto.INT64), _info("action_dist_inputs", 1, outputs), *given]
+    return _model(nodes, taken, given, weights)
+
+
+def chase_landmark(spaces: AgentInterface) -> bytes:
+    """A graph for mpe2.simple that steers to the landmark. The observation is velocity and relative position, (x, y)
+    each.
+    """
+    towards = np.zeros((4, 5))
+    for axis in (0, 1):
+        towards[2 + axis, [1 + 2 * axis, 2 + 2 * axis]] = -1.0, 1.0
+        towards[axis, [1 + 2 * axis, 2 + 2 * axis]] = 0.4, -0.4
+    return linear(spaces, chosen=towards)
+
+
+def _logits(spaces: AgentInterface) -> int:
+    match spaces.action:
+        case Discrete(n=n):
+            return n
+        case Box(shape=(m,)):
+            return m
+    raise AssertionError(f"no linear graph for {spaces.action}")
+
+
+def _info(name: str, dtype: int, *shape: int) -> ValueInfoProto:
+    return helper.make_tensor_value_info(name, dtype, ["batch", *shape])
+
+
+def graph(
+    wins: bool = False, blocks: bool = False, order: tuple[int, ...] = EDGES_FIRST, faulty: bool = False
+) -> bytes:
+    """An ONNX graph with the interface of a checkpoint: observation, action_mask → action, action_dist_inputs.
+
+    faulty: it always regards the last square as free, and sometimes plays it although it is taken.
+    """
+    see = np.zeros((18, 16), np.float32)
+    heed = np.zeros((16, 9), np.float32)
+    for i, line in enumerate(LINES):
+        for square in line:
+            see[2 * square, i] = see[2 * square + 1, 8 + i] = 1.0
+            heed[i, square] = 200.0 * wins
+            heed[8 + i, square] = 20.0 * blocks
+    weights = {
+        "see": see,
+        "more_than_one": np.full(16, -1.0, np.float32),
+        "heed": heed,
+        "order": -np.argsort(order).astype(np.float32),
+        "flat": np.array([-1, 18], np.int64),
+        "taken_for_free": np.arange(9) == (8 if faulty else 9),
+        "illegal": np.array(np.finfo(np.float32).min, np.float32),
+    }
+    nodes = [
+        helper.make_node("Cast", ["observation"], ["planes"], to=TensorProto.FLOAT),
+        helper.make_node("Reshape", ["planes", "flat"], ["squares"]),
+        helper.make_node("MatMul", ["squares", "see"], ["marks"]),
+        helper.make_node("Add", ["marks", "more_than_one"], ["excess"]),
+        helper.make_node("Relu", ["excess"], ["pairs"]),
+        helper.make_node("MatMul", ["pairs", "heed"], ["urgent"]),
+        helper.make_node("Add", ["urgent", "order"], ["wanted"]),
+        helper.make_node("Cast", ["action_mask"], ["masked"], to=TensorProto.BOOL),
+        helper.make_node("Or", ["masked", "taken_for_free"], ["legal"]),
+        helper.make_node("Where", ["legal", "wanted", "illegal"], ["action_dist_inputs"]),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
+    ]
+    taken = [_info("observation", TensorProto.INT8, 3, 3, 2), _info("action_mask", TensorProto.INT8, 9)]
+    given = [_info("action", TensorProto.INT64), _info("action_dist_inputs", TensorProto.FLOAT, 9)]
+    return _model(nodes, taken, given, weights)
+
+
+def _model(
+    nodes: Sequence[NodeProto],
+    taken: Sequence[ValueInfoProto],
+    given: Sequence[ValueInfoProto],
+    weights: Mapping[str, NDArray],
+) -> bytes:
+    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    body = helper.make_graph(nodes, "by_hand", taken, given, tensors)
+    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return bytes(model.SerializeToString())
+
+
+def _builder(row: LeagueRow, graph: bytes) -> Callable[[Path, int], Manifest]:
+    def build(directory: Path, number: int) -> Manifest:
+        policies = {}
+        for name in row.interface.policy_ids:
+            (directory / f"{name}.onnx").write_bytes(graph)
+            spaces = row.interface.of_policy(name)
+            policies[name] = PolicyManifest(
+                file=f"{name}.onnx",
+                observation=spaces.observation,
+                action=spaces.action,
+                inputs=_tensors(graph, "input"),
+                outputs=_tensors(graph, "output"),
+                state=tuple(tensor for tensor in _tensors(graph, "input") if tensor.name.startswith("state_in_")),
+                parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
+            )
+        return Manifest(
+            league=row.slug,
+            version=number,
+            created_at=datetime.now(UTC),
+            interface=row.interface,
+            policies=policies,
+            environment=row.config.environment,
+            environment_digest=row.environment_digest,
+            algorithm="ppo",
+            settings={},
+            seed=0,
+            steps=number,
+            stack={},
+        )
+
+    return build
+
+
+def _tensors(graph: bytes, kind: str) -> tuple[Tensor, ...]:
+    body = onnx.load_model_from_string(graph).graph
+    return tuple(
+        Tensor(
+            name=node.name,
+            dtype=helper.tensor_dtype_to_np_dtype(node.type.tensor_type.elem_type).name,
+            shape=(None, *(axis.dim_value for axis in node.type.tensor_type.shape.dim[1:])),
+        )
+        for node in (body.input if kind == "input" else body.output)
+    )
+
+
+def playable(registry: Registry) -> None:
+    """A league that can be played, with two versions."""
+    league = config(play={"opening_plies": 2, "num_envs": 2})
+    registry.leagues.register(league, interface(league))
+    for wins in (False, True):
+        publish(registry, graph(wins=wins))

@@ -1,0 +1,84 @@
+"""The layout of the code, beyond the contracts of import-linter."""
+
+import ast
+from collections import Counter, defaultdict
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PRODUCT = ("league", "training", "serve_app", "evaluation", "cli", "examples")
+GENERATED = ("migrations/", "_pb2.py", "_sync/")
+MAX_MODULES = 14
+ONE_PER_COMMAND_OR_ROUTE = {"cli": 20, "serve_app/routes": 20}
+
+
+def modules(*packages: str) -> list[Path]:
+    """Python files of top-level packages, without generated ones, relative to the root."""
+    found = (path.relative_to(ROOT) for package in packages for path in (ROOT / package).rglob("*.py"))
+    return sorted(path for path in found if not any(part in path.as_posix() for part in GENERATED))
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse((ROOT / path).read_text())
+
+
+def test_a_folder_has_few_modules() -> None:
+    counts = Counter(path.parent.as_posix() for path in modules(*PRODUCT) if path.name != "__init__.py")
+    crowded = {
+        folder: count for folder, count in counts.items() if count > ONE_PER_COMMAND_OR_ROUTE.get(folder, MAX_MODULES)
+    }
+    assert crowded == {}
+
+
+def test_public_class_names_are_unique() -> None:
+    places: defaultdict[str, list[str]] = defaultdict(list)
+    for path in modules(*PRODUCT):
+        for node in tree(path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(path.as_posix())
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def imports(path: Path) -> set[str]:
+    """Names that a module imports, such as `ray.serve.deployment`."""
+    found = set()
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def uses_upstream_internals(path: Path) -> bool:
+    """Private modules and hooks of Ray, and what serves HTTP and WebSockets. The client uses websockets' public API."""
+    serving = ("uvicorn.", "websockets.") if path.parts[0] == "serve_app" else ()
+    return "__serve_" in (ROOT / path).read_text() or any(
+        f"{name}.".startswith(serving) or (name.startswith("ray.") and "._" in name) for name in imports(path)
+    )
+
+
+def test_upstream_internals_are_used_in_two_places_only() -> None:
+    users = {path.as_posix() for path in modules(*PRODUCT) if uses_upstream_internals(path)}
+    assert any(name.startswith("serve_app/runtime/") for name in users), "the check finds them"
+    assert {name for name in users if not name.startswith("serve_app/runtime/")} <= {"training/rllib_compat.py"}
+
+
+def test_each_module_has_a_docstring() -> None:
+    undocumented = [path for path in modules(*PRODUCT) if tree(path).body and not ast.get_docstring(tree(path))]
+    assert undocumented == []
+
+
+@pytest.mark.parametrize("path", modules("tests"), ids=str)
+def test_no_test_module_imports_another(path: Path) -> None:
+    imported = {
+        node.module
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("tests.")
+    }
+    own = path.with_suffix("").as_posix().replace("/", ".")
+    others = [name for name in imported - {own} if name.rpartition(".")[2].startswith(("test_", "conftest"))]
+    assert others == []

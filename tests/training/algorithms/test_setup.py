@@ -1,0 +1,39 @@
+from typing import Any
+
+import pytest
+
+from league.errors import ConfigError
+from tests.support.training_leagues import tictactoe
+from training.algorithms.setup import check_policies_to_train, learning_policies
+
+POLICIES = ("a", "b", "c")
+
+
+def training_with_policies(policies: Any, **training: Any) -> Any:
+    return tictactoe(policies_to_train=policies, **training).training
+
+
+@pytest.mark.parametrize(("policies", "expected"), [(None, POLICIES), (["c", "a"], ("a", "c"))])
+def test_a_list_applies_to_every_update(policies: Any, expected: tuple[str, ...]) -> None:
+    assert [learning_policies(training_with_policies(policies), POLICIES, i) for i in range(3)] == [expected] * 3
+
+
+def test_phases_are_cyclic() -> None:
+    settings = training_with_policies([{"policies": ["a"], "iterations": 2}, {"policies": ["c", "b"], "iterations": 1}])
+    check_policies_to_train(settings, POLICIES)
+    found = [learning_policies(settings, POLICIES, i) for i in range(7)]
+    assert found == [("a",), ("a",), ("b", "c")] * 2 + [("a",)]
+
+
+@pytest.mark.parametrize("policies", [["a", "d"], [{"policies": ["d"], "iterations": 1}]])
+def test_an_unknown_policy_is_reported(policies: Any) -> None:
+    with pytest.raises(ConfigError, match="policies_to_train: unknown policy 'd'; the league has a, b, c"):
+        check_policies_to_train(training_with_policies(policies), POLICIES)
+
+
+@pytest.mark.parametrize("policies", [["a"], [{"policies": ["a"], "iterations": 1}]])
+def test_policies_with_a_shared_encoder_must_learn_together(policies: Any) -> None:
+    with pytest.raises(ConfigError, match="with shared_encoder, all policies must learn together"):
+        check_policies_to_train(training_with_policies(policies, shared_encoder=True), POLICIES)
+    check_policies_to_train(training_with_policies(list(POLICIES), shared_encoder=True), POLICIES)
+    check_policies_to_train(training_with_policies(None, shared_encoder=True), POLICIES)

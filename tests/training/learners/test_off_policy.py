@@ -1,0 +1,67 @@
+"""Targets computed by hand."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from training.learners.off_policy import best_legal_action, bootstrapped_returns, next_actions, project_distribution
+
+ONLINE = torch.tensor([[1.0, 5.0, 9.0], [-3.0, -2.0, -1.0], [0.0, 0.0, 0.0]])
+TARGET = torch.tensor([[7.0, 2.0, 3.0], [-4.0, -8.0, 4.0], [1.0, 2.0, 3.0]])
+MASK = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.int8)
+
+
+def test_double_dqn_selects_legal_actions_by_the_online_network() -> None:
+    assert next_actions(ONLINE, TARGET, MASK).tolist() == [1, 1, 1]
+    assert next_actions(None, TARGET, MASK).tolist() == [0, 0, 1]
+    assert next_actions(ONLINE, TARGET, None).tolist() == [2, 2, 0]
+
+
+def test_a_mask_without_legal_actions_is_ignored() -> None:
+    """The mask of an agent that is truncated in another agent's turn."""
+    assert best_legal_action(ONLINE, torch.zeros(3, 3)).tolist() == [2, 2, 0]
+
+
+def check_returns(returns: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> None:
+    """A step within an episode, a truncated one, and a terminated one: 1 + 0.9·4 twice, then 1."""
+    rewards, discounts = torch.ones(3), torch.full((3,), 0.9)
+    found = returns(rewards, discounts, torch.tensor([False, False, True]), torch.tensor([4.0, 4.0, -1e9]))
+    torch.testing.assert_close(found, torch.tensor([4.6, 4.6, 1.0]))
+
+
+def test_returns_bootstrap_unless_terminated() -> None:
+    check_returns(bootstrapped_returns)
+
+
+def test_the_check_detects_truncation_treated_as_termination() -> None:
+    truncated = torch.tensor([False, True, False])
+    with pytest.raises(AssertionError):
+        check_returns(
+            lambda rewards, discounts, terminated, values: bootstrapped_returns(
+                rewards, discounts, terminated | truncated, values
+            )
+        )
+
+
+ATOMS = torch.tensor([-1.0, 0.0, 1.0])
+
+
+def project(probabilities: list[float], reward: float, discount: float, terminated: bool) -> list[float]:
+    arguments = torch.tensor([reward]), torch.tensor([discount]), torch.tensor([terminated])
+    return project_distribution(torch.tensor([probabilities]), ATOMS, *arguments)[0].tolist()
+
+
+def test_a_distribution_is_projected_onto_its_atoms() -> None:
+    """Returns 0.25 + 0.5·(−1, 0, 1) = −0.25, 0.25, 0.75, each split between the adjacent atoms."""
+    found = project([0.2, 0.5, 0.3], 0.25, 0.5, False)
+    expected = [0.2 * 0.25, 0.2 * 0.75 + 0.5 * 0.75 + 0.3 * 0.25, 0.5 * 0.25 + 0.3 * 0.75]
+    assert found == pytest.approx(expected)
+    assert sum(found) == pytest.approx(1)
+
+
+def test_terminated_returns_are_rewards_and_returns_are_clipped_to_the_atoms() -> None:
+    assert project([0.2, 0.5, 0.3], 0.5, 0.9, True) == pytest.approx([0, 0.5, 0.5])
+    assert project([0.2, 0.5, 0.3], 3.0, 1.0, False) == pytest.approx([0, 0, 1])
+    assert project([0.2, 0.5, 0.3], 0.0, 1.0, False) == pytest.approx([0.2, 0.5, 0.3])

@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from league.errors import ConfigError
+from training.modules.encoder import ObservationFeatures
+
+PLANES = spaces.Box(0, 1, (6, 7, 2), np.int8)
+
+
+def test_features_of_all_leaves() -> None:
+    """Parts are in the order of their names; integers are one-hot from their start; masks are omitted."""
+    features = ObservationFeatures(
+        spaces.Dict(
+            {
+                "action_mask": spaces.Box(0, 1, (9,), np.int8),
+                "observation.box": spaces.Box(-1, 1, (2,), np.float64),
+                "observation.die": spaces.Discrete(3, start=1),
+                "observation.flag": spaces.Box(0, 1, (1, 1), np.bool_),
+                "observation.pair": spaces.MultiDiscrete([2, 3], start=[5, 0]),
+                "observation.switches": spaces.MultiBinary(2),
+            }
+        )
+    )
+    row = features(
+        {
+            "observation.box": torch.tensor([[0.5, -0.5]], dtype=torch.float64),
+            "observation.die": torch.tensor([3]),
+            "observation.flag": torch.tensor([[[True]]]),
+            "observation.pair": torch.tensor([[6, 2]]),
+            "observation.switches": torch.tensor([[1, 0]], dtype=torch.int8),
+        }
+    )
+    assert features.width == 13
+    assert row.dtype == torch.float32
+    assert row[0].tolist() == pytest.approx([0.5, -0.5, 0, 0, 1, 1, 0, 1, 0, 0, 1, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "expected"),
+    [
+        (spaces.Box(0, 255, (2,), np.uint8), [0, 255], [0, 1]),
+        (spaces.Box(-200, 200, (2,), np.float32), [-200, 100], [0, 0.75]),
+        (spaces.Box(np.array([0, 100]), np.array([100, 300]), dtype=np.int64), [25, 200], [0.25, 0.5]),
+        (spaces.Box(0, 30, (2,), np.float32), [3, 30], [3, 30]),
+        (spaces.Box(-3e38, 3e38, (2,), np.float32), [3, -30], [3, -30]),
+        (spaces.Box(0, np.inf, (2,), np.float32), [300, 0], [300, 0]),
+        (spaces.Box(np.array([0, 0]), np.array([255, 1]), dtype=np.int64), [51, 1], [51, 1]),
+    ],
+    ids=["image", "symmetric", "per element", "narrow", "huge", "half open", "mixed"],
+)
+def test_finite_bounds_are_scaled(space: spaces.Box, value: list[float], expected: list[float]) -> None:
+    features = ObservationFeatures(spaces.Dict(observation=space))
+    row = features({"observation": torch.as_tensor(np.array([value], space.dtype))})
+    assert row.tolist() == [pytest.approx(expected)]
+
+
+def test_convolutions_are_equivariant_to_translation() -> None:
+    """A pattern moved by one column moves the outputs of each filter by one column."""
+    features = ObservationFeatures(spaces.Dict(observation=PLANES, die=spaces.Discrete(3)), convolutions=[(5, 4, 1)])
+    assert features.width == 5 * 3 * 4 + 3
+    planes = torch.zeros((2, 6, 7, 2), dtype=torch.int8)
+    planes[0, 2:5, 0:3, 0] = 1
+    planes[1, 2:5, 1:4, 0] = 1
+    rows = features({"observation": planes, "die": torch.tensor([0, 2])})
+    assert rows[:, :3].tolist() == [[1, 0, 0], [0, 0, 1]]
+    left, right = rows[:, 3:].reshape(2, 5, 3, 4)
+    assert torch.allclose(left[:, :, :2], right[:, :, 1:3])
+    assert not torch.allclose(left, right)
+
+
+def test_strides_reduce_the_width() -> None:
+    space = spaces.Dict(observation=spaces.Box(0, 255, (84, 84, 4), np.uint8))
+    features = ObservationFeatures(space, convolutions=[(16, 8, 4), (32, 4, 2)])
+    assert features.width == 32 * 9 * 9
+    image = torch.randint(0, 256, (2, 84, 84, 4), dtype=torch.uint8)
+    assert features({"observation": image}).shape == (2, features.width)
+
+
+@pytest.mark.parametrize(
+    ("space", "convolutions", "message"),
+    [
+        (spaces.Box(0, 1, (9,)), [(8, 3, 1)], "no part"),
+        (spaces.Box(0, 1, (3, 4, 1)), [(8, 4, 1)], "kernel 4 is larger than images of 3×4"),
+        (spaces.Box(0, 1, (9, 9, 1)), [(8, 3, 3), (8, 4, 1)], "kernel 4 is larger than images of 3×3"),
+        (spaces.Text(3), [], "unsupported observation space"),
+    ],
+)
+def test_unsupported_convolutions_are_rejected(space: spaces.Space, convolutions: list, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ObservationFeatures(spaces.Dict(observation=space), convolutions)
+
+
+def test_only_floats_are_normalized() -> None:
+    space = spaces.Dict(
+        die=spaces.Discrete(2), integers=spaces.Box(0, 9, (1,), np.int8), numbers=spaces.Box(0, 255, (1,), np.float64)
+    )
+    features = ObservationFeatures(space, normalize=True)
+    numbers = torch.tensor([[10.0], [30.0]], dtype=torch.float64)
+    batch = {"die": torch.tensor([0, 1]), "integers": torch.tensor([[3], [4]]), "numbers": numbers}
+    features.update_statistics(batch)
+    np.testing.assert_allclose(features(batch), [[1, 0, 3, -1], [0, 1, 4, 1]], rtol=1e-6)
+
+
+def test_normalized_planes_are_convolved() -> None:
+    features = ObservationFeatures(
+        spaces.Dict(observation=spaces.Box(0, 9, (4, 4, 1))), convolutions=[(1, 4, 1)], normalize=True
+    )
+    planes = torch.rand(50, 4, 4, 1) * 9
+    features.update_statistics({"observation": planes})
+    standard = (planes - planes.mean(0)) / planes.std(0, correction=0)
+    convolution = features.parts[0].convolutions
+    assert torch.allclose(features({"observation": planes}), convolution(standard.permute(0, 3, 1, 2)), atol=1e-5)

@@ -1,0 +1,54 @@
+import io
+
+from rich.console import Console
+
+from league.training_config import PPOConfig
+from training.runs.progress import TrainingProgress, clock
+
+SETTINGS = PPOConfig(steps=1000, minutes=2)
+METRICS = {"steps": 250, "seconds": 60.0, "steps_per_second": 12.5, "a/return": 0.5, "a/length": 7.0, "a/entropy": 1.25}
+
+
+def output_of(*updates: dict[str, object], terminal: bool = False, policies: tuple[str, ...] = ("a", "b")) -> str:
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=terminal, width=200)
+    with TrainingProgress(console, SETTINGS, policies) as progress:
+        for metrics in updates:
+            progress.update(metrics)
+    return file.getvalue()
+
+
+def test_a_line_has_the_progress_and_the_metrics_of_each_policy() -> None:
+    """A quarter of the steps, but half of the time: the larger fraction counts."""
+    (line,) = output_of(METRICS).splitlines()
+    assert "50%  250 steps" in line
+    assert "12 steps/s  1:00 elapsed, 1:00 left" in line
+    assert "a: return +0.50, length 7.0, entropy 1.25; b: no finished episode yet" in line
+
+
+def test_a_log_has_few_lines_but_the_last_one() -> None:
+    lines = output_of(METRICS, METRICS, METRICS | {"steps": 1000, "done": True}).splitlines()
+    assert len(lines) == 2
+    assert "100%  1,000 steps" in lines[-1]
+
+
+def test_the_number_of_policies_in_a_line_is_limited() -> None:
+    (line,) = output_of(METRICS, policies=("a", "b", "c", "d", "e")).splitlines()
+    assert line.endswith("c: no finished episode yet; 2 more")
+
+
+def test_a_terminal_has_a_progress_bar() -> None:
+    output = output_of(METRICS, METRICS | {"steps": 750}, terminal=True)
+    for part in ("━", "75%", "750 steps", "12 steps/s", "0:20 left", "return +0.50"):
+        assert part in output
+
+
+def test_a_report_without_an_update_has_no_speed() -> None:
+    """For example if training is stopped before it starts."""
+    (line,) = output_of({"steps": 0, "seconds": 0.0, "done": True}).splitlines()
+    assert "0%  0 steps" in line
+    assert "steps/s" not in line
+
+
+def test_durations_are_formatted_as_a_clock() -> None:
+    assert [clock(seconds) for seconds in (0, 61.9, 3600, 36_061)] == ["0:00", "1:01", "1:00:00", "10:01:01"]

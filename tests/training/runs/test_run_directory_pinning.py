@@ -1,0 +1,35 @@
+from pathlib import Path
+
+import pytest
+
+from league.config import LeagueConfig
+from league.errors import InvalidReference, LeagueError, UnknownVersion
+from tests.support import tictactoe
+from training.runs.run_directory import pin_opponents, with_pins
+
+
+def with_opponents(*refs: str) -> LeagueConfig:
+    return tictactoe.config().with_training(opponents=[{"ref": ref, "share": 0.3} for ref in refs])
+
+
+def test_references_are_pinned_when_training_starts(tmp_path: Path) -> None:
+    registry = tictactoe.registry(tmp_path)
+    for _ in range(2):
+        tictactoe.publish(registry, tictactoe.graph())
+    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="me", reason="first")
+    league = with_opponents("@champion", "tictactoe@2", "script:random")
+    pins = pin_opponents(league, registry, registry.leagues.get("tictactoe").interface)
+    assert pins == {"@champion": "tictactoe@1", "tictactoe@2": "tictactoe@2", "script:random": "script:random"}
+    opponents = with_pins(league, pins).training.opponents
+    assert [opponent.ref for opponent in opponents] == ["tictactoe@1", "tictactoe@2", "script:random"]
+    assert [opponent.share for opponent in opponents] == [0.3, 0.3, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("ref", "error"),
+    [("@3", UnknownVersion), ("champion", InvalidReference), ("script:stockfish", LeagueError)],
+)
+def test_unknown_opponents_are_rejected(tmp_path: Path, ref: str, error: type[LeagueError]) -> None:
+    registry = tictactoe.registry(tmp_path)
+    with pytest.raises(error, match=ref.strip("@").removeprefix("script:")):
+        pin_opponents(with_opponents(ref), registry, registry.leagues.get("tictactoe").interface)

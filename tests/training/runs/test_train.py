@@ -1,0 +1,278 @@
+"""Complete runs: Ray Tune, RLlib's Algorithm with a remote runner, publishing, interruption."""
+
+import dataclasses
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from league.config import LeagueConfig
+from league.errors import ConfigError, LeagueError, NotFound, ParityError, UnknownVersion
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.registry.storage.rows import VersionRow
+from league.settings import Storage
+from tests.support.training_leagues import tictactoe
+from tests.support.waiting import until
+from training.export import publish as publishing
+from training.runs.train import check_network, train
+
+SETTINGS = {"runners": 1, "train_batch_size": 256, "minibatch_size": 128, "epochs": 1, "checkpoint_every": 512}
+LEAGUE = tictactoe(steps=1024, **SETTINGS)
+DEADLINE = 120
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    registry = Registry.open(Storage.at(tmp_path / "home"))
+    yield registry
+    registry.close()
+
+
+def lineage(versions: list[VersionRow]) -> list[tuple[int, int, int | None]]:
+    return [(version.number, version.steps, version.parent) for version in versions]
+
+
+def curves(run: Path) -> EventAccumulator:
+    events = EventAccumulator(str(run / "attempt-1"))
+    events.Reload()
+    return events
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A run that has ended, its versions, and what it printed."""
+
+    registry: Registry
+    versions: list[VersionRow]
+    output: str
+
+
+@pytest.fixture(scope="module")
+def trained(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trained]:
+    registry = Registry.open(Storage.at(tmp_path_factory.mktemp("trained") / "home"))
+    output, interrupt = io.StringIO(), signal.getsignal(signal.SIGINT)
+    versions = train(LEAGUE, registry=registry, console=Console(file=output))
+    assert signal.getsignal(signal.SIGINT) is interrupt, "Tune's SIGINT handler is restored"
+    yield Trained(registry, versions, output.getvalue())
+    registry.close()
+
+
+def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> None:
+    registry = trained.registry
+    assert lineage(trained.versions) == [(1, 512, None), (2, 1024, 1)]
+    assert "Published tictactoe@1 after 512 steps" in trained.output
+    assert "shared: return" in trained.output
+    (run,) = (registry.storage.home / "runs" / "tictactoe").iterdir()
+    assert not list(run.rglob("checkpoints/*")), "published checkpoints are deleted"
+    tags = curves(run).Tags()["scalars"]
+    of_policy = {
+        "return",
+        "length",
+        "entropy",
+        "policy_loss",
+        "value_loss",
+        "kl",
+        "explained_variance",
+        "gradient_norm",
+    }
+    assert {f"shared/{name}" for name in of_policy} <= set(tags)
+    assert {"agents/player_1/return", "agents/player_2/length", "run/return", "run/crashes"} <= set(tags)
+    assert {"run/steps_per_second", *(f"time/{name}" for name in ("sampling", "learning", "weights"))} <= set(tags)
+    assert curves(run).Scalars("shared/entropy")[-1].step == 1024
+    assert not any(tag.startswith("ray/") or "since_restore" in tag for tag in tags), "only curves are recorded"
+    (record,) = registry.runs.newest("tictactoe")
+    assert (record.id, record.state, record.steps, record.target) == (run.name, "ended", 1024, 1024)
+    assert registry.runs.points("tictactoe", run.name)[-1].steps == 1024
+    assert {f"shared/{name}" for name in of_policy} <= set(record.curves)
+    assert not any(name.startswith("agents/") for name in record.curves)
+    with pytest.raises(NotFound, match="complete"):
+        train(LEAGUE, registry=registry, resume=True)
+
+
+@pytest.mark.slow
+def test_continued_training_has_a_parent(trained: Trained) -> None:
+    further = train(LEAGUE, registry=trained.registry, parent=CheckpointRef("tictactoe", 1))
+    assert lineage(further) == [(3, 1024, 1), (4, 1536, 3)]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_an_off_policy_run_publishes_and_continues(registry: Registry) -> None:
+    """Versions, continued training with and without the replay buffer, and a version as opponent."""
+    settings = {"algorithm": "dqn", "runners": 1, "steps": 2048, "checkpoint_every": 1024, "learning_starts": 256}
+    league = tictactoe(**settings)
+    versions = train(league, registry=registry, console=Console(file=io.StringIO()))
+    assert lineage(versions) == [(1, 1024, None), (2, 2048, 1)]
+    assert versions[0].manifest.algorithm == "dqn"
+    for kept in (True, False):
+        shown, parent = io.StringIO(), CheckpointRef("tictactoe", 1)
+        further = league.with_training(steps=1024, opponents=["@1"], replay_in_checkpoint=kept)
+        (version,) = train(further, registry=registry, parent=parent, console=Console(file=shown))
+        assert (version.steps, version.parent) == (2048, 1)
+        assert ("The replay buffer starts empty" in shown.getvalue()) is not kept
+    with pytest.raises(ConfigError, match=r"training\.algorithm: tictactoe@1 was trained with dqn, got ppo"):
+        train(tictactoe(), registry=registry, parent=CheckpointRef("tictactoe", 1))
+    with pytest.raises(ConfigError, match=r"training\.dueling: tictactoe@1 was trained with True, got False"):
+        train(league.with_training(dueling=False), registry=registry, parent=CheckpointRef("tictactoe", 1))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_recurrent_team_is_trained_and_continued(registry: Registry) -> None:
+    """Trained by a remote runner, published, and continued; its versions do not contain the mixer."""
+    config = LeagueConfig.load("configs/two_step_game.yaml").with_training(
+        runners=1, steps=2048, checkpoint_every=1024, recurrence={"width": 8, "sequence": 2}, batch_size=16
+    )
+    versions = train(config, registry=registry, console=Console(file=io.StringIO()))
+    assert lineage(versions) == [(1, 1024, None), (2, 2048, 1)]
+    policy = versions[1].manifest.policies["shared"]
+    assert [tensor.name for tensor in policy.inputs if tensor not in policy.state] == ["observation"]
+    assert [tensor.shape for tensor in policy.state] == [(None, 8), (None, 1)]
+    assert [path.name for path in registry.versions.fetch("two_step_game", 2).glob("*.onnx")] == ["shared.onnx"]
+    (run,) = (registry.storage.home / "runs" / "two_step_game").iterdir()
+    assert {"joint/loss", "joint/value", "joint/error"} <= set(curves(run).Tags()["scalars"])
+    parent = CheckpointRef("two_step_game", 1)
+    (further,) = train(config.with_training(steps=1024), registry=registry, parent=parent)
+    assert (further.steps, further.parent) == (2048, 1)
+    with pytest.raises(ConfigError, match=r"training\.mixer: two_step_game@1 was trained with qmix, got vdn"):
+        train(config.with_training(mixer="vdn"), registry=registry, parent=parent)
+
+
+def test_invalid_options_are_rejected_before_training(registry: Registry) -> None:
+    with pytest.raises(ConfigError, match="either --from or --resume"):
+        train(LEAGUE, registry=registry, parent=CheckpointRef("tictactoe", 1), resume=True)
+    with pytest.raises(ConfigError, match="belongs to another league"):
+        train(LEAGUE, registry=registry, parent=CheckpointRef("chess", 1))
+    with pytest.raises(UnknownVersion):
+        train(LEAGUE, registry=registry, parent=CheckpointRef("tictactoe", 1))
+    with pytest.raises(ConfigError, match="kernel 4"):
+        train(tictactoe(convolutions=[{"filters": 4, "kernel": 4}]), registry=registry)
+    with pytest.raises(ConfigError, match=r"per_policy\.nobody"):
+        train(tictactoe(per_policy={"nobody": {"lr": 1}}), registry=registry)
+    with pytest.raises(UnknownVersion, match="no version 7"):
+        train(tictactoe(opponents=["@7"]), registry=registry)
+    assert not (registry.storage.home / "runs").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_failed_parity_check_ends_the_run_and_keeps_earlier_versions(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check_parity, outcomes = publishing.parity.check_parity, iter([True, False, False])
+
+    def check_once(*arguments: object) -> object:
+        if not next(outcomes):
+            raise ParityError("the graph differs")
+        return check_parity(*arguments)
+
+    monkeypatch.setattr(publishing.parity, "check_parity", check_once)
+    with pytest.raises(ParityError, match="the graph differs"):
+        train(tictactoe(steps=4096, **SETTINGS), registry=registry)
+    assert lineage(registry.versions.all("tictactoe")) == [(1, 512, None)]
+    (record,) = registry.runs.newest("tictactoe")
+    assert (record.state, record.error) == ("failed", "the graph differs")
+
+    monkeypatch.undo()
+    versions = train(tictactoe(steps=1024, **SETTINGS), registry=registry, resume=True)
+    steps = [version.steps for version in versions]
+    assert steps[:2] == [512, 1024]
+    assert steps == sorted(set(steps))
+
+
+def test_continued_training_requires_the_same_network(trained: Trained) -> None:
+    """Settings that did not exist when the version was trained have their defaults."""
+    version, *_ = trained.versions
+    for setting in ({"hidden": [8]}, {"recurrence": {"width": 4}}, {"normalize_observations": True}):
+        with pytest.raises(ConfigError, match=f"training.{next(iter(setting))}: tictactoe@1 was trained with"):
+            train(tictactoe(**setting), registry=trained.registry, parent=CheckpointRef("tictactoe", 1))
+    old = {key: value for key, value in version.manifest.settings.items() if key not in ("recurrence", "opponents")}
+    manifest = version.manifest.model_copy(update={"settings": old})
+    check_network(dataclasses.replace(version, manifest=manifest), tictactoe())
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(
+    ("entry_point", "messages"),
+    [
+        ("raising", ("league faulty", "ZeroDivisionError: division by zero", "faulty.py:13", "attempt-1/error.txt")),
+        pytest.param("unrewarding", ("faulty", "player_1", "nan"), marks=pytest.mark.slow),
+    ],
+)
+def test_a_fault_of_the_environment_in_a_runner_is_one_sentence(
+    registry: Registry, entry_point: str, messages: tuple[str, ...]
+) -> None:
+    league = LeagueConfig.from_mapping(
+        {
+            "league": "faulty",
+            "environment": {"entry_point": f"tests.support.faulty:{entry_point}"},
+            "policies": {"first": ["player_0"], "second": ["player_1"]},
+            "training": {"runners": 1, "num_envs": 2, "hidden": [8], "crashes": 1},
+        }
+    )
+    with pytest.raises(LeagueError) as raised:
+        train(league, registry=registry)
+    for word in messages:
+        assert word in str(raised.value)
+    assert "\n" not in str(raised.value)
+    if entry_point == "raising":
+        (trace,) = registry.storage.home.rglob("error.txt")
+        assert "ZeroDivisionError" in trace.read_text()
+
+
+SCRIPT = """
+import sys
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.training.runs.test_train import SLOW
+from training.runs.train import train
+train(SLOW, registry=Registry.open(Storage.at(sys.argv[1])))
+"""
+SLOW = tictactoe(steps=1536, **SETTINGS | {"epochs": 16, "minibatch_size": 32})
+"""Long enough to be killed between two checkpoints."""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_killed_run_publishes_the_same_versions_after_resuming(tmp_path: Path) -> None:
+    """The driver is killed with SIGKILL during the run."""
+    home = tmp_path / "killed"
+    driver = subprocess.Popen([sys.executable, "-c", SCRIPT, str(home)], stdout=subprocess.DEVNULL)
+    try:
+        _wait_for_checkpoint(home)
+    finally:
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+    killed = Registry.open(Storage.at(home))
+    before = killed.versions.all("tictactoe")
+    assert len(before) < 3, "the driver was killed too late"
+    resumed = train(SLOW, registry=killed, resume=True)
+
+    whole = train(SLOW, registry=Registry.open(Storage.at(tmp_path / "whole")))
+    assert [version.steps for version in whole] == [512, 1024, 1536]
+    assert [graphs(version) for version in resumed] == [graphs(version) for version in whole]
+    assert len({json.dumps(graphs(version)) for version in whole}) == 3, "the weights must change"
+    assert [version.sha256 for version in resumed[: len(before)]] == [version.sha256 for version in before]
+    assert [version.parent for version in resumed] == [None, *(version.number for version in resumed[:-1])]
+    (record,) = killed.runs.newest("tictactoe")
+    assert (record.state, record.attempts, record.steps) == ("ended", 2, 1536)
+    steps = [point.steps for point in killed.runs.points("tictactoe", record.id)]
+    assert steps == sorted(steps)
+
+
+def graphs(version: VersionRow) -> dict[str, str]:
+    """The digest of each ONNX file."""
+    return {name: digest for name, digest in version.manifest.files.items() if name.endswith(".onnx")}
+
+
+def _wait_for_checkpoint(home: Path) -> None:
+    until(lambda: any(home.glob("runs/tictactoe/*/attempt-1/checkpoints/512")), DEADLINE)

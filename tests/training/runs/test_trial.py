@@ -1,0 +1,164 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from league.environments.building import interface
+from league.settings import Storage
+from tests.support.counting import Counting
+from tests.support.training_leagues import counting, tictactoe
+from training.algorithms.metrics import metric_names
+from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, build_algorithm, read_progress
+
+LEAGUE = counting([4, 6], [1], train_batch_size=120, minibatch_size=60, epochs=1, runners=0)
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_training_continues_exactly_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights, the moments of Adam and the step count are equal; no seed of an earlier reset is repeated."""
+    seeds: list[int] = []
+    reset = Counting.reset
+
+    def recording(self: Counting, seed: int | None = None, options: None = None) -> None:
+        seeds.append(seed)
+        reset(self, seed, options)
+
+    monkeypatch.setattr(Counting, "reset", recording)
+    first = build_algorithm(LEAGUE, interface(LEAGUE))
+    first.train()
+    first.train()
+    first.save_to_path(str(tmp_path / "240"))
+    learner = first.learner_group._learner
+    weights = {name: value.clone() for name, value in learner.module["policy_0"].state_dict().items()}
+    moments = learner.get_optimizer("policy_0").state_dict()["state"]
+    first.stop()
+    before = len(seeds)
+
+    second = build_algorithm(LEAGUE, interface(LEAGUE), tmp_path / "240")
+    restored = second.learner_group._learner
+    for name, value in restored.module["policy_0"].state_dict().items():
+        assert torch.equal(value, weights[name])
+    for index, state in restored.get_optimizer("policy_0").state_dict()["state"].items():
+        assert all(torch.equal(state[key], moments[index][key]) for key in ("step", "exp_avg", "exp_avg_sq"))
+    result = second.train()
+    second.stop()
+    assert result["num_env_steps_sampled_lifetime"] == 360
+    assert len(seeds) > before > 0
+    assert len(set(seeds)) == len(seeds)
+
+
+def trial(directory: Path, start: StartState = FROM_SCRATCH, **training: Any) -> Trial:
+    """A trial in this process with checkpoints below `directory`."""
+    ppo_settings = {"train_batch_size": 128, "minibatch_size": 64, "epochs": 1}
+    league = tictactoe(**({} if "algorithm" in training else ppo_settings), **training)
+    (directory / "checkpoints").mkdir(parents=True, exist_ok=True)
+    plan = TrialPlan(start, directory / "checkpoints", directory / "end", Storage.at(directory))
+    interface_ = interface(league)
+    return Trial({"league": league.model_dump(by_alias=True), "interface": interface_.model_dump(), "plan": plan})
+
+
+def run(trial: Trial) -> list[dict[str, Any]]:
+    """All results of a trial until it is done."""
+    results = [trial.train()]
+    while not results[-1]["done"]:
+        results.append(trial.train())
+    return results
+
+
+def weights(trial: Trial) -> dict[str, torch.Tensor]:
+    return trial.algorithm.learner_group._learner.module["shared"].state_dict()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_checkpoints_are_saved_at_their_interval_with_the_curves(tmp_path: Path) -> None:
+    complete = trial(tmp_path, steps=600, checkpoint_every=256)
+    results = run(complete)
+    complete.stop()
+    assert [(result["steps"], "checkpoint" in result) for result in results] == [(256, True), (512, True), (640, True)]
+    assert [Path(result["checkpoint"]).name for result in results] == ["256", "512", "640"]
+    assert results[-1]["spent"]
+    assert read_progress(tmp_path / "checkpoints" / "512") == (512, pytest.approx(results[1]["seconds"]))
+    for result in results:
+        assert metric_names(interface(complete.league)) <= result.keys()
+        assert result["time/sampling"] > 0
+        assert result["time/learning"] > 0
+        assert result["episodes"] > 0
+        assert result["crashes"] == 0
+        assert result["shared/return"] == 0, "the game is zero-sum"
+        assert result["agents/player_1/return"] == -result["agents/player_2/return"]
+    assert any(result["agents/player_1/return"] for result in results)
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_restored_training_equals_uninterrupted_training(tmp_path: Path) -> None:
+    """Weights and actions are identical."""
+    settings = {"steps": 768, "checkpoint_every": 256, "opening_plies": 2}
+    uninterrupted = trial(tmp_path / "whole", **settings)
+    expected = run(uninterrupted)
+    steps, seconds = read_progress(tmp_path / "whole" / "checkpoints" / "256")
+    resumed = trial(
+        tmp_path / "resumed", StartState(tmp_path / "whole" / "checkpoints" / "256", steps, 0, seconds), **settings
+    )
+    results = run(resumed)
+    for name, value in weights(uninterrupted).items():
+        assert torch.equal(weights(resumed)[name], value)
+    learned = ("shared/length", "shared/policy_loss", "agents/player_1/return", "shared/kl", "steps")
+    assert [[result[name] for name in learned] for result in results] == [
+        [result[name] for name in learned] for result in expected[1:]
+    ]
+    uninterrupted.stop()
+    resumed.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_restored_off_policy_training_equals_uninterrupted_training(tmp_path: Path) -> None:
+    """Includes buffer, priorities, targets, schedules and counters; and the curves have the documented names."""
+    settings: dict[str, Any] = {
+        "algorithm": "dqn",
+        "steps": 3072,
+        "checkpoint_every": 1024,
+        "learning_starts": 256,
+        "replay_capacity": 1500,
+        "target_every": 7,
+        "n_step": 2,
+        "noisy": True,
+        "priorities": {},
+        "exploration": {"steps": 2500},
+        "opponents": [{"ref": "script:random", "share": 0.3}],
+    }
+    whole = trial(tmp_path / "whole", **settings)
+    expected = run(whole)
+    checkpoint = tmp_path / "whole" / "checkpoints" / str(expected[0]["steps"])
+    resumed = trial(tmp_path / "resumed", StartState(checkpoint, *read_progress(checkpoint)[:1], 0, 0.0), **settings)
+    results = run(resumed)
+    for name, value in weights(whole).items():
+        assert torch.equal(weights(resumed)[name], value)
+    learned = ("shared/length", "shared/loss", "shared/value", "exploration", "agents/player_1/return", "steps")
+    assert [[result[name] for name in learned] for result in results] == [
+        [result[name] for name in learned] for result in expected[1:]
+    ]
+    assert metric_names(interface(whole.league), "dqn") <= expected[-1].keys()
+    whole.stop()
+    resumed.stop()
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_a_trial_that_is_asked_to_stop_saves_its_state(tmp_path: Path) -> None:
+    stopping = trial(tmp_path, steps=10**9, checkpoint_every=None)
+    result = stopping.train()
+    assert "checkpoint" not in result
+    stopping.plan.stop_file.touch()
+    result = stopping.train()
+    assert (result["done"], result["spent"]) == (True, False)
+    assert result["checkpoint"] == str(tmp_path / "checkpoints" / str(stopping.steps))
+    stopping.stop()
+
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again" / "end").touch()
+    at_once = trial(tmp_path / "again", StartState(Path(result["checkpoint"]), stopping.steps, 0, 1.0), steps=10**9)
+    result = at_once.train()
+    assert result["done"]
+    assert "checkpoint" not in result, "nothing has changed since"
+    at_once.stop()

@@ -1,0 +1,90 @@
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from league.config import SweepConfig
+from league.errors import ConfigError
+from tests.support.training_leagues import tictactoe
+from training.sweeps.search_space import applied, nested, plan
+
+
+def sweep(parameters: dict[str, Any], samples: int = 1) -> SweepConfig:
+    return SweepConfig(parameters=parameters, samples=samples)
+
+
+def test_trials_are_all_combinations_with_separate_draws() -> None:
+    trials = plan(tictactoe(), sweep({"lr": {"loguniform": [1e-4, 1e-2]}, "clip": [0.1, 0.2], "epochs": [2, 3]}, 2))
+    assert [(trial["clip"], trial["epochs"]) for trial in trials] == [
+        (0.1, 2), (0.1, 2), (0.1, 3), (0.1, 3), (0.2, 2), (0.2, 2), (0.2, 3), (0.2, 3),
+    ]  # fmt: skip
+    assert len({trial["lr"] for trial in trials}) == 8
+    assert [list(trial) for trial in trials] == [["lr", "clip", "epochs"]] * 8, "in the order of the configuration"
+
+
+def test_the_seed_determines_the_draws() -> None:
+    parameters = sweep({"lr": {"uniform": [0.1, 0.2]}}, samples=3)
+    assert plan(tictactoe(seed=1), parameters) == plan(tictactoe(seed=1), parameters)
+    assert plan(tictactoe(seed=1), parameters) != plan(tictactoe(seed=2), parameters)
+
+
+@given(st.integers(0, 1000), st.floats(1e-6, 1.0), st.floats(1.001, 100.0))
+def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> None:
+    bounds = [low, low * factor]
+    parameters = {
+        "uniform": {"uniform": bounds},
+        "loguniform": {"loguniform": bounds},
+        "randint": {"randint": [3, 5]},
+        "choice": {"choice": ["a", "b"]},
+    }
+    for trial in plan(tictactoe(seed=seed), sweep(parameters, samples=4)):
+        assert bounds[0] <= trial["uniform"] <= bounds[1]
+        assert bounds[0] <= trial["loguniform"] <= bounds[1]
+        assert trial["randint"] in (3, 4)
+        assert trial["choice"] in ("a", "b")
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([], "at least one value"),
+        ({"lognormal": [1, 2]}, "one of choice, uniform"),
+        ({"uniform": [1, 2], "choice": [1]}, "one of choice, uniform"),
+        ({"uniform": [2, 1]}, "low < high"),
+        ({"uniform": [1]}, "low < high"),
+        ({"uniform": ["a", "b"]}, "low < high"),
+        ({"loguniform": [0, 1]}, "0 < low"),
+        ({"randint": [0.5, 2]}, "whole numbers"),
+        ({"choice": 1}, r"choice: \[value"),
+    ],
+)
+def test_invalid_parameters_are_rejected(values: Any, expected: str) -> None:
+    with pytest.raises(ConfigError, match=rf"sweep\.parameters\.lr: expected .*{expected}"):
+        plan(tictactoe(), sweep({"lr": values}))
+
+
+def test_nested_settings_are_applied() -> None:
+    settings = {"lr": 0.5, "per_policy.shared.entropy": 0.25, "recurrence.width": 7, "hidden": [4]}
+    training = applied(tictactoe(recurrence=None), settings).training
+    assert (training.lr, training.per_policy["shared"].entropy, training.hidden) == (0.5, 0.25, (4,))
+    assert training.recurrence is not None
+    assert training.recurrence.width == 7
+    assert nested(settings) == {
+        "lr": 0.5, "per_policy": {"shared": {"entropy": 0.25}}, "recurrence": {"width": 7}, "hidden": [4],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"lrr": 1}, "did you mean 'lr'"),
+        ({"lr": -1}, r"training\.lr"),
+        ({"lr.shared": 1}, r"training\.lr has no nested settings"),
+        ({"per_policy.shared.width": 1}, r"per_policy\.shared\.width"),
+        ({"minibatch_size": 512, "train_batch_size": 256}, "minibatch_size must be at most"),
+    ],
+)
+def test_invalid_settings_are_rejected(settings: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        applied(tictactoe(), settings)

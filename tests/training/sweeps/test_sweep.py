@@ -1,0 +1,130 @@
+"""Complete sweeps: Ray Tune with several trials, publishing of the best one, interruption."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from league.config import LeagueConfig
+from league.errors import ConfigError, NotFound
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.support.training_leagues import tictactoe
+from tests.support.waiting import until
+from training.sweeps.sweep import sweep
+
+SETTINGS = {"steps": 2048, "train_batch_size": 256, "minibatch_size": 128, "epochs": 2, "checkpoint_every": 256}
+DEADLINE = 120
+
+
+def league(parameters: dict[str, Any], training: dict[str, Any] | None = None, **settings: Any) -> LeagueConfig:
+    document = tictactoe(**SETTINGS | (training or {})).model_dump(by_alias=True)
+    return LeagueConfig.from_mapping(document | {"sweep": {"parameters": parameters, **settings}})
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    registry = Registry.open(Storage.at(tmp_path / "home"))
+    yield registry
+    registry.close()
+
+
+def test_invalid_sweeps_are_rejected_before_training(registry: Registry) -> None:
+    rejected = {
+        "sweep is missing": tictactoe(),
+        "did you mean 'lr'": league({"lrr": [1]}),
+        r"lr -1: .*training\.lr": league({"lr": [0.1, -1]}),
+        r"per_policy\.nobody: unknown policy; the league has shared": league({"per_policy.nobody.lr": [1]}),
+        r"sweep\.metric: unknown metric 'retrun'; expected one of .*shared/return": league(
+            {"lr": [1]}, metric="retrun"
+        ),
+        r"sweep\.asha\.grace_steps": league({"lr": [1]}, asha={"grace_steps": 10**6}),
+    }
+    for words, config in rejected.items():
+        with pytest.raises(ConfigError, match=words):
+            sweep(config, registry=registry)
+    assert not (registry.storage.home / "sweeps").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_bad_trials_stop_early_and_the_best_is_published(registry: Registry) -> None:
+    """The metric is the entropy, so that a trial that learns quickly is the worse one."""
+    parameters = {"lr": [1e-5, 0.05], "per_policy.shared.entropy": [0.0]}
+    asha = {"grace_steps": 512, "reduction_factor": 2}
+    config, output = league(parameters, metric="shared/entropy", asha=asha), io.StringIO()
+    report = sweep(config, registry=registry, console=Console(file=output))
+    good, bad = report.trials
+    assert report.is_whole
+    assert report.best == good
+    assert good.outcome is not None
+    assert bad.outcome is not None
+    assert (good.outcome.steps, good.outcome.ended_early) == (2048, False)
+    assert bad.outcome.ended_early
+    assert bad.outcome.steps < 2048
+    assert good.score is not None
+    assert bad.score is not None
+    assert good.score > bad.score
+    assert "1 of 2: trial 0 (lr 1e-05, per_policy.shared.entropy 0.0): +1." in output.getvalue()
+    assert "ended early" in output.getvalue().splitlines()[-1]
+
+    assert report.version is not None
+    (version,) = registry.versions.all("tictactoe")
+    assert version.ref == report.version.ref
+    assert version.source == f"sweep-{report.path.name}/trial-000/2048"
+    settings = version.manifest.settings
+    assert (settings["lr"], settings["per_policy"]["shared"]["entropy"]) == (1e-5, 0.0)
+    assert not list(report.path.rglob("checkpoints"))
+    for number in (0, 1):
+        events = EventAccumulator(str(report.path / f"trial-00{number}"))
+        assert "shared/entropy" in events.Reload().Tags()["scalars"]
+    with pytest.raises(NotFound, match="complete"):
+        sweep(config, registry=registry, resume=True)
+
+
+SCRIPT = """
+import sys
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.training.sweeps.test_sweep import LONG
+from training.sweeps.sweep import sweep
+sweep(LONG, registry=Registry.open(Storage.at(sys.argv[1])))
+"""
+LONG = league({"steps": [256, 1024]}, training={"epochs": 32, "minibatch_size": 32}, metric="shared/length")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_killed_sweep_continues_with_its_unfinished_trials(registry: Registry) -> None:
+    """The driver is killed with SIGKILL in the second trial, after the end of the first."""
+    home = registry.storage.home
+    driver = subprocess.Popen([sys.executable, "-c", SCRIPT, str(home)], stdout=subprocess.DEVNULL)
+    try:
+        _wait_for(home, "sweeps/tictactoe/*/trial-001/checkpoints/256")
+    finally:
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+    (outcome,) = home.rglob("outcome.json")
+    before = outcome.stat().st_mtime_ns
+    with pytest.raises(ConfigError, match="sweep has changed"):
+        sweep(league({"steps": [256]}, training={"epochs": 32, "minibatch_size": 32}), registry=registry, resume=True)
+    shown = io.StringIO()
+    report = sweep(LONG, registry=registry, resume=True, publish_best=False, console=Console(file=shown))
+    assert outcome.stat().st_mtime_ns == before, "a finished trial is not repeated"
+    assert "trial 0" not in shown.getvalue()
+    assert [trial.outcome.steps for trial in report.trials if trial.outcome] == [256, 1024]
+    assert report.version is None
+    first_of_second_life = EventAccumulator(str(max((report.path / "trial-001").glob("events*"))))
+    assert first_of_second_life.Reload().Scalars("run/steps")[0].step > 256, "the trial continues from its checkpoint"
+
+
+def _wait_for(home: Path, pattern: str) -> None:
+    until(lambda: any(home.glob(pattern)), DEADLINE)

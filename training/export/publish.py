@@ -1,0 +1,122 @@
+"""Publishes a training checkpoint as a version in the registry."""
+
+import shutil
+import subprocess
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
+
+from league.config import LeagueConfig
+from league.interface import Interface
+from league.registry.registry import Registry
+from league.registry.storage.manifest import PROBES, TRAINING, Manifest, PolicyManifest
+from league.registry.storage.rows import VersionRow
+from league.stack import installed
+from training.algorithms.setup import module_spec
+from training.export import parity
+from training.export.onnx_export import export_policy, graph_tensors
+from training.modules.policy_module import PolicyModule
+
+MODULES = Path(COMPONENT_LEARNER_GROUP, COMPONENT_LEARNER, COMPONENT_RL_MODULE)
+"""Where an Algorithm's checkpoint stores the modules."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """RLlib's state on disk.
+
+    source: its unique name, "<run>/<steps>". steps: actions of training, including parents'.
+    """
+
+    path: Path
+    source: str
+    steps: int
+
+
+def publish(
+    checkpoint: Checkpoint,
+    *,
+    registry: Registry,
+    config: LeagueConfig,
+    interface: Interface,
+    parent: int | None,
+    git_commit: str | None,
+) -> VersionRow:
+    """Export the policies of `checkpoint`, check parity, and publish the graphs with the training state.
+
+    Raises ParityError, and what publishing raises; no version exists then.
+    """
+
+    def build(staging: Path, number: int) -> Manifest:
+        modules = load_modules(checkpoint.path, config, interface)
+        observations = parity.collect_observations(config.environment, interface, modules, seed=config.training.seed)
+        policies = {
+            policy: _export(staging, policy, module, interface, observations[policy])
+            for policy, module in modules.items()
+        }
+        shutil.copytree(checkpoint.path, staging / TRAINING)
+        return Manifest(
+            league=config.league,
+            version=number,
+            created_at=datetime.now(UTC),
+            interface=interface,
+            policies=policies,
+            environment=config.environment,
+            environment_digest=config.environment.digest(),
+            algorithm=config.training.algorithm,
+            settings=config.training.model_dump(mode="json", by_alias=True),
+            seed=config.training.seed,
+            steps=checkpoint.steps,
+            parent=parent,
+            git_commit=git_commit,
+            stack=installed(),
+        )
+
+    return registry.publisher.publish(config.league, build, source=checkpoint.source, parent=parent)
+
+
+def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, PolicyModule]:
+    """Return the policies' modules in the state of `checkpoint`. Reads pickles: use on trusted checkpoints only."""
+    modules = module_spec(config.training, interface).build()
+    modules.restore_from_path(checkpoint / MODULES)
+    return {policy: modules[policy] for policy in interface.policy_ids}
+
+
+def git_commit(config_path: Path | None) -> str | None:
+    """Return the HEAD commit of the repository that tracks the league's file, or None."""
+    if config_path is None:
+        return None
+    directory, name = config_path.absolute().parent, config_path.name
+    try:
+        _git(directory, "ls-files", "--error-unmatch", name)
+        return _git(directory, "rev-parse", "HEAD")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(directory: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(directory), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def _export(
+    staging: Path, policy: str, module: PolicyModule, interface: Interface, observations: list[parity.ObservedBatch]
+) -> PolicyManifest:
+    spaces = interface.of_policy(policy)
+    file, probes = f"{policy}.onnx", f"{policy}{PROBES}"
+    export_policy(module, spaces, staging / file)
+    inputs, outputs, state = graph_tensors(module, spaces)
+    proof = parity.check_parity(staging / file, policy, module, observations, spaces.action)
+    (staging / probes).write_bytes(parity.probes(staging / file, observations).to_bytes())
+    return PolicyManifest(
+        file=file,
+        observation=spaces.observation,
+        action=spaces.action,
+        inputs=inputs,
+        outputs=outputs,
+        state=state,
+        parity=proof,
+        probes=probes,
+    )

@@ -1,0 +1,1 @@
+"""Training runs: driver, Ray Tune trial, run directory, progress and publication queue."""

@@ -1,0 +1,104 @@
+"""Displays a run's progress: a bar with return, steps/s and remaining time in a terminal, plain lines elsewhere."""
+
+import time
+from collections.abc import Mapping
+from typing import Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, ProgressColumn, TaskProgressColumn, TextColumn
+from rich.progress import Progress as Bars
+
+from league.registry.storage.rows import VersionRow
+from league.training_config import TrainingSettings
+
+SECONDS_PER_LINE = 10.0
+MAX_POLICIES = 3
+"""Policies shown individually; TensorBoard has all."""
+
+
+class ProgressDisplay:
+    """A bar with a percentage and further `columns`, in a terminal only. A context manager."""
+
+    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
+        self._console = console
+        description, percentage = TextColumn("{task.description}"), TaskProgressColumn()
+        self._bars = Bars(description, BarColumn(24), percentage, *columns, console=console, transient=True)
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # Stopping a bar that was not started prints an empty line.
+        if self._console.is_terminal:
+            self._bars.stop()
+
+    def say(self, sentence: str) -> None:
+        """Print a line above the bar."""
+        self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+
+class TrainingProgress(ProgressDisplay):
+    """The progress of a run. `published` may be called from another thread."""
+
+    def __init__(self, console: Console, settings: TrainingSettings, policies: tuple[str, ...]) -> None:
+        super().__init__(console, TextColumn("{task.fields[pace]}"), TextColumn("{task.fields[doing]}"))
+        self._settings = settings
+        self._policies = policies
+        self._bar = self._bars.add_task("Starting …", total=1.0, pace="", doing="")
+        self._next_line = 0.0
+
+    def update(self, metrics: Mapping[str, Any]) -> None:
+        """Show a trial's latest metrics."""
+        done = fraction(metrics, self._settings)
+        steps, pace = f"{metrics['steps']:,} steps", _pace(metrics, done)
+        doing = policy_summaries(metrics, self._policies)
+        if self._console.is_terminal:
+            self._bars.update(self._bar, completed=done, description=steps, pace=pace, doing=doing)
+        elif time.monotonic() >= self._next_line or metrics.get("done"):
+            self._next_line = time.monotonic() + SECONDS_PER_LINE
+            self.say(f"{done:4.0%}  {steps}  {pace}  {doing}")
+
+    def published(self, version: VersionRow) -> None:
+        """Print that a version was published."""
+        parity = [policy.parity for policy in version.manifest.policies.values()]
+        observations = sum(proof.observations for proof in parity)
+        self.say(
+            f"Published {version.ref} after {version.steps:,} steps: matches the trained policy on "
+            f"{observations:,} observations."
+        )
+
+
+def fraction(metrics: Mapping[str, Any], settings: TrainingSettings) -> float:
+    """Return the fraction of the budget spent: of steps or of time, whichever is larger."""
+    spent = metrics["steps"] / settings.steps
+    if settings.minutes is not None:
+        spent = max(spent, metrics["seconds"] / (60 * settings.minutes))
+    return min(spent, 1.0)
+
+
+def policy_summaries(metrics: Mapping[str, Any], policies: tuple[str, ...]) -> str:
+    """Return a summary of the first few policies' metrics."""
+    shown = "; ".join(_policy_summary(policy, metrics) for policy in policies[:MAX_POLICIES])
+    more = len(policies) - MAX_POLICIES
+    return f"{shown}; {more} more" if more > 0 else shown
+
+
+def _policy_summary(policy: str, metrics: Mapping[str, Any]) -> str:
+    shown = (("return", "+.2f"), ("length", ".1f"), ("entropy", ".2f"))
+    values = [f"{name} {metrics[key]:{form}}" for name, form in shown if (key := f"{policy}/{name}") in metrics]
+    return f"{policy}: " + (", ".join(values) or "no finished episode yet")
+
+
+def _pace(metrics: Mapping[str, Any], done: float) -> str:
+    left = metrics["seconds"] * (1 - done) / done if done else 0.0
+    speed = f"{metrics['steps_per_second']:,.0f} steps/s  " if "steps_per_second" in metrics else ""
+    return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(left)} left"
+
+
+def clock(seconds: float) -> str:
+    """Format seconds as minutes and seconds, with hours if needed."""
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

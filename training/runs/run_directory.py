@@ -1,0 +1,218 @@
+"""The directory of a training run: its record, pinned opponents, checkpoints and lock.
+
+<home>/runs/<league>/<run>/
+    run.json            the run's configuration; written before training and on completion
+    lock                held while a driver works on the run
+    attempt-<n>/        Tune's trial and its TensorBoard files; a new attempt at each start
+        stop                created to request that the trial saves and ends
+        checkpoints/<steps>/    RLlib's state, until it is published
+"""
+
+import json
+import math
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict
+
+from league.config import LeagueConfig
+from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.files import disk_errors, replacing
+from league.interface import Interface
+from league.policies.loading import contestant
+from league.refs import CheckpointRef, of_league, parse_ref
+from league.registry.registry import Registry
+from league.settings import Storage
+from league.training_config import TrainingSettings
+
+
+def write(record: BaseModel, path: Path) -> None:
+    """Replace the record at `path` atomically."""
+    with replacing(path) as draft:
+        draft.write_text(record.model_dump_json(indent=2, by_alias=True))
+
+
+@contextmanager
+def locked(directory: Path, what: str) -> Iterator[None]:
+    """Exclude other processes from `directory`. Raises AlreadyRunning. The lock ends with the process."""
+    lock = FileLock(directory / "lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise AlreadyRunning(f"{what} is running in another process") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface) -> dict[str, str]:
+    """Resolve each opponent of `training.opponents`: reference as written → `script:name` or `league@number`.
+
+    Raises what loading an opponent raises: it does not exist, or does not fit the league.
+    """
+    pins = {}
+    for opponent in config.training.opponents:
+        ref = parse_ref(of_league(opponent.ref, config.league))
+        pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
+        contestant(pinned, registry, interface)
+        pins[opponent.ref] = pinned
+    return pins
+
+
+def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
+    """Return the league with its opponents replaced by what they are pinned to; others are unchanged."""
+    opponents = [
+        opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in config.training.opponents
+    ]
+    return config.with_training(opponents=opponents)
+
+
+RUN_FILE = "run.json"
+ATTEMPT = "attempt-"
+CHECKPOINTS = "checkpoints"
+STOP_FILE = "stop"
+RESUMABLE_SETTINGS = {
+    "steps",
+    "minutes",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "runners",
+    "gpus",
+    "runner_gpus",
+    "crashes",
+}
+"""Training settings that may change when a run is resumed: duration and resources, not what is learned."""
+
+
+class RunRecord(BaseModel):
+    """The content of run.json."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    config: LeagueConfig
+    """The league, with pinned opponents."""
+    pins: dict[str, str] = {}
+    """Opponents as the user wrote them → what they resolved to when the run began."""
+    parent: int | None
+    git_commit: str | None
+    started_at: datetime
+    complete: bool = False
+
+
+class RunDirectory:
+    """One training run of a league."""
+
+    def __init__(self, path: Path, record: RunRecord) -> None:
+        self.path = path
+        self.record = record
+
+    @property
+    def id(self) -> str:
+        """Unique among all runs: its start time and a random part."""
+        return self.path.name
+
+    @classmethod
+    def begin(
+        cls,
+        storage: Storage,
+        config: LeagueConfig,
+        parent: int | None,
+        git_commit: str | None,
+        pins: dict[str, str] | None = None,
+    ) -> Self:
+        """Create the directory of a new run. pins: what the opponents' references resolve to."""
+        pins = pins or {}
+        config = with_pins(config, pins)
+        now = datetime.now(UTC)
+        path = _runs(storage, config.league) / f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+        run = cls(path, RunRecord(config=config, pins=pins, parent=parent, git_commit=git_commit, started_at=now))
+        with disk_errors(path):
+            path.mkdir(parents=True)
+            run._write()
+        return run
+
+    @classmethod
+    def resume(cls, storage: Storage, config: LeagueConfig) -> Self:
+        """Open the league's newest run if it is incomplete: it was interrupted, or its budget is larger now.
+
+        Raises NotFound; ConfigError if `config` differs.
+        """
+        runs = _runs(storage, config.league)
+        newest = max(runs.glob(f"*/{RUN_FILE}"), default=None)
+        if newest is None:
+            raise NotFound(f"league {config.league} has no training run in {runs}: there is nothing to resume")
+        record = RunRecord.model_validate_json(newest.read_text())
+        config = with_pins(config, record.pins)
+        if (changed := changed_setting(record.config, config)) is not None:
+            raise ConfigError(
+                f"{changed} has changed since training run {newest.parent.name} began, so it cannot be resumed: "
+                f"start a new run, with --from to continue from a version"
+            )
+        if record.complete and not _has_larger_budget(record.config.training, config.training):
+            raise NotFound(
+                f"training run {newest.parent.name} is complete: there is nothing to resume, unless --steps or"
+                " --minutes is larger"
+            )
+        run = cls(newest.parent, record.model_copy(update={"config": config, "complete": False}))
+        run._write()
+        return run
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Exclude other drivers. Raises AlreadyRunning. The lock ends with the process."""
+        return locked(self.path, f"training run {self.id}")
+
+    def attempts(self) -> list[Path]:
+        """Return the directories of the run's starts, oldest first."""
+        return sorted(self.path.glob(f"{ATTEMPT}*"), key=lambda attempt: int(attempt.name.removeprefix(ATTEMPT)))
+
+    def next_attempt(self) -> Path:
+        """Return the directory of the next start."""
+        last = max((int(attempt.name.removeprefix(ATTEMPT)) for attempt in self.attempts()), default=0)
+        return self.path / f"{ATTEMPT}{last + 1}"
+
+    def checkpoints(self) -> list[Path]:
+        """Return complete, unpublished checkpoints by their steps."""
+        found = self.path.glob(f"{ATTEMPT}*/{CHECKPOINTS}/*")
+        return sorted((path for path in found if path.name.isdigit()), key=lambda path: int(path.name))
+
+    def remove_checkpoints(self) -> None:
+        """Delete the checkpoints of earlier attempts, complete or not, after all complete ones are published."""
+        for attempt in self.attempts():
+            shutil.rmtree(attempt / CHECKPOINTS, ignore_errors=True)
+
+    def complete(self) -> None:
+        """Record that the budget is spent and everything is published."""
+        self.record = self.record.model_copy(update={"complete": True})
+        self._write()
+
+    def _write(self) -> None:
+        write(self.record, self.path / RUN_FILE)
+
+
+def _runs(storage: Storage, league: str) -> Path:
+    return storage.home / "runs" / league
+
+
+def changed_setting(old: LeagueConfig, new: LeagueConfig) -> str | None:
+    """Return the first setting that differs and affects what is learned."""
+    for key in ("environment", "policies"):
+        if getattr(old, key) != getattr(new, key):
+            return key
+    before, after = (json.loads(config.training.model_dump_json(by_alias=True)) for config in (old, new))
+    for key in before.keys() | after.keys():
+        if key not in RESUMABLE_SETTINGS and before.get(key) != after.get(key):
+            return f"training.{key}"
+    return None
+
+
+def _has_larger_budget(old: TrainingSettings, new: TrainingSettings) -> bool:
+    """Return whether one limit is larger; the trial checks the other one."""
+    before, now = (settings.minutes or math.inf for settings in (old, new))
+    return new.steps > old.steps or now > before

@@ -1,0 +1,229 @@
+"""Runs one training run: Ray Tune trains, and the driver publishes each checkpoint as a version."""
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+from ray import tune
+from rich.console import Console
+
+from league.config import LeagueConfig
+from league.environments.building import interface as interface_of
+from league.errors import ConfigError, InterfaceChanged
+from league.interface import Interface
+from league.ray_cluster import UNLIMITED, LocalRay, connected
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.registry.storage.manifest import TRAINING
+from league.registry.storage.rows import VersionRow
+from league.training_config import AnyTraining, TrainingConfig
+from training.algorithms.off_policy import starts_with_empty_replay
+from training.algorithms.setup import algorithm_config, module_spec
+from training.export.publish import git_commit
+from training.rllib_compat import NotPickled, silence_tune
+from training.runs.error_messages import training_error
+from training.runs.progress import TrainingProgress
+from training.runs.publish_queue import PublishQueue, published_versions
+from training.runs.run_directory import CHECKPOINTS, STOP_FILE, RunDirectory, pin_opponents
+from training.runs.run_reporter import RunReporter
+from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
+from training.runs.tune import Interrupted, cpu_share, fit, placement, run_config
+
+NETWORK_SETTINGS = (
+    *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
+    *("dueling", "noisy", "distributional"),
+    *("mixer", "mixing_width", "groups"),
+)
+"""Settings that define the network: a version's weights require the same values."""
+
+
+def train(
+    config: LeagueConfig,
+    *,
+    registry: Registry,
+    parent: CheckpointRef | None = None,
+    resume: bool = False,
+    address: str | None = None,
+    local: LocalRay = UNLIMITED,
+    config_path: Path | None = None,
+    console: Console | None = None,
+) -> list[VersionRow]:
+    """Train `config` until its budget (`training.steps`, `training.minutes`) is spent.
+
+    Registers the league, runs one Ray Tune trial, shows its progress, records it in the registry, writes TensorBoard
+    files to `<home>/runs/<league>/<run>`, and publishes a version at each checkpoint.
+
+    The first SIGINT or SIGTERM saves and publishes the current state, and raises Interrupted. A second one raises
+    KeyboardInterrupt immediately. The run can be resumed in both cases.
+
+    Args:
+        config: The league.
+        registry: Where versions are published.
+        parent: The version to continue from; the first version of the run records it as its parent.
+        resume: Continue the league's newest run, which was interrupted or has a larger budget now. Its versions stay,
+            and checkpoints that were saved but not published are published first. With a checkpoint interval in steps
+            and one runner, the versions equal those of an uninterrupted run.
+        address: A running Ray cluster. None uses the Ray that this process is connected to, or starts one.
+        local: Limits of a Ray that is started; it ends with the run.
+        config_path: The file of `config`; its git commit is recorded in the manifests.
+        console: Where progress is shown: a bar in a terminal, plain lines elsewhere.
+
+    Returns:
+        All versions of this run, ascending, including those from before an interruption.
+
+    Raises:
+        LeagueError: Nothing to resume, or changed settings; an unknown or incompatible parent; missing or incompatible
+            opponents; a run that another process works on; a cluster whose machines do not share storage; a fault of
+            the environment; an export that fails its parity check (earlier versions stay).
+    """
+    if resume and parent is not None:
+        raise ConfigError("a resumed run already has its parent: use either --from or --resume")
+    silence_tune()
+    interface = interface_of(config)
+    check(config, interface)
+    registry.leagues.register(config, interface)
+    number = None if parent is None else _parent(registry, parent, config, interface).number
+    interrupted = RunDirectory.resume(registry.storage, config) if resume else None
+    pins = {} if interrupted else pin_opponents(config, registry, interface)
+    with connected(address, registry.storage, local) as dashboard:
+        run = interrupted or RunDirectory.begin(registry.storage, config, number, git_commit(config_path), pins)
+        progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
+        with run.locked(), progress, RunReporter(registry, run) as reporter:
+            if dashboard:
+                progress.say(f"Ray's dashboard: {dashboard}")
+            _train_and_publish(run, registry, interface, progress, reporter)
+    return published_versions(registry, run)
+
+
+def check(config: LeagueConfig, interface: Interface) -> None:
+    """Raise ConfigError for invalid settings before anything is started."""
+    algorithm_config(config, interface)
+    module_spec(config.training, interface).build()
+
+
+def _train_and_publish(
+    run: RunDirectory, registry: Registry, interface: Interface, progress: TrainingProgress, reporter: RunReporter
+) -> None:
+    publisher = PublishQueue(run, registry, interface, progress)
+    try:
+        _publish_remaining(run, publisher)
+        spent = _tune(run, interface, registry, publisher, progress, reporter)
+    except Exception:
+        publisher.join()
+        raise
+    publisher.join()
+    if not spent:
+        published = ", ".join(version.ref for version in published_versions(registry, run)) or "nothing yet"
+        raise Interrupted(f"Ended early. Published: {published}. TensorBoard: {run.path}. To continue: --resume.")
+    run.complete()
+
+
+def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interface: Interface) -> VersionRow:
+    """Return the version to continue from, which must fit the league and its network."""
+    if ref.league != config.league:
+        raise ConfigError(f"--from: {ref} belongs to another league than {config.league}")
+    version = registry.versions.resolve(ref)
+    if version.manifest.interface.digest() != interface.digest():
+        raise InterfaceChanged(f"{version.ref} has other spaces or policies than the environment now")
+    check_network(version, config)
+    return version
+
+
+def check_network(version: VersionRow, config: LeagueConfig) -> None:
+    """Raise ConfigError if `config` defines another network than the version. Missing settings have defaults."""
+    settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
+    for key in NETWORK_SETTINGS:
+        # Each algorithm has a subset of them.
+        if (was := before.get(key)) != (wanted := now.get(key)):
+            raise ConfigError(f"training.{key}: {version.ref} was trained with {was}, got {wanted}")
+
+
+def _publish_remaining(run: RunDirectory, publisher: PublishQueue) -> None:
+    """Publish the checkpoints of earlier attempts, then delete them."""
+    for checkpoint in run.checkpoints():
+        publisher.add(checkpoint)
+    publisher.join()
+    run.remove_checkpoints()
+
+
+def _start(run: RunDirectory, registry: Registry) -> StartState:
+    """Return the state to train from: the run's newest version, otherwise its parent, otherwise none."""
+    parent, league = run.record.parent, run.record.config.league
+    before = registry.versions.get(league, parent).steps if parent is not None else 0
+    published = published_versions(registry, run)
+    if published:
+        state = registry.versions.fetch(league, published[-1].number) / TRAINING
+        steps, seconds = read_progress(state)
+        return StartState(state, steps, before, seconds)
+    if parent is not None:
+        return StartState(registry.versions.fetch(league, parent) / TRAINING, before, before, 0.0)
+    return FROM_SCRATCH
+
+
+def _tune(
+    run: RunDirectory,
+    interface: Interface,
+    registry: Registry,
+    publisher: PublishQueue,
+    progress: TrainingProgress,
+    reporter: RunReporter,
+) -> bool:
+    """Run one attempt as a Tune experiment of one trial. Returns whether the budget is spent."""
+    config, attempt = run.record.config, run.next_attempt()
+    (attempt / CHECKPOINTS).mkdir(parents=True)
+    share = cpu_share(config.training.runners)
+    start = _start(run, registry)
+    if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
+        progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
+    plan = TrialPlan(start, attempt / CHECKPOINTS, attempt / STOP_FILE, registry.storage, cpus=share)
+    reporter.begin(start.steps - start.steps_before_run, start.seconds)
+
+    def request_stop() -> None:
+        plan.stop_file.touch()
+        progress.say("Ending after this update, then publishing. Press Ctrl-C again to end immediately.")
+
+    tuner = tune.Tuner(
+        tune.with_resources(Trial, placement(config.training, share)),
+        param_space={
+            "league": config.model_dump(mode="json", by_alias=True),
+            "interface": interface.model_dump(mode="json"),
+            "plan": plan,
+        },
+        tune_config=tune.TuneConfig(trial_dirname_creator=lambda _: attempt.name),
+        run_config=run_config(
+            run.path, [_ResultCallback(publisher, progress, reporter)], _StopOnPublishError(publisher)
+        ),
+    )
+    result = fit(tuner, request_stop)[0]
+    if result.error is not None:
+        raise training_error(result.error, config.league, attempt / "error.txt") from result.error
+    return bool((result.metrics or {}).get("spent"))
+
+
+class _ResultCallback(NotPickled, tune.Callback):
+    """Receives each result of the trial in the driver's process."""
+
+    def __init__(self, publisher: PublishQueue, progress: TrainingProgress, reporter: RunReporter) -> None:
+        self._publisher = publisher
+        self._progress = progress
+        self._reporter = reporter
+
+    def on_trial_result(self, *, result: dict[str, Any], **_: Any) -> None:
+        self._progress.update(result)
+        self._reporter.report(result)
+        if "checkpoint" in result:
+            self._publisher.add(Path(result["checkpoint"]))
+
+
+class _StopOnPublishError(NotPickled, tune.Stopper):
+    """Ends training when a version cannot be published."""
+
+    def __init__(self, publisher: PublishQueue) -> None:
+        self._publisher = publisher
+
+    def __call__(self, *_: Any) -> bool:
+        return self.stop_all()
+
+    def stop_all(self) -> bool:
+        return self._publisher.error is not None

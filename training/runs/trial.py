@@ -1,0 +1,188 @@
+"""The Ray Tune trial that trains: RLlib's Algorithm, a few updates per step, and its checkpoints.
+
+A checkpoint is saved at the first update that reaches its interval. All episodes and random choices are reset at this
+point, so that training resumed from it continues identically. With an interval in steps, a run's versions are therefore
+the same, however often it was interrupted (one runner, one machine). With intervals or budgets in minutes, they depend
+on the machine's speed.
+"""
+
+import json
+import math
+import os
+import shutil
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from ray import tune
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
+
+from league.config import LeagueConfig
+from league.files import move_durably
+from league.interface import Interface
+from league.settings import Storage
+from training.algorithms.metrics import CHECKPOINT_TIME, gpu_use, time_each_update, totals, training_metrics
+from training.algorithms.setup import algorithm_config
+from training.rllib_compat import wait_for_runners
+
+REPORT_SECONDS = 2.0
+"""Interval between a trial's reports, in seconds."""
+MAX_THREADS = 4
+"""More do not accelerate networks of a few hundred units."""
+PROGRESS_FILE = "progress.json"
+"""In a checkpoint, beside RLlib's state: steps and seconds of training so far."""
+
+
+@dataclass(frozen=True, slots=True)
+class StartState:
+    """The state that a trial starts from.
+
+    checkpoint: RLlib's state, or None. steps: actions so far, including parents'. steps_before_run: parents' actions
+    only.
+    seconds: training time of this run so far.
+    """
+
+    checkpoint: Path | None
+    steps: int
+    steps_before_run: int
+    seconds: float
+
+
+FROM_SCRATCH = StartState(None, 0, 0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class TrialPlan:
+    """What a trial needs besides its league.
+
+    start: the initial state. checkpoints: the directory for checkpoints. stop_file: a file whose existence requests
+    that the trial saves and ends. cpus: of the learner and of each runner. threads: of the learner, at most.
+    """
+
+    start: StartState
+    checkpoints: Path
+    stop_file: Path
+    storage: Storage
+    cpus: float = 1.0
+    threads: int = MAX_THREADS
+
+
+class Trial(tune.Trainable):
+    """Trains until the budget is spent or a stop is requested. config: dumped `league` and `interface`, and a `plan`.
+
+    A result contains the path of the checkpoint, if one was saved, and whether the budget is `spent`.
+    """
+
+    def setup(self, config: dict[str, Any]) -> None:
+        self.league = LeagueConfig.model_validate(config["league"])
+        self.interface = Interface.model_validate(config["interface"])
+        self.plan: TrialPlan = config["plan"]
+        # Runners are idle while the learner works: it may use all cores.
+        torch.set_num_threads(min(os.cpu_count() or 1, self.plan.threads))
+        start = self.plan.start
+        self.algorithm = build_algorithm(
+            self.league, self.interface, start.checkpoint, self.plan.cpus, self.plan.storage
+        )
+        self.algorithm.reset_episodes(start.steps)
+        self.steps = self.saved_steps = start.steps
+        self.seconds = start.seconds
+        self._plan_checkpoint()
+
+    def step(self) -> dict[str, Any]:
+        """Update until a report is due; return the latest value of each metric."""
+        metrics: dict[str, Any] = {}
+        sums: Counter[str] = Counter()
+        began, steps = time.monotonic(), self.steps
+        while time.monotonic() - began < REPORT_SECONDS and not self._due():
+            updated = time.monotonic()
+            result = self.algorithm.train()
+            self.seconds += time.monotonic() - updated
+            self.steps += int(result[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED])
+            metrics |= training_metrics(result, self.interface)
+            sums.update(totals(result))
+        elapsed = time.monotonic() - began
+        if self.steps > steps:
+            metrics |= sums | gpu_use() | {"steps_per_second": (self.steps - steps) / elapsed}
+        done = self._spent() or self._stop_requested()
+        if (done or self._due()) and self.steps > self.saved_steps:
+            saving = time.monotonic()
+            metrics["checkpoint"] = str(self._save())
+            metrics[CHECKPOINT_TIME] = time.monotonic() - saving
+        return metrics | {
+            "timesteps_total": self.steps,
+            "steps": self.steps - self.plan.start.steps_before_run,
+            "seconds": self.seconds,
+            "spent": self._spent(),
+            "done": done,
+        }
+
+    def cleanup(self) -> None:
+        self.algorithm.stop()
+
+    def _due(self) -> bool:
+        reached = self.steps >= self.next_steps or self.seconds >= self.next_seconds
+        return reached or self._spent() or self._stop_requested()
+
+    def _spent(self) -> bool:
+        settings = self.league.training
+        out_of_time = settings.minutes is not None and self.seconds >= 60 * settings.minutes
+        return out_of_time or self.steps - self.plan.start.steps_before_run >= settings.steps
+
+    def _stop_requested(self) -> bool:
+        return self.plan.stop_file.exists()
+
+    def _plan_checkpoint(self) -> None:
+        """Schedule the next multiple of the interval since the run began, which an interruption does not shift."""
+        settings, before = self.league.training, self.plan.start.steps_before_run
+        self.next_steps = before + _next_multiple(self.steps - before, settings.checkpoint_every)
+        minutes = settings.checkpoint_minutes
+        self.next_seconds = _next_multiple(self.seconds, None if minutes is None else 60 * minutes)
+
+    def _save(self) -> Path:
+        """Save a checkpoint and rename it once complete, so that a named directory is always complete."""
+        target = self.plan.checkpoints / str(self.steps)
+        draft = target.with_name(f"{target.name}.part")
+        shutil.rmtree(draft, ignore_errors=True)
+        self.algorithm.save_to_path(str(draft))
+        progress = {"steps": self.steps, "seconds": self.seconds}
+        (draft / PROGRESS_FILE).write_text(json.dumps(progress))
+        move_durably(draft, target)
+        self.saved_steps = self.steps
+        self._plan_checkpoint()
+        self.algorithm.reset_episodes(self.steps)
+        return target
+
+
+def _next_multiple(done: float, every: float | None) -> float:
+    """Return the first multiple of `every` beyond `done`; infinity without `every`."""
+    return math.inf if every is None else (done // every + 1) * every
+
+
+def build_algorithm(
+    league: LeagueConfig,
+    interface: Interface,
+    checkpoint: Path | None = None,
+    runner_cpus: float = 1.0,
+    storage: Storage | None = None,
+) -> Algorithm:
+    """Build a league's RLlib Algorithm, with the state of `checkpoint` if given.
+
+    storage: where to load opponents' versions from; required only with such opponents.
+    """
+    config = algorithm_config(league, interface, storage)
+    algorithm = config.env_runners(num_cpus_per_env_runner=runner_cpus).build_algo()
+    time_each_update(algorithm)
+    if checkpoint is not None:
+        wait_for_runners(algorithm)
+        algorithm.restore_from_path(str(checkpoint))
+    return algorithm
+
+
+def read_progress(checkpoint: Path) -> tuple[int, float]:
+    """Return the steps and seconds of a checkpoint."""
+    progress = json.loads((checkpoint / PROGRESS_FILE).read_text())
+    return int(progress["steps"]), float(progress["seconds"])

@@ -1,0 +1,346 @@
+"""Records transitions for replay: each from an agent's action to its own next observation, or to its end.
+
+Columns of `PolicyTransitions`, one block per policy, rows (k, …):
+
+| `observations/<input>` | in the environment's dtype; `action_mask` is an input like any other |
+| `actions` | raw: (k,) int64 or (k, m) float32, see league/policies/actions.py |
+| `rewards` | float32, sum since the action; in turn-based games it includes other agents' moves |
+| `terminated`, `truncated` | of the agent; only truncated agents are bootstrapped |
+| `next_observations/<input>` | at the agent's own next turn, or its last observation |
+| `recurrent_state/<key>` | of a recurrent policy: the state before the action |
+
+Columns of `JointTransitions`, one block for all policies, one row per step of an environment. Policy p has n_p agents,
+in the order of the environment's `possible_agents`, as an additional axis of its columns:
+
+| `observations/<p>/<input>`, `next_observations/<p>/<input>` | (k, n_p, …); zeros for absent agents |
+| `actions/<p>` | (k, n_p) or (k, n_p, m) |
+| `rewards/<p>`, `terminated/<p>`, `truncated/<p>` | (k, n_p) |
+| `recurrent_state/<p>/<key>` | (k, n_p, width) |
+| `present/<p>` | (k, n_p) bool: whether the agent acted; otherwise its other columns are meaningless |
+| `state`, `next_state` | (k, s) float32: the environment's own, else all flattened observations without masks |
+
+`next_state` of a finished episode is the state in which it ended, not the next episode's first.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environment_config import EnvironmentConfig
+from league.environments.lockstep import stepping
+from league.environments.stepping import EpisodeStart, Turn
+from league.errors import EnvironmentMismatch
+from league.interface import AgentInterface, Interface
+from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, inputs
+from training.replay_buffer import NEXT, Rows, TransitionBlock
+from training.sampling.reset_seeds import ResetSeeds
+
+OBSERVATIONS, ACTIONS, REWARDS, TERMINATED, TRUNCATED = "observations", "actions", "rewards", "terminated", "truncated"
+PRESENT, STATE, RECURRENT_STATE = "present", "state", "recurrent_state"
+JOINT = "joint"
+"""The key of the buffer of joint transitions, in place of a policy id."""
+Initial = Mapping[str, Mapping[str, NDArray]]
+"""Policy id → initial recurrent state, key → (width,); empty if not recurrent."""
+STATELESS: Initial = {}
+
+
+@dataclass
+class _OpenTransitions:
+    """The last observations and actions of a policy's agents. A place is env · n_p + index of the agent in its
+    policy."""
+
+    is_open: NDArray
+    is_first: NDArray
+    observations: Rows = field(default_factory=dict)
+    recurrent_state: Rows = field(default_factory=dict)
+    actions: NDArray | None = None
+    places: NDArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Places of the rows that must act now."""
+
+
+class PolicyTransitions:
+    """Records each policy's own transitions, in the order in which they are completed."""
+
+    def __init__(
+        self, interface: Interface, agents: Sequence[str], num_envs: int, initial: Initial = STATELESS
+    ) -> None:
+        self._num_envs, self._initial = num_envs, initial
+        self._policies = interface.policy_ids
+        by_agent = [interface.policies[agent] for agent in agents]
+        self._policy_of = by_agent
+        self._number = [by_agent[:i].count(policy) for i, policy in enumerate(by_agent)]
+        self._sizes = {policy: by_agent.count(policy) for policy in self._policies}
+        self._stream_offset = 0
+        self._closed: dict[str, list[TransitionBlock]] = {policy: [] for policy in self._policies}
+
+    def begin(self, seeds: ResetSeeds) -> None:
+        self._stream_offset = seeds.runner * self._num_envs
+
+    def restart(self) -> None:
+        self._open = {
+            policy: _OpenTransitions(
+                np.zeros(self._num_envs * n, dtype=bool),
+                np.ones(self._num_envs * n, dtype=bool),
+                recurrent_state={
+                    key: np.stack([each] * self._num_envs * n) for key, each in self._initial.get(policy, {}).items()
+                },
+            )
+            for policy, n in self._sizes.items()
+        }
+
+    def read(self, turn: Turn) -> None:
+        for policy, block in self.close(turn).items():
+            self._closed[policy].append(block)
+
+    def act(
+        self,
+        policy: str,
+        raw: NDArray,
+        log_p: NDArray,  # noqa: ARG002  # off-policy learners do not use it
+        dist_inputs: NDArray,  # noqa: ARG002
+        state: Mapping[str, NDArray] | None,
+    ) -> None:
+        own = self._open[policy]
+        for key, kept in own.recurrent_state.items():
+            assert state is not None, "a recurrent policy has a state"
+            kept[own.places] = state[key]
+        if own.actions is None:
+            own.actions = np.zeros((len(own.is_open), *raw.shape[1:]), raw.dtype)
+        own.actions[own.places] = raw
+        own.is_open[own.places] = True
+
+    def cut(self) -> dict[str, TransitionBlock]:
+        """Return policy id → transitions completed since the last cut; policies without any are left out."""
+        cut = {policy: concatenate(blocks) for policy, blocks in self._closed.items() if blocks}
+        self._closed = {policy: [] for policy in self._policies}
+        return cut
+
+    def close(self, turn: Turn) -> dict[str, TransitionBlock]:
+        """Return the transitions that a turn completes, and store its rows as the latest observations."""
+        for env in turn.crashed:
+            for policy, n in self._sizes.items():
+                left = slice(env * n, (env + 1) * n)
+                self._open[policy].is_open[left] = False
+                self._open[policy].is_first[left] = True
+        closed: dict[str, list[TransitionBlock]] = {policy: [] for policy in self._policies}
+        self._close_endings(turn, closed)
+        for own in self._open.values():
+            own.places = own.places[:0]
+        for group, batch in turn.batches.items():
+            if not isinstance(group, str):
+                continue
+            numbers = np.array([self._number[agent] for agent in batch.agents], dtype=np.int64)
+            places = np.array(batch.envs, dtype=np.int64) * self._sizes[group] + numbers
+            rewards, unended = np.array(batch.rewards, dtype=np.float32), np.zeros(len(places), dtype=bool)
+            self._close(group, places, batch.observations, rewards, unended, unended, closed)
+            self._observe(group, places, batch.observations)
+        return {policy: concatenate(blocks) for policy, blocks in closed.items() if blocks}
+
+    def _close_endings(self, turn: Turn, closed: dict[str, list[TransitionBlock]]) -> None:
+        for policy in self._policies:
+            endings = [ending for ending in turn.endings if self._policy_of[ending.agent] == policy]
+            if not endings:
+                continue
+            n = self._sizes[policy]
+            places = np.array([ending.env * n + self._number[ending.agent] for ending in endings], dtype=np.int64)
+            observations = {
+                name: np.stack([ending.observation[name] for ending in endings]) for name in endings[0].observation
+            }
+            rewards = np.array([ending.reward for ending in endings], dtype=np.float32)
+            terminated = np.array([ending.terminated for ending in endings], dtype=bool)
+            truncated = np.array([ending.truncated for ending in endings], dtype=bool) & ~terminated
+            self._close(policy, places, observations, rewards, terminated, truncated, closed)
+            self._open[policy].is_open[places] = False
+            self._open[policy].is_first[places] = True
+
+    def _close(
+        self,
+        policy: str,
+        places: NDArray,
+        observations: Rows,
+        rewards: NDArray,
+        terminated: NDArray,
+        truncated: NDArray,
+        closed: dict[str, list[TransitionBlock]],
+    ) -> None:
+        own = self._open[policy]
+        chosen = np.flatnonzero(own.is_open[places])
+        if not len(chosen):
+            return
+        places = places[chosen]
+        assert own.actions is not None, "an open place has acted"
+        rows = {f"{OBSERVATIONS}/{name}": seen[places] for name, seen in own.observations.items()}
+        rows |= {f"{RECURRENT_STATE}/{key}": before[places] for key, before in own.recurrent_state.items()}
+        rows |= {ACTIONS: own.actions[places], REWARDS: rewards[chosen]}
+        rows |= {TERMINATED: terminated[chosen], TRUNCATED: truncated[chosen]}
+        rows |= {
+            f"{NEXT}{OBSERVATIONS}/{name}": np.asarray(observations[name])[chosen].astype(seen.dtype, copy=False)
+            for name, seen in own.observations.items()
+        }
+        streams = self._stream_offset * self._sizes[policy] + places
+        closed[policy].append(TransitionBlock(rows, streams, own.is_first[places]))
+        own.is_first[places] = False
+        own.is_open[places] = False
+
+    def _observe(self, policy: str, places: NDArray, observations: Rows) -> None:
+        own = self._open[policy]
+        if not own.observations:
+            own.observations = {
+                name: np.zeros((len(own.is_open), *rows.shape[1:]), rows.dtype) for name, rows in observations.items()
+            }
+        for name, rows in observations.items():
+            own.observations[name][places] = rows
+        own.places = places
+
+    def sizes(self) -> dict[str, int]:
+        """Return policy id → number of its agents, n_p."""
+        return dict(self._sizes)
+
+    def still_open(self, envs: NDArray) -> bool:
+        """Return whether an agent of these environments has acted and has no next observation yet."""
+        return any(
+            own.is_open.reshape(self._num_envs, self._sizes[policy])[envs].any() for policy, own in self._open.items()
+        )
+
+
+class JointTransitions:
+    """Records the transitions of all agents in one step as one row. All present agents must act simultaneously."""
+
+    keeps_states = True
+
+    def __init__(
+        self, interface: Interface, agents: Sequence[str], num_envs: int, initial: Initial = STATELESS
+    ) -> None:
+        self._own = PolicyTransitions(interface, agents, num_envs, initial)
+        self._num_envs = num_envs
+        self._stream_offset = 0
+        self._closed: list[TransitionBlock] = []
+        self._states: NDArray | None = None
+        self._empty = {
+            policy: _empty_block(interface.of_policy(policy), initial.get(policy, {}))
+            for policy in interface.policy_ids
+        }
+
+    def begin(self, seeds: ResetSeeds) -> None:
+        self._own.begin(seeds)
+        self._stream_offset = seeds.runner * self._num_envs
+
+    def restart(self) -> None:
+        self._own.restart()
+
+    def read(self, turn: Turn) -> None:
+        """Raises EnvironmentMismatch if agents take turns."""
+        own = self._own.close(turn)
+        if own:
+            envs = np.unique(np.concatenate([self._envs_of(policy, block) for policy, block in own.items()]))
+            if self._own.still_open(envs):
+                raise EnvironmentMismatch(
+                    "the agents of one step receive their next observations at different times: joint transitions"
+                    " require an environment in which all agents act at once"
+                )
+            self._closed.append(self._joint_rows(envs, own, turn))
+        self._keep_states(turn)
+
+    def act(
+        self, policy: str, raw: NDArray, log_p: NDArray, dist_inputs: NDArray, state: Mapping[str, NDArray] | None
+    ) -> None:
+        self._own.act(policy, raw, log_p, dist_inputs, state)
+
+    def cut(self) -> dict[str, TransitionBlock]:
+        """Return {JOINT: transitions completed since the last cut}; empty if there are none."""
+        closed, self._closed = self._closed, []
+        return {JOINT: concatenate(closed)} if closed else {}
+
+    def _envs_of(self, policy: str, block: TransitionBlock) -> NDArray:
+        return block.streams // self._own.sizes()[policy] - self._stream_offset
+
+    def _joint_rows(self, envs: NDArray, own: Mapping[str, TransitionBlock], turn: Turn) -> TransitionBlock:
+        rows: Rows = {}
+        firsts = np.zeros(len(envs), dtype=bool)
+        for policy, n in self._own.sizes().items():
+            block = own.get(policy, self._empty[policy])
+            places = np.searchsorted(envs, self._envs_of(policy, block)), block.streams % n
+            firsts[places[0]] |= block.firsts
+            rows[f"{PRESENT}/{policy}"] = np.zeros((len(envs), n), dtype=bool)
+            rows[f"{PRESENT}/{policy}"][places] = True
+            for name, column in block.rows.items():
+                head, _, rest = name.partition("/")
+                whole = np.zeros((len(envs), n, *column.shape[1:]), column.dtype)
+                whole[places] = column
+                rows["/".join(filter(None, (head, policy, rest)))] = whole
+        if self.keeps_states:
+            rows |= self._with_states(envs, rows, turn)
+        return TransitionBlock(rows, self._stream_offset + envs, firsts)
+
+    def _with_states(self, envs: NDArray, rows: Rows, turn: Turn) -> Rows:
+        if self._states is None:
+            return {STATE: _flat_state(rows, OBSERVATIONS), NEXT + STATE: _flat_state(rows, NEXT + OBSERVATIONS)}
+        after = np.stack([(turn.last_states if env in turn.last_states else turn.states)[env] for env in envs.tolist()])
+        return {STATE: self._states[envs], NEXT + STATE: after}
+
+    def _keep_states(self, turn: Turn) -> None:
+        for env, state in turn.states.items():
+            if self._states is None:
+                self._states = np.zeros((self._num_envs, len(state)), np.float32)
+            self._states[env] = state
+
+
+class JointTransitionsWithoutState(JointTransitions):
+    """Joint transitions without the columns `state` and `next_state`."""
+
+    keeps_states = False
+
+
+def state_size(environment: EnvironmentConfig, interface: Interface) -> int:
+    """Return s, the size of `state` in an environment. Raises ConfigError if the environment cannot be created."""
+    with closing(stepping(environment, 1, states=True)) as batched:
+        turn = batched.start(lambda _: EpisodeStart(0, list(interface.policies.values())))
+    if turn.states:
+        return len(turn.states[0])
+    return sum(
+        math.prod(leaf.shape)
+        for agent in interface.agents
+        for name, leaf in inputs(interface.agents[agent].observation).items()
+        if name != ACTION_MASK
+    )
+
+
+def concatenate(blocks: Sequence[TransitionBlock]) -> TransitionBlock:
+    """Concatenate blocks that have the same columns."""
+    if len(blocks) == 1:
+        return blocks[0]
+    return TransitionBlock(
+        {name: np.concatenate([block.rows[name] for block in blocks]) for name in blocks[0].rows},
+        np.concatenate([block.streams for block in blocks]),
+        np.concatenate([block.firsts for block in blocks]),
+    )
+
+
+def _empty_block(spaces: AgentInterface, initial: Mapping[str, NDArray]) -> TransitionBlock:
+    """Return the columns of a policy without rows."""
+    seen = {name: np.zeros((0, *leaf.shape), leaf.dtype) for name, leaf in inputs(spaces.observation).items()}
+    rows: Rows = {f"{OBSERVATIONS}/{name}": column for name, column in seen.items()}
+    rows |= {f"{RECURRENT_STATE}/{key}": np.zeros((0, *each.shape), each.dtype) for key, each in initial.items()}
+    match spaces.action:
+        case Discrete():
+            rows[ACTIONS] = np.zeros(0, np.int64)
+        case MultiDiscrete(nvec=nvec):
+            rows[ACTIONS] = np.zeros((0, np.size(nvec)), np.int64)
+        case Box(shape=shape):
+            rows[ACTIONS] = np.zeros((0, math.prod(shape)), np.float32)
+    rows |= {REWARDS: np.zeros(0, np.float32), TERMINATED: np.zeros(0, bool), TRUNCATED: np.zeros(0, bool)}
+    rows |= {f"{NEXT}{OBSERVATIONS}/{name}": column for name, column in seen.items()}
+    return TransitionBlock(rows, np.zeros(0, np.int64), np.zeros(0, bool))
+
+
+def _flat_state(rows: Rows, head: str) -> NDArray:
+    parts = [
+        column.reshape(len(column), -1).astype(np.float32)
+        for name, column in rows.items()
+        if name.startswith(f"{head}/") and not name.endswith(f"/{ACTION_MASK}")
+    ]
+    return np.concatenate(parts, axis=1)

@@ -1,0 +1,259 @@
+"""Runs a parameter sweep: Ray Tune trains several trials concurrently, and the best checkpoint becomes a version.
+
+An interrupted sweep can be resumed: finished trials stay, others continue from their newest checkpoint. The sweep keeps
+its own files for this (training/sweeps/sweep_directory.py): Tune restores an older snapshot and unpickles the
+experiment's driver. After resuming, successive halving compares running trials only with one another, which may let a
+weak trial run longer; it never reverts a decision.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ray import tune
+from ray.tune.schedulers import ASHAScheduler, FIFOScheduler, TrialScheduler
+from rich.console import Console
+
+from league.config import LeagueConfig, SweepConfig
+from league.environments.building import interface as interface_of
+from league.errors import ConfigError, LeagueError
+from league.interface import Interface
+from league.ray_cluster import UNLIMITED, LocalRay, connected
+from league.registry.registry import Registry
+from league.registry.storage.rows import VersionRow
+from training.algorithms import metrics
+from training.export.publish import Checkpoint, git_commit, publish
+from training.rllib_compat import silence_tune
+from training.runs.error_messages import training_error
+from training.runs.run_directory import CHECKPOINTS, pin_opponents
+from training.runs.train import check
+from training.runs.trial import FROM_SCRATCH, MAX_THREADS, StartState, TrialPlan, read_progress
+from training.runs.tune import cpu_share, fit, placement, run_config
+from training.sweeps.search_space import Settings, applied, plan
+from training.sweeps.sweep_directory import SweepDirectory, TrialOutcome
+from training.sweeps.trial import (
+    NUMBER,
+    TRIAL,
+    StopWhenSaved,
+    SweepCallback,
+    SweepProgress,
+    SweepTrial,
+    format_settings,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TrialReport:
+    """One trial of a sweep. outcome: None if it is not finished. error: why it failed."""
+
+    number: int
+    settings: Settings
+    outcome: TrialOutcome | None
+    error: LeagueError | None
+
+    @property
+    def score(self) -> float | None:
+        return None if self.outcome is None else self.outcome.score
+
+
+@dataclass(frozen=True, slots=True)
+class SweepReport:
+    """best: the trial with the best score among those that spent their budget. version: its published version.
+    is_whole: False if the sweep was interrupted.
+    """
+
+    path: Path
+    trials: list[TrialReport]
+    best: TrialReport | None
+    version: VersionRow | None
+    is_whole: bool
+
+
+def sweep(
+    config: LeagueConfig,
+    *,
+    registry: Registry,
+    resume: bool = False,
+    publish_best: bool = True,
+    address: str | None = None,
+    local: LocalRay = UNLIMITED,
+    config_path: Path | None = None,
+    console: Console | None = None,
+) -> SweepReport:
+    """Train the league once per trial of `config.sweep`, and publish the newest checkpoint of the best one.
+
+    Each trial is trained as `train` does, with its own settings; only the best one is published. TensorBoard files are
+    in `<home>/sweeps/<league>/<sweep>`.
+
+    The first SIGINT or SIGTERM lets the trials save and ends the sweep without publishing. A second one raises
+    KeyboardInterrupt immediately. The sweep can be resumed in both cases.
+
+    Args:
+        config: The league, with its `sweep`.
+        registry: Where the version is published.
+        resume: Continue the league's newest sweep, which was interrupted.
+        publish_best: Whether to publish the best trial.
+        address, local, config_path, console: See `train`.
+
+    Raises:
+        LeagueError: `config` has no sweep; an invalid parameter, value or metric, before anything starts; all trials
+            failed (the first one's error); what `train` raises.
+    """
+    if config.sweep is None:
+        raise ConfigError(f"{config.league}: sweep is missing: it lists the training settings to try")
+    silence_tune()
+    interface = interface_of(config)
+    trials = plan(config, config.sweep)
+    _check(config, config.sweep, trials, interface)
+    registry.leagues.register(config, interface)
+    interrupted = SweepDirectory.resume(registry.storage, config, trials) if resume else None
+    pins = {} if interrupted else pin_opponents(config, registry, interface)
+    with connected(address, registry.storage, local) as dashboard:
+        this = interrupted or SweepDirectory.begin(registry.storage, config, pins, trials, git_commit(config_path))
+        with this.locked(), SweepProgress(console or Console(), this, config.sweep.mode) as progress:
+            if dashboard:
+                progress.say(f"Ray's dashboard: {dashboard}")
+            errors = _run(this, interface, registry, progress)
+        return _conclude(this, errors, interface, registry, publish_best)
+
+
+def _conclude(
+    sweep: SweepDirectory,
+    errors: Mapping[int, LeagueError],
+    interface: Interface,
+    registry: Registry,
+    publish_best: bool,
+) -> SweepReport:
+    """Find the best trial, publish it, and complete the sweep if all trials have ended."""
+    trials = [
+        TrialReport(number, settings, sweep.outcome(number), errors.get(number))
+        for number, settings in enumerate(sweep.record.trials)
+    ]
+    best, version = _best(trials, _settings(sweep)), None
+    is_whole = all(trial.outcome is not None or trial.error is not None for trial in trials)
+    if is_whole and best is None and errors:
+        raise next(iter(errors.values()))
+    if is_whole:
+        if best is not None and publish_best:
+            version = _publish(sweep, best.number, interface, registry)
+        sweep.complete()
+    return SweepReport(sweep.path, trials, best, version, is_whole)
+
+
+def _check(config: LeagueConfig, sweep: SweepConfig, trials: list[Settings], interface: Interface) -> None:
+    if sweep.metric not in (known := metrics.metric_names(interface, config.training.algorithm)):
+        raise ConfigError(f"sweep.metric: unknown metric {sweep.metric!r}; expected one of {', '.join(sorted(known))}")
+    for settings in trials:
+        try:
+            check(applied(config, settings), interface)
+        except ConfigError as error:
+            raise ConfigError(f"sweep.parameters: {format_settings(settings)}: {error}") from error
+    budget = max(applied(config, settings).training.steps for settings in trials)
+    if sweep.asha is not None and sweep.asha.grace_steps > budget:
+        raise ConfigError(f"sweep.asha.grace_steps: {sweep.asha.grace_steps} exceeds a trial's steps, {budget}")
+
+
+def _run(
+    sweep: SweepDirectory, interface: Interface, registry: Registry, progress: SweepProgress
+) -> dict[int, LeagueError]:
+    """Train the unfinished trials; return the errors of those that failed."""
+    settings = _settings(sweep)
+    numbers = [number for number in range(len(sweep.record.trials)) if sweep.outcome(number) is None]
+    if not numbers:
+        return {}
+    sweep.stop_file.unlink(missing_ok=True)
+    at_once = min(settings.concurrent, len(numbers))
+    leagues = {number: sweep.league(number) for number in numbers}
+    share = cpu_share(max(league.training.runners for league in leagues.values()), at_once)
+    threads = min(MAX_THREADS, max(1, (os.cpu_count() or 1) // at_once))
+    plans = {
+        number: {
+            "league": league.model_dump(mode="json", by_alias=True),
+            "interface": interface.model_dump(mode="json"),
+            "plan": _plan(sweep, number, registry, share, threads),
+        }
+        for number, league in leagues.items()
+    }
+    placements = {number: placement(league.training, share) for number, league in leagues.items()}
+    watch = SweepCallback(sweep, settings.metric, progress)
+    tuner = tune.Tuner(
+        tune.with_resources(
+            tune.with_parameters(SweepTrial, plans=plans, metric=settings.metric),
+            lambda config: placements[config[TRIAL][NUMBER]],
+        ),
+        param_space={TRIAL: tune.grid_search([_shown(sweep, number) for number in numbers])},
+        tune_config=tune.TuneConfig(
+            scheduler=_scheduler(settings, leagues),
+            max_concurrent_trials=at_once,
+            trial_dirname_creator=lambda trial: sweep.trial(trial.config[TRIAL][NUMBER]).name,
+        ),
+        run_config=run_config(sweep.path, [watch], StopWhenSaved(watch)),
+    )
+    return {
+        (number := result.config[TRIAL][NUMBER]): training_error(
+            result.error, sweep.record.config.league, sweep.trial(number) / "error.txt"
+        )
+        for result in fit(tuner, watch.request_stop)
+        if result.error is not None
+    }
+
+
+def _plan(sweep: SweepDirectory, number: int, registry: Registry, share: float, threads: int) -> TrialPlan:
+    """Plan a trial from its newest checkpoint."""
+    checkpoints = sweep.trial(number) / CHECKPOINTS
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    start, newest = FROM_SCRATCH, sweep.checkpoint(number)
+    if newest is not None:
+        steps, seconds = read_progress(newest)
+        start = StartState(newest, steps, 0, seconds)
+    return TrialPlan(start, checkpoints, sweep.stop_file, registry.storage, cpus=share, threads=threads)
+
+
+def _scheduler(settings: SweepConfig, leagues: Mapping[int, LeagueConfig]) -> TrialScheduler:
+    if settings.asha is None:
+        return FIFOScheduler()
+    return ASHAScheduler(
+        time_attr="steps",
+        metric=settings.metric,
+        mode=settings.mode,
+        grace_period=settings.asha.grace_steps,
+        reduction_factor=settings.asha.reduction_factor,
+        # A trial that has spent its budget ends by itself.
+        max_t=max(league.training.steps for league in leagues.values()) + 1,
+    )
+
+
+def _shown(sweep: SweepDirectory, number: int) -> dict[str, Any]:
+    """Return a trial's number and settings for TensorBoard's table of hyperparameters, which accepts no lists."""
+    settings = sweep.record.trials[number]
+    simple = {name: value if isinstance(value, int | float | str) else str(value) for name, value in settings.items()}
+    return {NUMBER: number} | simple
+
+
+def _best(trials: list[TrialReport], settings: SweepConfig) -> TrialReport | None:
+    sign = 1 if settings.mode == "max" else -1
+    whole = [trial for trial in trials if trial.outcome is not None and not trial.outcome.ended_early]
+    scored = {trial.number: sign * trial.score for trial in whole if trial.score is not None}
+    return trials[max(scored, key=lambda number: scored[number])] if scored else None
+
+
+def _publish(sweep: SweepDirectory, number: int, interface: Interface, registry: Registry) -> VersionRow:
+    checkpoint = sweep.checkpoint(number)
+    assert checkpoint is not None, "a trial that spent its budget has saved"
+    return publish(
+        Checkpoint(
+            checkpoint, source=f"{sweep.id}/{sweep.trial(number).name}/{checkpoint.name}", steps=int(checkpoint.name)
+        ),
+        registry=registry,
+        config=sweep.league(number),
+        interface=interface,
+        parent=None,
+        git_commit=sweep.record.git_commit,
+    )
+
+
+def _settings(sweep: SweepDirectory) -> SweepConfig:
+    assert sweep.record.config.sweep is not None
+    return sweep.record.config.sweep

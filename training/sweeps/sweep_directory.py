@@ -1,0 +1,145 @@
+"""The directory of a sweep, from which it can be resumed.
+
+<home>/sweeps/<league>/<sweep>/
+    sweep.json          the sweep's trials; written before the first trial and on completion
+    lock                held while a driver works on the sweep
+    stop                created to request that the trials save and end
+    trial-<number>/     Tune's trial and its TensorBoard files
+        outcome.json        the trial's result; written when it has ended
+        checkpoints/<steps>/    RLlib's state, the newest only; deleted when the sweep is complete
+"""
+
+import secrets
+import shutil
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict
+
+from league.config import LeagueConfig
+from league.errors import ConfigError, NotFound
+from league.files import disk_errors
+from league.settings import Storage
+from training.runs.run_directory import CHECKPOINTS, STOP_FILE, changed_setting, locked, with_pins, write
+from training.sweeps.search_space import Settings, applied
+
+SWEEP_FILE = "sweep.json"
+OUTCOME_FILE = "outcome.json"
+
+
+class SweepRecord(BaseModel):
+    """The content of sweep.json. See RunRecord."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    config: LeagueConfig
+    pins: dict[str, str]
+    trials: tuple[Settings, ...]
+    """The settings of each trial."""
+    git_commit: str | None
+    started_at: datetime
+    complete: bool = False
+
+
+class TrialOutcome(BaseModel):
+    """The result of a trial. score: the mean metric of its last reports, or None without values."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    score: float | None
+    steps: int
+    seconds: float
+    ended_early: bool
+    """By the scheduler, because other trials were better."""
+
+
+class SweepDirectory:
+    """One sweep of a league."""
+
+    def __init__(self, path: Path, record: SweepRecord) -> None:
+        self.path = path
+        self.record = record
+
+    @property
+    def id(self) -> str:
+        """Unique among all sweeps and runs."""
+        return f"sweep-{self.path.name}"
+
+    @property
+    def stop_file(self) -> Path:
+        return self.path / STOP_FILE
+
+    @classmethod
+    def begin(
+        cls,
+        storage: Storage,
+        config: LeagueConfig,
+        pins: dict[str, str],
+        trials: list[Settings],
+        git_commit: str | None,
+    ) -> Self:
+        """Create the directory of a new sweep. trials: the settings of each."""
+        now = datetime.now(UTC)
+        path = _sweeps(storage, config.league) / f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+        record = SweepRecord(
+            config=with_pins(config, pins), pins=pins, trials=tuple(trials), git_commit=git_commit, started_at=now
+        )
+        with disk_errors(path):
+            path.mkdir(parents=True)
+            write(record, path / SWEEP_FILE)
+        return cls(path, record)
+
+    @classmethod
+    def resume(cls, storage: Storage, config: LeagueConfig, trials: list[Settings]) -> Self:
+        """Open the league's newest sweep if it is incomplete. Raises NotFound; ConfigError if `config` differs."""
+        sweeps = _sweeps(storage, config.league)
+        newest = max(sweeps.glob(f"*/{SWEEP_FILE}"), default=None)
+        if newest is None:
+            raise NotFound(f"league {config.league} has no sweep in {sweeps}: there is nothing to resume")
+        record = SweepRecord.model_validate_json(newest.read_text())
+        if record.complete:
+            raise NotFound(f"sweep {newest.parent.name} is complete: there is nothing to resume")
+        changed = changed_setting(record.config, with_pins(config, record.pins))
+        if changed is None and list(record.trials) != trials:
+            changed = "sweep"
+        if changed is not None:
+            raise ConfigError(f"{changed} has changed since sweep {newest.parent.name} began: start a new one")
+        return cls(newest.parent, record)
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Exclude other drivers. Raises AlreadyRunning. The lock ends with the process."""
+        return locked(self.path, f"sweep {self.path.name}")
+
+    def league(self, number: int) -> LeagueConfig:
+        """Return the league with a trial's settings."""
+        return applied(self.record.config, self.record.trials[number])
+
+    def trial(self, number: int) -> Path:
+        """Return the directory of a trial."""
+        return self.path / f"trial-{number:03d}"
+
+    def checkpoint(self, number: int) -> Path | None:
+        """Return the newest complete checkpoint of a trial."""
+        found = (path for path in (self.trial(number) / CHECKPOINTS).glob("*") if path.name.isdigit())
+        return max(found, key=lambda path: int(path.name), default=None)
+
+    def outcome(self, number: int) -> TrialOutcome | None:
+        """Return the result of a trial, if it has ended."""
+        file = self.trial(number) / OUTCOME_FILE
+        return TrialOutcome.model_validate_json(file.read_text()) if file.exists() else None
+
+    def set_outcome(self, number: int, outcome: TrialOutcome) -> None:
+        """Record that a trial has ended."""
+        write(outcome, self.trial(number) / OUTCOME_FILE)
+
+    def complete(self) -> None:
+        """Record that all trials have ended, and delete their checkpoints."""
+        write(self.record.model_copy(update={"complete": True}), self.path / SWEEP_FILE)
+        for number in range(len(self.record.trials)):
+            shutil.rmtree(self.trial(number) / CHECKPOINTS, ignore_errors=True)
+
+
+def _sweeps(storage: Storage, league: str) -> Path:
+    return storage.home / "sweeps" / league
