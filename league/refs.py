@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from league.errors import InvalidReference
 
 SLUG = re.compile(r"[a-z0-9_-]+")
+MAX_SLUG = 100
+"""Characters. Ids of schedules and verdicts contain the league's name and must fit into 255 characters."""
 CHAMPION = "champion"
 MAX_VERSION = 2**31 - 1
 """Version numbers are a signed 32-bit column of the registry."""
@@ -21,6 +23,8 @@ MAX_VERSION = 2**31 - 1
 
 def check_slug(kind: str, text: str) -> str:
     """Return `text` if it is a valid name of a league, policy, side or alias; raise InvalidReference otherwise."""
+    if len(text) > MAX_SLUG:
+        raise InvalidReference(f"{kind} {text[:32]!r}… has {len(text)} characters, expected at most {MAX_SLUG}")
     if not SLUG.fullmatch(text):
         raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'")
     return text

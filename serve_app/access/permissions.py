@@ -16,6 +16,9 @@ PUBLIC_PATHS = ("/docs", "/openapi.json", "/", "/leagues", "/v1/key")
 PAGE_PREFIXES = ("/leagues/", "/pages/")
 AUDITED = ("aliases", "rollback", "traffic", "versions")
 """Paths below a league whose changes are recorded with the name of the key."""
+MAX_CACHED = 256
+"""Length of the longest path or model whose permission is cached. Requests without a key are cached, too, and their
+paths may have 64 kB and model names 4 MB."""
 
 
 class RequiredPermission(NamedTuple):
@@ -33,9 +36,18 @@ class RequiredPermission(NamedTuple):
 PUBLIC = RequiredPermission(None, None)
 
 
-@lru_cache(maxsize=4096)  # the same few paths recur
 def for_request(kind: str, method: str, path: str) -> RequiredPermission:
     """The permission for a request. `kind` is the ASGI scope type; `path` is relative to the root path."""
+    return (_for_request if len(path) <= MAX_CACHED else _for_request.__wrapped__)(kind, method, path)
+
+
+def for_rpc(rpc: str, model: str) -> RequiredPermission:
+    """The permission for an RPC of GRPCInferenceService; `model` is empty if it names none."""
+    return (_for_rpc if len(model) <= MAX_CACHED else _for_rpc.__wrapped__)(rpc, model)
+
+
+@lru_cache(maxsize=4096)  # the same few paths recur
+def _for_request(kind: str, method: str, path: str) -> RequiredPermission:
     if (path.startswith(HEALTH_PREFIXES + PAGE_PREFIXES) or path in PUBLIC_PATHS) and method in ("GET", "HEAD"):
         return PUBLIC
     league = league_of(path)
@@ -45,8 +57,7 @@ def for_request(kind: str, method: str, path: str) -> RequiredPermission:
 
 
 @lru_cache(maxsize=4096)
-def for_rpc(rpc: str, model: str) -> RequiredPermission:
-    """The permission for an RPC of GRPCInferenceService; `model` is empty if it names none."""
+def _for_rpc(rpc: str, model: str) -> RequiredPermission:
     if rpc in ("ServerLive", "ServerReady"):
         return PUBLIC
     scope = "act" if rpc == "ModelInfer" else "read"

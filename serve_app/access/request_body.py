@@ -16,7 +16,7 @@ BODY_READ = "league.body_is_read"
 
 
 async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
-    """Read a JSON body of at most `limit` bytes. Raises BodyTooLarge or UnsupportedMediaType."""
+    """Read a JSON body of at most `limit` bytes. Raises the errors of `read_bytes`, or UnsupportedMediaType."""
     for name, value in scope["headers"]:
         if name == b"content-type":
             _check_type(value)
@@ -24,11 +24,16 @@ async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
 
 
 async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
-    """Read a body of at most `limit` bytes. Raises BodyTooLarge as early as possible."""
+    """Read a body of at most `limit` bytes.
+
+    Raises BodyTooLarge as early as possible, and MalformedBody if the connection closes before the body is complete.
+    """
     for name, value in scope["headers"]:
         if name == b"content-length" and int(value) > limit:
             raise _too_large(limit)
     message = await receive()
+    if message["type"] == "http.disconnect":
+        raise _incomplete()
     body: bytes = message.get("body", b"")
     if message.get("more_body", False):
         body = await _read_rest(body, receive, limit)
@@ -55,7 +60,7 @@ async def _read_rest(body: bytes, receive: Receive, limit: int) -> bytes:
     while more and size <= limit:
         message = await receive()
         if message["type"] == "http.disconnect":
-            raise MalformedBody("the connection closed before the body was complete")
+            raise _incomplete()
         parts.append(message.get("body", b""))
         size += len(parts[-1])
         more = message.get("more_body", False)
@@ -67,6 +72,10 @@ def _check_type(value: bytes) -> None:
     if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
         given = media_type.decode("latin-1")[:64]
         raise UnsupportedMediaType(f"the Content-Type is {given!r}, expected application/json")
+
+
+def _incomplete() -> MalformedBody:
+    return MalformedBody("the connection closed before the body was complete")
 
 
 def _too_large(limit: int) -> BodyTooLarge:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from league.errors import InvalidReference
 from league.refs import CheckpointRef, PolicyRef, ScriptRef, check_alias, parse_ref
 
-slugs = st.from_regex(r"[a-z0-9_-]+", fullmatch=True)
+slugs = st.from_regex(r"[a-z0-9_-]{1,100}", fullmatch=True)
 aliases = slugs.filter(lambda slug: not slug.isdigit())
 versions = st.integers(1, 2**31 - 1) | aliases
 
@@ -37,6 +37,9 @@ def test_a_model_name_survives_parsing_its_text(ref: PolicyRef) -> None:
         "script:",
         "script:A",
         "a/b@1",
+        f"{'a' * 101}@1",
+        f"a@{'b' * 101}",
+        f"script:{'a' * 101}",
     ],
 )
 def test_an_invalid_reference_is_rejected(text: str) -> None:

@@ -4,6 +4,7 @@ import pytest
 from starlette.routing import Route, WebSocketRoute
 
 from league.registry.registry import Registry
+from serve_app.access import permissions
 from serve_app.access.permissions import PUBLIC, RequiredPermission, for_request, for_rpc
 from serve_app.app import Replica
 from tests.support.replicas import QUICK
@@ -98,3 +99,12 @@ def test_all_routes_but_health_documentation_and_pages_need_a_permission(registr
             assert (need.scope is None) == is_open, route.path
             if "{league}" in route.path or "{model}" in route.path:
                 assert need.league in ("league", "model"), route.path
+
+
+def test_long_paths_and_models_are_not_cached() -> None:
+    """They come from requests without a key, too: 4096 of them would keep gigabytes."""
+    sizes = [cached.cache_info().currsize for cached in (permissions._for_request, permissions._for_rpc)]
+    path, model = f"/v1/leagues/{'x' * 300}", "x" * 300
+    assert for_request("http", "GET", path) == RequiredPermission("read", "x" * 300)
+    assert for_rpc("ModelReady", model) == RequiredPermission("read", model)
+    assert [cached.cache_info().currsize for cached in (permissions._for_request, permissions._for_rpc)] == sizes
