@@ -27,7 +27,7 @@ from league.results.ledger import Ledger
 from league.results.records import Match
 from league.results.scoring import admit
 
-ROUNDING = 1e-9
+ROUNDING = 1e-6
 """Tolerance for derived floats (LLR, Elo, scores, intervals), relative and absolute: rounding differs between
 processors and BLAS kernels. Outcomes, counts and games must be equal."""
 

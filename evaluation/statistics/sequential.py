@@ -43,6 +43,9 @@ need not exist; near one, it converges slowly."""
 MAX_STEPS = 2000
 """Iterations of the constrained estimate. A dozen are usual; a few blocks with large effects need hundreds."""
 
+TOLERANCE = 1e-8
+"""Of the constrained estimate, in probability."""
+
 MAX_NEWTON_STEPS = 100
 """Iterations of one tilt. Six are usual; empty cells need dozens of bisections."""
 
@@ -369,12 +372,12 @@ def _most_likely_effect(observed: Floats, elo: float) -> Floats:
     active = np.arange(len(observed))
     for _ in range(MAX_STEPS):
         current = p[active]
-        mean = current @ grid
+        mean = (current * grid).sum(axis=1)  # unlike a matrix product, independent of the number of rows
         sigma = np.sqrt((current * (grid - mean[:, None]) ** 2).sum(axis=1))[:, None]
         phi = grid - 0.5 - t * sigma * (1 + ((mean[:, None] - grid) / sigma) ** 2) / 2
         p[active] = _tilt(observed[active], phi)
         moved = np.abs(p[active] - current).max(axis=1)
-        active = active[moved > 1e-8]
+        active = active[moved > TOLERANCE]
         if active.size == 0:
             return p
     raise ArithmeticError(f"the constrained estimate did not converge for {len(active)} count(s)")
@@ -384,12 +387,13 @@ def _tilt(observed: Floats, phi: Floats) -> Floats:
     """`p_i = q_i / (1 + theta phi_i)` with theta such that `sum_i p_i phi_i = 0`, for rows of shape (m, cells).
 
     The sum falls from +inf to -inf between its two outermost poles. Newton's method runs on the sum without these
-    poles, and falls back to bisection where a step would leave the bracket.
+    poles, and falls back to bisection where a step would leave the bracket. The result of a row does not depend on the
+    other rows, so that a later block does not change the LLR of an earlier one.
     """
     first, last = phi.max(axis=1), phi.min(axis=1)
     poles = -1 / first, -1 / last
     low, high = poles
-    theta = np.zeros(len(phi))
+    theta, settled = np.zeros(len(phi)), np.zeros(len(phi), dtype=bool)
     for _ in range(MAX_NEWTON_STEPS):
         ratio = phi / (1 + theta[:, None] * phi)
         moment, slope = (observed * ratio).sum(axis=1), -(observed * ratio**2).sum(axis=1)
@@ -398,8 +402,9 @@ def _tilt(observed: Floats, phi: Floats) -> Floats:
         step = theta - moment * a * b / (slope * a * b + moment * (first * b + last * a))
         step = np.where((step > low) & (step < high), step, (low + high) / 2)
         room = np.minimum(step - poles[0], poles[1] - step)
-        settled = np.abs(step - theta) <= 1e-8 * room
-        theta = step
+        is_close = np.abs(step - theta) <= TOLERANCE * room
+        theta = np.where(settled, theta, step)
+        settled |= is_close
         if settled.all():
             break
     p = observed / (1 + theta[:, None] * phi)

@@ -84,6 +84,15 @@ def test_impossible_block_scores_are_rejected(score: float) -> None:
         decide(GATE, [0.5, score])
 
 
+def test_the_llr_of_a_block_does_not_depend_on_later_ones() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.choice([0.0, 0.25, 0.5, 0.75, 1.0], size=400, p=[0.25, 0.3, 0.2, 0.15, 0.1]).tolist()
+    settings = GATE.model_copy(update={"max_blocks": 400, "alpha": 1e-9})
+    every = decide(settings, scores).curve
+    for blocks in (5, 11, 50, 200):
+        assert decide(settings, scores[:blocks]).curve == pytest.approx(every[:blocks], rel=1e-13)
+
+
 @few_examples
 @given(block_scores, block_scores)
 def test_blocks_after_the_stopping_block_are_ignored(scores: list[float], later: list[float]) -> None:
