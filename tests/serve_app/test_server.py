@@ -134,6 +134,8 @@ def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> No
         return call
 
     send_request = caller()
+    promote(served, "board", 1)
+    until(lambda: serving(served, 1) == 2)
     with load(caller, callers=8) as seen:
         for version in (2, 3, 1) * 4:
             promote(served, "board", version)

@@ -135,7 +135,9 @@ def test_a_game_against_a_version_is_played(shared: GameWorkerPool) -> None:
     assert [step["moves"][0]["action"] for step in state["steps"][1:]] == [4, state["steps"][2]["moves"][0]["action"]]
     assert state["picture"].startswith("data:image/png;base64,")
     assert state["chances"][0][0] in state["legal"]
-    assert len(worker_processes()) == 1, "one process per league"
+    processes = worker_processes()
+    submit(shared, play_request(5))
+    assert worker_processes() == processes, "one process per league"
 
 
 def test_errors_keep_their_type(shared: GameWorkerPool) -> None:
