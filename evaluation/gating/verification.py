@@ -29,7 +29,7 @@ from league.results.scoring import admit
 
 ROUNDING = 1e-6
 """Tolerance for derived floats (LLR, Elo, scores, intervals), relative and absolute: rounding differs between
-processors and BLAS kernels. Outcomes, counts and games must be equal."""
+processors and BLAS kernels, and iterative estimates converge to 1e-8. Outcomes, counts and games must be equal."""
 
 
 @dataclass(frozen=True, slots=True)

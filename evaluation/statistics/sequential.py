@@ -44,7 +44,7 @@ MAX_STEPS = 2000
 """Iterations of the constrained estimate. A dozen are usual; a few blocks with large effects need hundreds."""
 
 TOLERANCE = 1e-8
-"""Of the constrained estimate, in probability."""
+"""Convergence of the constrained estimate: the change of a probability, and of a tilt relative to its nearer pole."""
 
 MAX_NEWTON_STEPS = 100
 """Iterations of one tilt. Six are usual; empty cells need dozens of bisections."""

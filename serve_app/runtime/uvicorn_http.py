@@ -1,8 +1,8 @@
 """uvicorn's HTTP protocol with batched accepts, notification of shutdown, and the length of the accept queue.
 
 uvloop accepts one connection per turn of the event loop, and a turn handles the requests of all open connections. If
-many clients connect at once with slow requests, the last one would wait for minutes. Therefore each new connection
-accepts all others that wait.
+many clients connect at once with slow requests, the last one would wait for a long time. Therefore each new
+connection accepts all others that wait.
 
 A server that stops finishes requests in progress. Event streams are notified so that they end.
 """
