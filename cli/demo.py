@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.rule import Rule
 
-from cli.options import open_registry
+from cli.options import DEFAULT_URL, open_registry
 from cli.output import console, say
 from configs import find
 from league.settings import Storage
@@ -120,6 +120,8 @@ def _show_next_steps(league: str, url: str, first: str = "") -> None:
     say(f"Open {url} in a browser for the leaderboard, verdicts and recorded games, and")
     say(f"  {url}/leagues/{league}/play    to play against the champion.")
     say("In another terminal, after `source .venv/bin/activate`:")
+    if url != DEFAULT_URL:
+        say(f"  export LEAGUE_URL={url}")
     say(f"  league act {league}@champion            request an action over HTTP")
     say(f"  league versions {league}                list versions with aliases and ratings")
     say(f"  league evaluate {league}                play a round robin of all versions and scripts")

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from league.registry.registry import Registry
 
 CORES = os.cpu_count() or 1
+DEFAULT_URL = "http://127.0.0.1:8000"
+"""Of the policy server that `league serve` starts and `league act` calls."""
 
 Config = Annotated[
     str,

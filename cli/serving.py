@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import orjson
 import typer
 
-from cli.options import open_registry
+from cli.options import DEFAULT_URL, open_registry
 from cli.output import emit, say
 from league.errors import ConfigError, InvalidReference
 from league.refs import CheckpointRef, PolicyRef, ScriptRef, parse_ref
@@ -56,9 +56,13 @@ def serve(
             f"  {url}/v1/leagues                          leagues as JSON\n"
             f"  {url}/v1/policies/LEAGUE/action           POST an observation to get an action\n"
             f"  {url}/v2/models/LEAGUE                    Open Inference Protocol over HTTP; also over gRPC\n"
-            "Try: league act connect_four@champion          Stop: Ctrl-C"
+            f"Try: league act connect_four@champion{_url_option(url)}          Stop: Ctrl-C"
         ),
     )
+
+
+def _url_option(url: str) -> str:
+    return "" if url == DEFAULT_URL else f" --url {url}"
 
 
 def act(
@@ -73,7 +77,7 @@ def act(
         ),
     ] = None,
     policy: Annotated[str | None, typer.Option(help="Policy ID, if the version has several policies.")] = None,
-    url: Annotated[str, typer.Option(envvar="LEAGUE_URL", help="URL of the policy server.")] = "http://127.0.0.1:8000",
+    url: Annotated[str, typer.Option(envvar="LEAGUE_URL", help="URL of the policy server.")] = DEFAULT_URL,
     local: Annotated[
         bool, typer.Option("--local", help="Load the version in this process instead of calling a server.")
     ] = False,
