@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks import coverage, golden, null_play
-from benchmarks.shuffled_order import verdicts_of_shuffled_completion
-from benchmarks.simulated_gates import CELLS, EQUALS, simulate, stronger
-from benchmarks.simulated_years import boundary, chance, walk
+from benchmarks.simulations import coverage, golden, null_play
+from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completion
+from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
+from benchmarks.simulations.simulated_years import boundary, chance, walk
 from evaluation.gating.gate import NIGHTS, AnchorResult, Decision, alpha_per_verdict, combine_results, decide
 from evaluation.statistics.sequential import expected_games
 from league.config import GateConfig
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 
 CANDIDATES = 8
 SINGLE = GateConfig(elo0=0, elo1=60, max_blocks=1000, nights=None)

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import Executable, delete, update
 
-from benchmarks.served_league import builder
+from benchmarks.leagues.served_league import builder
 from evaluation.gating.gate import decide_matches
 from evaluation.gating.verdicts import conclude, gate_of, open_verdict
 from evaluation.matches.tournament import evaluate

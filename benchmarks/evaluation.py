@@ -26,8 +26,8 @@ import torch
 from pettingzoo.classic import connect_four_v3
 from ray.rllib.core.columns import Columns
 
-from benchmarks import adaptive_ranking, rating_speed, tournament_kills
-from benchmarks.evaluated_league import CONFIG, publish
+from benchmarks.leagues.evaluated_league import CONFIG, publish
+from benchmarks.tournaments import adaptive_ranking, rating_speed, tournament_kills
 from evaluation.matches.tournament import play_schedule
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin

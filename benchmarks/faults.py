@@ -25,11 +25,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.callers import WITH_RETRIES, WITHOUT_RETRIES, CallLog, calling
-from benchmarks.load import post
-from benchmarks.overload import Overload, overload
-from benchmarks.served_league import BODY, LEAGUE, publish
-from benchmarks.slow_clients import slow_clients
+from benchmarks.leagues.served_league import BODY, LEAGUE, publish
+from benchmarks.load.callers import WITH_RETRIES, WITHOUT_RETRIES, CallLog, calling
+from benchmarks.load.http import post
+from benchmarks.load.overload import Overload, overload
+from benchmarks.load.slow_clients import slow_clients
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from serve_app.runtime.launch import running

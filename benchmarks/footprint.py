@@ -19,8 +19,8 @@ import httpx
 import psutil
 import yaml
 
+from benchmarks.leagues.served_league import BODY, LEAGUE, publish
 from benchmarks.processes import replica_processes
-from benchmarks.served_league import BODY, LEAGUE, publish
 from league.registry.registry import Registry
 from serve_app.runtime.launch import DEPLOY_YAML, running
 

@@ -22,10 +22,11 @@ import tritonclient.grpc as over_grpc
 import tritonclient.http as over_http
 from numpy.typing import NDArray
 
-from benchmarks import load, stream_load
-from benchmarks.learned import local_ray
+from benchmarks.leagues.served_league import BODY, LEAGUE, PLANES, publish
+from benchmarks.load import http as load
+from benchmarks.load import websocket as stream_load
 from benchmarks.parity import CONFIGS, prepare, situations
-from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
+from benchmarks.training.learned import local_ray
 from league.client.requests import encode
 from league.policies import load as load_policy
 from league.registry.registry import Registry

@@ -31,8 +31,8 @@ from schemathesis import GenerationMode
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from benchmarks.leagues.served_league import BODY, LEAGUE, PLANES, publish
 from benchmarks.processes import replica_processes
-from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
 from serve_app.inference.stream_codec import encode_request as message_of
 from serve_app.runtime.launch import running
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.learned import (
+from benchmarks.training.learned import (
     CurvePoint,
     LearningCurve,
     interval,
@@ -27,9 +27,9 @@ from benchmarks.learned import (
     report_target,
     two_at_once,
 )
-from benchmarks.truncation import as_rllib
-from benchmarks.two_step import two_step_game
-from benchmarks.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
+from benchmarks.training.truncation import as_rllib
+from benchmarks.training.two_step import two_step_game
+from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
 from examples import traffic
 from league.config import LeagueConfig
 

@@ -23,7 +23,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 from scipy import stats
 
-from benchmarks.learned import local_ray, one_thread
+from benchmarks.training.learned import local_ray, one_thread
 from league.config import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.maddpg import MADDPG

@@ -21,8 +21,8 @@ import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
 from benchmarks.crowded_league import LEAGUE, crowd
-from benchmarks.load import measure
-from benchmarks.served_league import BODY
+from benchmarks.leagues.served_league import BODY
+from benchmarks.load.http import measure
 from serve_app.runtime.launch import running
 
 CALL = 100

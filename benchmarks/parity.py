@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.learned import local_ray
+from benchmarks.training.learned import local_ray
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.interface import Interface

@@ -17,8 +17,8 @@ from types import ModuleType
 from mpe2 import simple_adversary_v3, simple_spread_v3
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 
-from benchmarks.learned import local_ray, one_thread, report_target
 from benchmarks.sampling import in_parallel, in_turns
+from benchmarks.training.learned import local_ray, one_thread, report_target
 from league.config import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.metrics import PHASES, totals

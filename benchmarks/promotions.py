@@ -28,9 +28,9 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from benchmarks.load import Load, drive, measure
+from benchmarks.leagues.served_league import BODY, LEAGUE, publish
+from benchmarks.load.http import Load, drive, measure
 from benchmarks.processes import haproxy_processes
-from benchmarks.served_league import BODY, LEAGUE, publish
 from league.registry.registry import Registry
 from serve_app.runtime.launch import running
 

@@ -72,7 +72,7 @@ def rate(seconds):
 """
 TOURNAMENT = """
 from benchmarks import evaluation
-from benchmarks.evaluated_league import publish
+from benchmarks.leagues.evaluated_league import publish
 
 registry, _ = publish(home, 2)
 schedules = evaluation._schedules(registry, blocks=16)
@@ -82,8 +82,8 @@ def rate(seconds):
     return repeat(lambda: evaluation._tournament(next(schedules), registry, 0) and 1, seconds)
 """
 SERVING = """
-from benchmarks.load import measure
-from benchmarks.served_league import BODY, publish
+from benchmarks.load.http import measure
+from benchmarks.leagues.served_league import BODY, publish
 from benchmarks.serving import _ours
 
 storage = publish(home, versions=1).storage

@@ -26,9 +26,9 @@ from statistics import median
 import httpx
 import yaml
 
-from benchmarks.load import measure
-from benchmarks.rllib_server import save_module
-from benchmarks.served_league import BODY, LEAGUE, PLANES, publish
+from benchmarks.leagues.served_league import BODY, LEAGUE, PLANES, publish
+from benchmarks.load.http import measure
+from benchmarks.peers.rllib_server import save_module
 from league.settings import Storage
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import DEPLOY_YAML, running
@@ -148,7 +148,7 @@ def _ours(storage: Storage, replicas: int) -> Iterator[str]:
 def _constant(storage: Storage, scratch: Path, factory: str) -> Iterator[str]:
     document = yaml.safe_load(DEPLOY_YAML.read_text())
     (application,) = document["applications"]
-    application["import_path"] = f"benchmarks.constant_app:{factory}"
+    application["import_path"] = f"benchmarks.peers.constant_app:{factory}"
     document.pop("grpc_options")
     deploy = scratch / "constant.yaml"
     deploy.write_text(yaml.safe_dump(document))
@@ -159,7 +159,7 @@ def _constant(storage: Storage, scratch: Path, factory: str) -> Iterator[str]:
 @contextmanager
 def _bare(kind: str, storage: Storage) -> Iterator[str]:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
-    command = [sys.executable, "-m", "benchmarks.bare_servers", kind, str(storage.home), str(port)]
+    command = [sys.executable, "-m", "benchmarks.peers.bare_servers", kind, str(storage.home), str(port)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, env=environment) as server:
         url = f"http://127.0.0.1:{port}/v1/policies/{LEAGUE}/action"
@@ -195,7 +195,7 @@ def _tuned(checkpoint: Path) -> Iterator[str]:
 @contextmanager
 def _rllib_server(checkpoint: Path, environment: dict[str, str]) -> Iterator[str]:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
-    command = [sys.executable, "-m", "benchmarks.rllib_server", str(checkpoint), str(port)]
+    command = [sys.executable, "-m", "benchmarks.peers.rllib_server", str(checkpoint), str(port)]
     with subprocess.Popen(
         command,
         cwd=ROOT,

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from statistics import median
 
-from benchmarks.load import measure
-from benchmarks.served_league import BODY, LEAGUE, publish
+from benchmarks.leagues.served_league import BODY, LEAGUE, publish
+from benchmarks.load.http import measure
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.runtime.launch import running

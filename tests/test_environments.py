@@ -14,7 +14,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces.arrays import tensors
 from league.spaces.conversion import to_gymnasium
-from tests.support.environment_cases import CASES, Case
+from tests.support.environments.cases import CASES, Case
 from training.export.publish import Checkpoint, publish
 from training.runs.trial import build_algorithm
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from pettingzoo.classic import leduc_holdem_v4
 
-from benchmarks.leduc import CALL, CHECK, FOLD, RAISE, RANKS, Hand, best_response, uniform
+from benchmarks.training.leduc import CALL, CHECK, FOLD, RAISE, RANKS, Hand, best_response, uniform
 
 
 def test_hands_equal_those_of_pettingzoo() -> None:

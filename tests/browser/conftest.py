@@ -8,9 +8,9 @@ import pytest
 from playwright.sync_api import Browser, expect, sync_playwright
 
 from serve_app.runtime.launch import running
-from tests.support import browser_leagues
-from tests.support.browsers import ARGUMENTS, Served, Tab
-from tests.support.tictactoe import LEAGUE
+from tests.support.clients.browsers import ARGUMENTS, Served, Tab
+from tests.support.leagues import browser_leagues
+from tests.support.leagues.tictactoe import LEAGUE
 
 TIMEOUT = 20_000
 """Timeout of each expectation, in milliseconds."""

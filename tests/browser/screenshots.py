@@ -25,10 +25,17 @@ from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.runtime.launch import running
-from tests.support import tictactoe
-from tests.support.browser_leagues import CONFIGS, CONNECT_FOUR, EMPTY, answer, compute, verdict_between_versions
-from tests.support.browsers import ARGUMENTS
-from tests.support.tictactoe import LEAGUE
+from tests.support.clients.browsers import ARGUMENTS
+from tests.support.leagues import tictactoe
+from tests.support.leagues.browser_leagues import (
+    CONFIGS,
+    CONNECT_FOUR,
+    EMPTY,
+    answer,
+    compute,
+    verdict_between_versions,
+)
+from tests.support.leagues.tictactoe import LEAGUE
 from training.runs.train import train
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"

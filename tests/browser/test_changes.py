@@ -6,10 +6,10 @@ import pytest
 from playwright.sync_api import Page, Route, expect
 
 from league.refs import CheckpointRef
-from tests.support.browser_leagues import EMPTY, RUN, record
-from tests.support.browsers import Served, Tab
-from tests.support.reported_league import HOSTILE
-from tests.support.tictactoe import LEAGUE
+from tests.support.clients.browsers import Served, Tab
+from tests.support.leagues.browser_leagues import EMPTY, RUN, record
+from tests.support.leagues.reported_league import HOSTILE
+from tests.support.leagues.tictactoe import LEAGUE
 
 pytestmark = pytest.mark.slow  # a browser and a server take all cores
 

@@ -7,9 +7,9 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from tests.support.browser_leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
-from tests.support.browsers import Served, Tab
-from tests.support.tictactoe import LEAGUE
+from tests.support.clients.browsers import Served, Tab
+from tests.support.leagues.browser_leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
+from tests.support.leagues.tictactoe import LEAGUE
 
 pytestmark = pytest.mark.slow  # a browser and a server take all cores
 

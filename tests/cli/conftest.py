@@ -5,8 +5,8 @@ import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support import tictactoe
 from tests.support.command import League, in_process, in_subprocess
+from tests.support.leagues import tictactoe
 from tests.support.templates import copy_of
 
 

@@ -5,8 +5,8 @@ import yaml
 
 from league.registry.registry import Registry
 from league.registry.storage.tables import VerdictTable
-from tests.support import tictactoe
 from tests.support.command import League
+from tests.support.leagues import tictactoe
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import pytest
 from filelock import FileLock
 
 from league.registry.registry import Registry
-from tests.support import tictactoe
 from tests.support.command import League
+from tests.support.leagues import tictactoe
 
 Inbox = tuple[str, list[dict[str, Any]]]
 

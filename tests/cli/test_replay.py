@@ -5,9 +5,9 @@ from PIL import Image
 from evaluation.matches.game_records import forfeits
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from tests.support import tictactoe
 from tests.support.command import League
-from tests.support.illegal_action_graph import illegal_action_graph
+from tests.support.leagues import tictactoe
+from tests.support.policies.illegal_action_graph import illegal_action_graph
 
 
 def test_a_game_is_rendered_and_described(league: League, registry: Registry, tmp_path: Path) -> None:

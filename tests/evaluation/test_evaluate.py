@@ -21,8 +21,8 @@ from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match
 from league.settings import Storage
-from tests.support import tictactoe
-from tests.support.tournaments import STRENGTHS
+from tests.support.leagues import tictactoe
+from tests.support.leagues.tournaments import STRENGTHS
 
 
 @pytest.fixture

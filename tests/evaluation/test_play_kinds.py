@@ -12,7 +12,7 @@ from league.environments.lockstep import stepping
 from league.errors import GameHung
 from league.results.records import Scoring, dump_games, load_games
 from league.results.scoring import admit
-from tests.support.environment_kinds import KINDS, Kind
+from tests.support.environments.kinds import KINDS, Kind
 
 kinds = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 CONTESTANTS = ["kind@1", "kind@2", "script:random"]

@@ -12,7 +12,7 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 
 ROLES = {"adversary": ["adversary_*"], "good": ["agent_*"]}
 

@@ -6,7 +6,7 @@ from uuid import uuid4
 import pytest
 
 from league.settings import Storage
-from tests.support import postgresql
+from tests.support.servers import postgresql
 
 
 @pytest.fixture(scope="session")

@@ -8,11 +8,11 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import running
-from tests.support import tictactoe
-from tests.support.protocol_leagues import every_kind
-from tests.support.replicas import READ_ONLY, replica
-from tests.support.served_leagues import everything
-from tests.support.servers import NO_SHEDDING, RayServer, deploy_file, processes, serving
+from tests.support.leagues import tictactoe
+from tests.support.leagues.protocol_leagues import every_kind
+from tests.support.leagues.served_leagues import everything
+from tests.support.servers.replicas import READ_ONLY, replica
+from tests.support.servers.under_load import NO_SHEDDING, RayServer, deploy_file, processes, serving
 from tests.support.waiting import until
 
 

@@ -17,10 +17,10 @@ from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
-from tests.support.actions import BAD_BODIES, BOARD, act, boards, rejected
-from tests.support.graphs import masked_mlp
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import promote
+from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards, rejected
+from tests.support.leagues.served_leagues import promote
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.replicas import QUICK
 from tests.support.waiting import until
 
 

@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from tests.support.served_leagues import promote
+from tests.support.leagues.served_leagues import promote
 from tests.support.waiting import until
 
 

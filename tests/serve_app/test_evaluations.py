@@ -7,8 +7,8 @@ from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
 from serve_app.app import Replica
-from tests.support.replicas import QUICK, replica
-from tests.support.served_leagues import promote
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.waiting import until
 
 BOARD = "/v1/leagues/board/evaluations"

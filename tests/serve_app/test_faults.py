@@ -12,15 +12,15 @@ from pathlib import Path
 import httpx
 import pytest
 
-from benchmarks.load import post
-from benchmarks.slow_clients import slow_clients
+from benchmarks.load.http import post
+from benchmarks.load.slow_clients import slow_clients
 from league.client import Client
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.runtime.launch import running
-from tests.support.actions import BOARD
-from tests.support.served_leagues import everything, promote
-from tests.support.servers import ACTION, Load, deploy_file, load, processes, serving
+from tests.support.clients.actions import BOARD
+from tests.support.leagues.served_leagues import everything, promote
+from tests.support.servers.under_load import ACTION, Load, deploy_file, load, processes, serving
 from tests.support.waiting import until
 
 pytestmark = pytest.mark.slow

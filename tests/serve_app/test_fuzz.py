@@ -30,9 +30,9 @@ from serve_app.inference_protocol.tensors import read_inputs, signature_of
 from serve_app.models.version_cache import LoadedPolicy, load
 from serve_app.openapi.document import document
 from serve_app.runtime.serve_bypass import is_event_stream
-from tests.support.match_results import PENDING, SCHEDULE, WON, record
-from tests.support.protocol_leagues import every_kind
-from tests.support.replicas import QUICK, replica
+from tests.support.leagues.match_results import PENDING, SCHEDULE, WON, record
+from tests.support.leagues.protocol_leagues import every_kind
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.waiting import until
 
 load_all_checks()

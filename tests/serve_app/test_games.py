@@ -23,8 +23,8 @@ from league.service_requests import GameRequest, GameResponse
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.openapi.document import document
-from tests.support import tictactoe
-from tests.support.replicas import QUICK, UnavailableEvaluation
+from tests.support.leagues import tictactoe
+from tests.support.servers.replicas import QUICK, UnavailableEvaluation
 from tests.support.waiting import until
 
 LEAGUE = "/v1/leagues/tictactoe"

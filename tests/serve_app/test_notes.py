@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from tests.support.replicas import replica
+from tests.support.servers.replicas import replica
 
 NOTE = "/v1/leagues/board/versions/2/note"
 

@@ -10,8 +10,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from tests.support.replicas import replica
-from tests.support.served_leagues import promote
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import replica
 
 CHAMPION = "/v1/leagues/board/aliases/champion"
 ROLLBACK = "/v1/leagues/board/rollback"

@@ -13,10 +13,10 @@ from evaluation.service.snapshots import refresh
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.openapi.document import document
-from tests.support import reported_league, tictactoe
-from tests.support.match_results import LOST, PENDING, RANKED, SCHEDULE, WON, record
-from tests.support.replicas import QUICK, replica
-from tests.support.served_leagues import everything, promote
+from tests.support.leagues import reported_league, tictactoe
+from tests.support.leagues.match_results import LOST, PENDING, RANKED, SCHEDULE, WON, record
+from tests.support.leagues.served_leagues import everything, promote
+from tests.support.servers.replicas import QUICK, replica
 
 BOARD = "/v1/leagues/board"
 OPENAPI = document(QUICK, [])

@@ -30,10 +30,10 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import MANIFEST, Manifest
 from league.registry.storage.tables import VersionTable
 from serve_app.inference.stream_codec import FRAMING, REQUEST
-from tests.support.actions import BOARD, act
-from tests.support.graphs import masked_mlp
-from tests.support.probes import probes
-from tests.support.served_leagues import promote, publish
+from tests.support.clients.actions import BOARD, act
+from tests.support.leagues.served_leagues import promote, publish
+from tests.support.policies.graphs import masked_mlp
+from tests.support.policies.probes import probes
 from tests.support.waiting import until
 
 SUSPICIOUS = frozenset(("pickle.find_class", "os.system", "os.exec", "subprocess.Popen", "os.posix_spawn"))

@@ -28,13 +28,13 @@ from league.results.records import Match
 from league.settings import Storage
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import running
-from tests.support import tictactoe
-from tests.support.actions import BOARD
-from tests.support.event_streams import listen
-from tests.support.graphs import masked_mlp
-from tests.support.scaling import scale
-from tests.support.served_leagues import promote, publish
-from tests.support.servers import ACTION, RayServer, load, processes, serving
+from tests.support.clients.actions import BOARD
+from tests.support.clients.event_streams import listen
+from tests.support.leagues import tictactoe
+from tests.support.leagues.served_leagues import promote, publish
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.scaling import scale
+from tests.support.servers.under_load import ACTION, RayServer, load, processes, serving
 from tests.support.waiting import until
 
 EVALUATIONS = "/v1/leagues/tictactoe/evaluations"

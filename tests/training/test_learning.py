@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.learned import LearningCurve, learn
+from benchmarks.training.learned import LearningCurve, learn
 from examples import traffic
 from league.config import LeagueConfig
 

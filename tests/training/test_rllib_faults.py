@@ -28,9 +28,9 @@ from ray.tune.registry import register_env
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from tests.support.counting import Counting
-from tests.support.simultaneous import Simultaneous
-from tests.support.training_leagues import counting, solvable, tictactoe
+from tests.support.environments.counting import Counting
+from tests.support.environments.simultaneous import Simultaneous
+from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from training.algorithms.ppo import algorithm_config
 from training.learners.train_batch import minibatches, train_batch
 from training.modules.actor_critic import ActorCritic
@@ -42,7 +42,7 @@ from training.sampling.rllib_env import LeagueEnv
 pytestmark = pytest.mark.usefixtures("ray_session")
 
 CYCLES = 5
-MEETING = "tests.support.simultaneous:meeting"
+MEETING = "tests.support.environments.simultaneous:meeting"
 
 
 def spread() -> LeagueConfig:

@@ -15,8 +15,8 @@ from league.config import LeagueConfig
 from league.errors import ConfigError, UnknownPolicy, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.storage import tables
-from tests.support import tictactoe
-from tests.support.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
+from tests.support.leagues import tictactoe
+from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
 
 @pytest.fixture

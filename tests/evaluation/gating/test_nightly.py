@@ -31,8 +31,8 @@ from league.registry.storage.rows import ShadowCounts
 from league.registry.verdicts import VerdictRepository
 from league.results.ledger import Ledger
 from league.settings import Storage
-from tests.support import tictactoe
-from tests.support.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of
+from tests.support.leagues import tictactoe
+from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
 
 @pytest.fixture(autouse=True)
@@ -206,7 +206,7 @@ from league.registry.verdicts import VerdictRepository
 from league.settings import Storage
 from evaluation.gating.nightly import nightly
 from evaluation.results import VerdictReport
-from tests.support.judged_league import CONFIG
+from tests.support.leagues.judged_league import CONFIG
 
 verdicts = 0
 def listener(progress):

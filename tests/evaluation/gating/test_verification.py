@@ -17,9 +17,9 @@ from league.registry.storage import tables
 from league.registry.storage.rows import VerdictRow
 from league.results.ledger import Ledger
 from league.settings import Storage
-from tests.support import tictactoe
-from tests.support.illegal_action_graph import illegal_action_graph
-from tests.support.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
+from tests.support.leagues import tictactoe
+from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
+from tests.support.policies.illegal_action_graph import illegal_action_graph
 from tests.support.templates import copy_of
 
 

@@ -24,10 +24,10 @@ from league.policies.policy import Actions, Arrays, Policy
 from league.results.ledger import Ledger
 from league.results.records import Forfeit, Game, Match, Reason, Schedule, dump_games, load_games
 from league.results.scoring import admit
-from tests.support import tictactoe
-from tests.support.environment_kinds import KINDS, Kind
-from tests.support.illegal_action_graph import illegal_action_graph
-from tests.support.lockstep import CONFIG, CONTESTANTS, INTERFACE, build_roster
+from tests.support.environments.kinds import KINDS, Kind
+from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, build_roster
+from tests.support.leagues import tictactoe
+from tests.support.policies.illegal_action_graph import illegal_action_graph
 
 BAD = "tictactoe@9"
 NUM_ENVS = (1, 2, 5, 32)

@@ -10,8 +10,8 @@ from evaluation.schedules.builders import round_robin
 from league.environments.lockstep import stepping
 from league.errors import EnvironmentMismatch, GameHung
 from league.results.records import Match, Schedule
-from tests.support import tictactoe
-from tests.support.lockstep import CONFIG, CONTESTANTS, INTERFACE, WINNER, build_roster
+from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, WINNER, build_roster
+from tests.support.leagues import tictactoe
 
 
 def schedule(blocks: int = 4, plies: int = 2, contestants: Sequence[str] = CONTESTANTS) -> Schedule:

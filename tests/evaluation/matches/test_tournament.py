@@ -28,8 +28,8 @@ from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match, Schedule
 from league.settings import Storage
-from tests.support import tictactoe
-from tests.support.tournaments import STRENGTHS, tournament_schedule
+from tests.support.leagues import tictactoe
+from tests.support.leagues.tournaments import STRENGTHS, tournament_schedule
 
 
 @pytest.fixture
@@ -199,7 +199,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from evaluation.results import Progress
 from evaluation.matches.tournament import play_schedule
-from tests.support.tournaments import tournament_schedule
+from tests.support.leagues.tournaments import tournament_schedule
 
 registry = Registry.open(Storage.at(sys.argv[1]))
 def listener(progress):
@@ -230,7 +230,7 @@ from ray.cluster_utils import Cluster
 from league.registry.registry import Registry
 from league.settings import Storage
 from evaluation.matches.tournament import play_schedule
-from tests.support.tournaments import tournament_schedule
+from tests.support.leagues.tournaments import tournament_schedule
 
 cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
 nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]

@@ -26,8 +26,8 @@ from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Schedule
 from league.settings import Storage
-from tests.support import tictactoe
-from tests.support.fuses import ACTIONS, LIGHT, fuse
+from tests.support.environments.fuses import ACTIONS, LIGHT, fuse
+from tests.support.leagues import tictactoe
 
 SOON = 1.0
 """In seconds: 1,000 times the duration of a game that does not hang."""
@@ -37,7 +37,10 @@ def config(ends: str, where: str = "step", seconds: float = SOON) -> LeagueConfi
     return LeagueConfig.from_mapping(
         {
             "league": "fuse",
-            "environment": {"entry_point": "tests.support.fuses:fuse", "kwargs": {"ends": ends, "where": where}},
+            "environment": {
+                "entry_point": "tests.support.environments.fuses:fuse",
+                "kwargs": {"ends": ends, "where": where},
+            },
             "play": {"num_envs": 3, "game_seconds": seconds},
             "gate": {"elo1": 100, "max_blocks": 4},
         }
@@ -157,7 +160,7 @@ def test_a_hanging_game_in_a_worker_is_reported(tmp_path: Path) -> None:
 STALLED = """
 import sys
 from evaluation.matches import watchdog
-from tests.support.fuses import FAULTS
+from tests.support.environments.fuses import FAULTS
 
 watchdog.GRACE = 0.2
 with watchdog.enforce_deadline(lambda: None, watchdog.Deadline(0.2, expendable=True)):

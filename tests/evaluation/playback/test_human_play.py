@@ -25,7 +25,7 @@ from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.service_requests import HumanPlayRequest
 from league.spaces import inputs
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
 CONNECT_FOUR = "pettingzoo.classic.connect_four_v3"
@@ -215,6 +215,6 @@ def test_an_opponent_without_a_legal_action_forfeits() -> None:
 
 
 def test_an_exception_of_the_environment_is_reported() -> None:
-    players = scripted_players(league_and_environment("tests.support.hanging:Raising")[1])
+    players = scripted_players(league_and_environment("tests.support.environments.hanging:Raising")[1])
     with pytest.raises(GameCrashed, match="ValueError: the board is gone"):
-        play_request("tests.support.hanging:Raising", players, "player_1", [4])
+        play_request("tests.support.environments.hanging:Raising", players, "player_1", [4])

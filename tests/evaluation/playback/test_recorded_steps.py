@@ -23,8 +23,8 @@ from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match
 from league.service_requests import MOST_STEPS, RecordingRequest
-from tests.support import tictactoe
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import tictactoe
+from tests.support.leagues.tictactoe import LEAGUE
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def test_forfeits_are_reported(registry: Registry) -> None:
 def test_a_game_that_cannot_be_replayed_has_a_reason(registry: Registry) -> None:
     match = play_match(registry)
     registry.leagues.register(
-        tictactoe.config(environment={"entry_point": "tests.support.hanging:Raising"}),
+        tictactoe.config(environment={"entry_point": "tests.support.environments.hanging:Raising"}),
         registry.leagues.get(LEAGUE).interface,
     )
     book = record_steps(registry, match)

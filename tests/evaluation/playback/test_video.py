@@ -14,9 +14,9 @@ from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch, InvalidReference, NotFound, StorageError
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 
-SIMULTANEOUS = "tests.support.simultaneous:meeting"
+SIMULTANEOUS = "tests.support.environments.simultaneous:meeting"
 
 
 @pytest.fixture

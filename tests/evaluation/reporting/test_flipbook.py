@@ -16,8 +16,8 @@ from league.environments.building import interface
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match
-from tests.support import tictactoe
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import tictactoe
+from tests.support.leagues.tictactoe import LEAGUE
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_an_environment_without_rendering_has_text_only(registry: Registry) -> N
         "meeting",
         "script:random",
         "script:first",
-        environment={"entry_point": "tests.support.simultaneous:meeting"},
+        environment={"entry_point": "tests.support.environments.simultaneous:meeting"},
         policies={"a": ["agent_0"], "b": ["*"]},
     )
     (book,) = flipbooks(registry, "meeting", [upset(match)], pictures=True)

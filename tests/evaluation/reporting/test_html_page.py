@@ -16,8 +16,8 @@ from evaluation.reporting.html_page import render_page, write
 from evaluation.reporting.league_report import MAX_UPSETS, MOST_VERDICTS, LeagueReport, league_report
 from evaluation.results import AnchorReport, Confirmation, Difference
 from league.errors import StorageError
-from tests.support import reported_league
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import reported_league
+from tests.support.leagues.tictactoe import LEAGUE
 
 BLOCKS = {"td", "th", "li", "p", "dt", "dd", "h3", "b", "caption", "span"}
 VOID = {"meta", "link", "img", "input", "br", "hr"}

@@ -18,8 +18,8 @@ from league.environments.building import interface
 from league.errors import UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from tests.support import reported_league, tictactoe
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import reported_league, tictactoe
+from tests.support.leagues.tictactoe import LEAGUE
 
 NOON = datetime(2026, 3, 3, 12, tzinfo=UTC)
 

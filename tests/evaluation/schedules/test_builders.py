@@ -10,8 +10,8 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch
 from league.results.records import Schedule
-from tests.support.schedules import CONFIG, INTERFACE
-from tests.support.tictactoe import config
+from tests.support.leagues.schedules import CONFIG, INTERFACE
+from tests.support.leagues.tictactoe import config
 
 names = st.lists(st.from_regex(r"tictactoe@[1-9]", fullmatch=True), min_size=2, max_size=6, unique=True)
 

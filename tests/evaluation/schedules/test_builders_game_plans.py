@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from evaluation.schedules.builders import game_plans, round_robin
 from league.environments.building import interface
-from tests.support.tictactoe import config
+from tests.support.leagues.tictactoe import config
 
 SCHEDULE = round_robin(config(), interface(config()), ["tictactoe@1", "tictactoe@2", "script:random"], 10)
 

@@ -6,8 +6,8 @@ import pytest
 from evaluation.schedules.tournament_plan import CHECK_GROWTH, Budget, StoppingRule, TournamentPlan, plan_tournament
 from league.errors import EnvironmentMismatch, InvalidInput
 from league.results.records import Match
-from tests.support.payoff_matches import match
-from tests.support.schedules import CONFIG, INTERFACE
+from tests.support.leagues.payoff_matches import match
+from tests.support.leagues.schedules import CONFIG, INTERFACE
 
 REFS = ("tictactoe@1", "script:random")
 

@@ -17,7 +17,7 @@ from evaluation.service.evaluation_supervisor import EvaluationSupervisor
 from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
 from league.results.ledger import Ledger
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 from tests.support.waiting import until
 
 LONG = 20_000
@@ -58,7 +58,7 @@ def submit(registry: Registry, blocks: int) -> Callable[[], EvaluationRow]:
 
 def change_environment(registry: Registry, environment: str) -> None:
     """Give the league another environment with the same spaces."""
-    config = tictactoe.config(environment={"entry_point": f"tests.support.hanging:{environment}"})
+    config = tictactoe.config(environment={"entry_point": f"tests.support.environments.hanging:{environment}"})
     registry.leagues.register(config, registry.leagues.get(tictactoe.LEAGUE).interface)
 
 

@@ -40,8 +40,8 @@ from league.service_requests import (
     RecordingRequest,
     VideoRequest,
 )
-from tests.support import tictactoe
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import tictactoe
+from tests.support.leagues.tictactoe import LEAGUE
 
 LONG = 120.0
 
@@ -53,7 +53,9 @@ def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
     tictactoe.publish(opened, tictactoe.graph(wins=True))
     evaluate(LEAGUE, ["tictactoe@1", "script:random"], registry=opened, blocks=1)
     for name in ("Hanging", "Raising", "Dying", "BlockingSignals"):
-        config = tictactoe.config(league=name.lower(), environment={"entry_point": f"tests.support.hanging:{name}"})
+        config = tictactoe.config(
+            league=name.lower(), environment={"entry_point": f"tests.support.environments.hanging:{name}"}
+        )
         opened.leagues.register(config, interface(config))
     with pytest.MonkeyPatch.context() as patch:
         for name, value in (
@@ -224,7 +226,9 @@ def test_a_changed_environment_is_used_for_the_next_game(registry: Registry) -> 
     with running() as pool:
         operation = play_request(0, opponent="script:first")
         assert len(document_of(submit(pool, operation, "moving"))["steps"]) == 3
-        other = tictactoe.config(league="moving", environment={"entry_point": "tests.support.hanging:Raising"})
+        other = tictactoe.config(
+            league="moving", environment={"entry_point": "tests.support.environments.hanging:Raising"}
+        )
         registry.leagues.register(other, interface(other))
         with pytest.raises(GameCrashed):
             asyncio.run(pool.submit(GameRequest(league="moving", environment="another", operation=operation), LONG))

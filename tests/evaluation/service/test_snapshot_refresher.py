@@ -16,8 +16,8 @@ from evaluation.service.snapshot_refresher import SnapshotRefresher
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.registry.snapshots import SnapshotRepository
-from tests.support import tictactoe
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import tictactoe
+from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.waiting import until
 
 

@@ -20,8 +20,8 @@ from league.errors import AlreadyRunning, UnknownLeague
 from league.registry.registry import Registry
 from league.registry.storage.rows import SnapshotRow
 from league.settings import Storage
-from tests.support import reported_league, tictactoe
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues import reported_league, tictactoe
+from tests.support.leagues.tictactoe import LEAGUE
 
 PARTS = {"summary", "leaderboard", "payoff", "ratings"}
 
@@ -132,12 +132,12 @@ def test_purged_games_are_ignored(registry: Registry) -> None:
 
 
 def test_games_of_another_environment_are_ignored(registry: Registry) -> None:
-    changed = tictactoe.config(environment={"entry_point": "tests.support.hanging:Raising"})
+    changed = tictactoe.config(environment={"entry_point": "tests.support.environments.hanging:Raising"})
     registry.leagues.register(changed, registry.leagues.get(LEAGUE).interface)
     assert registry.snapshots.stale() == [LEAGUE]
     refresh(registry, LEAGUE)
     summary = snapshot(registry, "summary").document
-    assert (summary["games"], summary["environment"]) == (0, "tests.support.hanging:Raising")
+    assert (summary["games"], summary["environment"]) == (0, "tests.support.environments.hanging:Raising")
     assert snapshot(registry, "leaderboard").document["leaderboard"] == []
     assert snapshot(registry, "payoff").document is None
     assert [version["rating"] for version in snapshot(registry, "ratings").document["versions"]] == [None] * 3

@@ -33,7 +33,7 @@ def test_improvement_and_its_opposite_sum_to_one(ours: np.ndarray, theirs: np.nd
 
 
 def test_the_interval_has_its_coverage() -> None:
-    """With the mean, which is faster than the IQM; `benchmarks.coverage` measures the IQM's interval."""
+    """With the mean, which is faster than the IQM; `benchmarks.simulations.coverage` measures the IQM's interval."""
     rng = np.random.default_rng(0)
     truth = covered = 0
     for seed in range(200):

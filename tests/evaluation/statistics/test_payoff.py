@@ -7,7 +7,7 @@ from hypothesis.extra.numpy import arrays
 from evaluation.statistics.payoff import tabulate
 from evaluation.statistics.population import alpha_rank, nash_averaging, resampled_interval, resampled_scores
 from tests.support.closeness import close
-from tests.support.payoff_matches import match
+from tests.support.leagues.payoff_matches import match
 
 SIDES = ("first", "second")
 

@@ -1,7 +1,7 @@
 import pytest
 
 from evaluation.statistics.population import population
-from tests.support.payoff_matches import match
+from tests.support.leagues.payoff_matches import match
 
 CYCLE = [match(pair, points) for pair in (("a", "b"), ("b", "c"), ("c", "a")) for points in ((1, 1), (1, 0)) * 20]
 

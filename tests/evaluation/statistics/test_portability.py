@@ -41,7 +41,7 @@ RECORD = """
 import sys
 from pathlib import Path
 from evaluation.gating.nightly import nightly
-from tests.support.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
+from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
 registry = league_of(Path(sys.argv[1]), WEAK, MIDDLING, STRONG)
 nightly(CONFIG, registry=registry)
 """
@@ -52,7 +52,7 @@ from pathlib import Path
 from evaluation.gating.verification import verify
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.tictactoe import LEAGUE
+from tests.support.leagues.tictactoe import LEAGUE
 registry = Registry.open(Storage.at(Path(sys.argv[1])))
 verdicts = registry.verdicts.all(LEAGUE)
 assert {verdict.outcome for verdict in verdicts} >= {"promote"}

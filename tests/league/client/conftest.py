@@ -10,10 +10,10 @@ import pytest
 from league.client import AsyncClient, Client
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.clients import SETTINGS, Connect, Synchronous
-from tests.support.protocol_leagues import every_kind
-from tests.support.served_leagues import everything
-from tests.support.streaming import Listening, listening
+from tests.support.clients.sync_and_async import SETTINGS, Connect, Synchronous
+from tests.support.leagues.protocol_leagues import every_kind
+from tests.support.leagues.served_leagues import everything
+from tests.support.servers.streaming import Listening, listening
 
 
 @pytest.fixture(params=[Client, AsyncClient], ids=["sync", "async"])

@@ -29,9 +29,9 @@ from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.models.traffic_split import key_position
-from tests.support.clients import Connect
-from tests.support.graphs import masked_mlp
-from tests.support.streaming import Listening, listening
+from tests.support.clients.sync_and_async import Connect
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
 BOARD = {"observation": np.zeros((6, 7, 2), np.int8), "action_mask": np.ones(7, np.int8)}

@@ -13,9 +13,9 @@ import pytest
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.stream_codec import REPLY, encode_request
-from tests.support.graphs import masked_mlp
-from tests.support.served_leagues import BOARD, promote, publish, register
-from tests.support.streaming import listening
+from tests.support.leagues.served_leagues import BOARD, promote, publish, register
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.streaming import listening
 
 ROOT = Path(__file__).parents[3]
 URL = "http://127.0.0.1:8000"

@@ -7,10 +7,10 @@ import pytest
 
 from league.errors import InvalidReference, UnknownLeague, UnknownVersion, VersionRetired
 from league.registry.registry import Registry
-from tests.support.actions import BOARD
-from tests.support.clients import Connect
-from tests.support.served_leagues import promote
-from tests.support.streaming import Listening, listening
+from tests.support.clients.actions import BOARD
+from tests.support.clients.sync_and_async import Connect
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
 ONE = np.ones(1, np.float32)

@@ -22,10 +22,10 @@ from league.settings import Storage
 from league.spaces import Box as BoxSpace
 from league.spaces import DictSpace
 from league.spaces import Discrete as DiscreteSpace
-from tests.support.graphs import masked_mlp
-from tests.support.protocol_leagues import CHOICE, table
-from tests.support.served_leagues import everything, promote, publish, register
-from tests.support.streaming import Listening, listening
+from tests.support.leagues.protocol_leagues import CHOICE, table
+from tests.support.leagues.served_leagues import everything, promote, publish, register
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
 TICTACTOE = AgentInterface(

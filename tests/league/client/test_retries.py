@@ -12,7 +12,7 @@ import pytest
 from league.client import retries
 from league.client.retries import Retries
 from league.errors import DeadlineExceeded, NotReady, Overloaded, RateLimited, RemoteError
-from tests.support.clients import Connect
+from tests.support.clients.sync_and_async import Connect
 
 DROP, NO_RESPONSE = 0, 1
 """In place of a status: close the connection without a response, or do not respond."""

@@ -23,10 +23,10 @@ from league.errors import (
     VersionRetired,
 )
 from league.registry.registry import Registry
-from tests.support.actions import BOARD, boards
-from tests.support.clients import SETTINGS, Connect
-from tests.support.served_leagues import promote
-from tests.support.streaming import Listening, listening
+from tests.support.clients.actions import BOARD, boards
+from tests.support.clients.sync_and_async import SETTINGS, Connect
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
 ONE = np.ones(1, np.float32)

@@ -9,7 +9,7 @@ from league.environment_config import EnvironmentConfig
 from league.environments.building import action_space, build, describe, interface, observation_space
 from league.errors import ConfigError, EnvironmentMismatch
 
-COUNTING = "tests.support.counting:counting"
+COUNTING = "tests.support.environments.counting:counting"
 
 
 def league(entry_point: str = COUNTING, **changes: Any) -> LeagueConfig:

@@ -6,8 +6,8 @@ from gymnasium import spaces
 
 from league.config import LeagueConfig
 from league.environments.conformance import Examination, examine
-from tests.support.counting import Counting
-from tests.support.simultaneous import Simultaneous
+from tests.support.environments.counting import Counting
+from tests.support.environments.simultaneous import Simultaneous
 
 HERE = "tests.league.environments"
 SUPPORT = "tests.support"

@@ -12,7 +12,7 @@ from league.environment_config import EnvironmentConfig
 from league.environments.lockstep import stepping
 from league.environments.stepping import EpisodeStart
 from tests.conformance.stepping import assert_abandoning_conforms, assert_states_conform, assert_stepping_conforms
-from tests.support.simultaneous import meeting, rllib_meeting
+from tests.support.environments.simultaneous import meeting, rllib_meeting
 
 PARALLEL: dict[str, dict[str, Any]] = {
     "mpe2.simple_spread_v3": {},
@@ -27,11 +27,11 @@ AEC: dict[str, dict[str, Any]] = {
     "pettingzoo.classic.tictactoe_v3": {},
 }
 OWN: dict[str, tuple[Any, dict[str, Any]]] = {
-    "tests.support.simultaneous:meeting": (
+    "tests.support.environments.simultaneous:meeting": (
         meeting,
         {"arrives": [0, 2, 1, 0], "leaves": [4, 5, 2, 3], "truncated": [1, 2]},
     ),
-    "tests.support.simultaneous:rllib_meeting": (rllib_meeting, {"ends": 4}),
+    "tests.support.environments.simultaneous:rllib_meeting": (rllib_meeting, {"ends": 4}),
     "examples.traffic:crossing": (crossing, {}),
     "examples.two_step:parallel_env": (two_step.parallel_env, {}),
     "examples.two_step:multi_agent_env": (two_step.multi_agent_env, {}),

@@ -11,7 +11,7 @@ from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
 from league.errors import IllegalAction
 from tests.conformance.stepping import assert_abandoning_conforms, assert_stepping_conforms
 
-COUNTING = "tests.support.counting:counting"
+COUNTING = "tests.support.environments.counting:counting"
 
 
 def counting(**kwargs: Any) -> EnvironmentConfig:

@@ -11,9 +11,9 @@ from league.environment_config import EnvironmentConfig
 from league.environments.lockstep import stepping
 from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
-from tests.support.simultaneous import RLlibSimultaneous, Simultaneous
+from tests.support.environments.simultaneous import RLlibSimultaneous, Simultaneous
 
-HERE = "tests.support.simultaneous"
+HERE = "tests.support.environments.simultaneous"
 
 
 def config(function: str = "meeting", **kwargs: Any) -> EnvironmentConfig:

@@ -21,8 +21,8 @@ from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.graphs import masked_mlp
-from tests.support.registries import LEAGUE, builder, interface, registered
+from tests.support.leagues.registries import LEAGUE, builder, interface, registered
+from tests.support.policies.graphs import masked_mlp
 
 GRAPHS = [masked_mlp(shape=(3, 3, 2), actions=9, seed=seed) for seed in (1, 2)]
 BATCH = {

@@ -12,7 +12,7 @@ from league.errors import EnvironmentMismatch, UnknownLeague
 from league.policies.loading import check_eligible, eligible, pinned
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 
 LARGER = {"entry_point": "pettingzoo.classic.tictactoe_v3", "kwargs": {"screen_height": 500}}
 MISMATCH = (

@@ -14,7 +14,7 @@ from league.errors import ArtifactCorrupt, EnvironmentMismatch, InvalidInput, Ob
 from league.policies.onnx import OnnxPolicy
 from league.registry.storage.manifest import Parity, PolicyManifest, Tensor
 from league.spaces import Box, DictSpace, Discrete
-from tests.support.graphs import continuous, counting, masked_mlp
+from tests.support.policies.graphs import continuous, counting, masked_mlp
 
 GRAPH = masked_mlp()
 POLICY = OnnxPolicy(GRAPH)

@@ -10,8 +10,8 @@ from league.errors import ArtifactCorrupt
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import Probes
 from league.spaces import Discrete
-from tests.support.graphs import counting, masked_mlp
-from tests.support.probes import probes
+from tests.support.policies.graphs import counting, masked_mlp
+from tests.support.policies.probes import probes
 
 SPACE = Discrete(n=7)
 

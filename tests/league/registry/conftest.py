@@ -5,7 +5,7 @@ import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.registries import registered
+from tests.support.leagues.registries import registered
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from league.registry import aliases
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint
-from tests.support.registries import LEAGUE, publish, registered
+from tests.support.leagues.registries import LEAGUE, publish, registered
 
 
 def begin_run(registry: Registry) -> None:

@@ -12,7 +12,7 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.replicas import LIVENESS_TIMEOUT
 from league.registry.storage.tables import AcknowledgementTable
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 @pytest.fixture

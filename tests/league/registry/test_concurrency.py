@@ -10,7 +10,7 @@ import pytest
 from league.errors import AliasMoved
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.registries import LEAGUE, leftovers, publish, registered
+from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
 
 PROCESSES = 3
 

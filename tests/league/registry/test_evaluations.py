@@ -13,7 +13,7 @@ from league.registry.registry import Registry
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import EvaluationRow
 from league.registry.storage.tables import EvaluationTable
-from tests.support.registries import LEAGUE
+from tests.support.leagues.registries import LEAGUE
 
 REQUEST = {"kind": "tournament", "blocks": 4}
 

@@ -9,7 +9,7 @@ from sqlalchemy import text
 from league.errors import InvalidInput, InvalidReference, NameTaken, UnknownKey, UnknownLeague
 from league.registry.keys import SCOPES, TOKEN_LENGTH, digest
 from league.registry.registry import Registry
-from tests.support.registries import LEAGUE
+from tests.support.leagues.registries import LEAGUE
 
 
 def test_a_token_is_returned_once_and_stored_as_a_digest(registry: Registry) -> None:

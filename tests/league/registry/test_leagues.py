@@ -2,7 +2,7 @@ import pytest
 
 from league.errors import InterfaceChanged, UnknownLeague
 from league.registry.registry import Registry
-from tests.support.registries import LEAGUE, config, interface, publish, registered
+from tests.support.leagues.registries import LEAGUE, config, interface, publish, registered
 
 
 def test_a_league_is_stored_as_registered(registry: Registry) -> None:

@@ -28,7 +28,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest
 from league.registry.storage.tables import VersionTable
 from league.settings import Storage
-from tests.support.registries import GRAPH, LEAGUE, builder, leftovers, manifest, publish
+from tests.support.leagues.registries import GRAPH, LEAGUE, builder, leftovers, manifest, publish
 
 
 def rows(registry: Registry) -> list[int]:
@@ -186,7 +186,7 @@ from pathlib import Path
 from league.registry import publishing, registry
 from league.registry.storage.artifacts import ArtifactStore
 from league.settings import Storage
-from tests.support.registries import LEAGUE, builder
+from tests.support.leagues.registries import LEAGUE, builder
 
 def die(*_, **__):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -253,7 +253,7 @@ from pathlib import Path
 from league.errors import LeagueError
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.registries import LEAGUE, builder
+from tests.support.leagues.registries import LEAGUE, builder
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 registry = Registry.open(Storage.at(sys.argv[1]))
@@ -279,7 +279,7 @@ import os, sys
 from league.errors import LeagueError
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.registries import publish
+from tests.support.leagues.registries import publish
 
 if os.geteuid() == 0:
     os.setuid(65534)

@@ -6,7 +6,7 @@ from sqlalchemy import update
 from league.errors import UnknownLeague
 from league.registry.registry import Registry
 from league.registry.storage.tables import AcknowledgementTable
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 def backdate(registry: Registry, replica: str, by: timedelta) -> None:

@@ -12,7 +12,7 @@ from league.registry.registry import Registry
 from league.registry.runs import HEARTBEAT_TIMEOUT
 from league.registry.storage.rows import RunPoint, RunRow
 from league.registry.storage.tables import RunTable
-from tests.support.registries import LEAGUE
+from tests.support.leagues.registries import LEAGUE
 
 SETTINGS = {"algorithm": "ppo", "lr": 3e-4}
 

@@ -9,8 +9,8 @@ from sqlalchemy.exc import StatementError
 from league.errors import UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from tests.support.ledger_matches import SCHEDULE, play_match
-from tests.support.registries import LEAGUE, config, interface, publish, registered
+from tests.support.leagues.ledger_matches import SCHEDULE, play_match
+from tests.support.leagues.registries import LEAGUE, config, interface, publish, registered
 
 
 def test_a_snapshot_is_stored_with_its_mark(registry: Registry) -> None:

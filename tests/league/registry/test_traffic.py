@@ -13,7 +13,7 @@ from league.registry.registry import Registry
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ReplicaReportTable
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 
 EMPTY = (0,) * (len(BOUNDS) + 1)
 

@@ -5,7 +5,7 @@ from sqlalchemy.exc import StatementError
 
 from league.errors import Conflict, InvalidInput, NotFound, UnknownLeague, UnknownVersion
 from league.registry.registry import Registry
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 
 SETTINGS = {"model": "normalized", "elo0": 0.0, "elo1": 30.0, "alpha": 0.05, "beta": 0.05, "max_blocks": 2000}
 EVIDENCE = {"llr": 2.97, "counts": [1, 2, 3, 4, 5]}

@@ -6,7 +6,7 @@ import pytest
 from league.errors import AlreadyRunning, Conflict, NotFound, UnknownLeague
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 from tests.support.waiting import until
 
 SETTINGS = {"gate": {"alpha": 0.01}}

@@ -7,7 +7,7 @@ from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.versions import MAX_NOTE_LENGTH
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 @pytest.fixture

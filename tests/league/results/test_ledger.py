@@ -27,8 +27,8 @@ from league.results.records import (
     load_schedule,
 )
 from league.settings import Storage
-from tests.support.ledger_matches import SCHEDULE, game, play_match
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.ledger_matches import SCHEDULE, game, play_match
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 @pytest.fixture

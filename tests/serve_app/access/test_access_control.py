@@ -17,9 +17,9 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.settings import ServeSettings
-from tests.support.actions import BOARD
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import everything
+from tests.support.clients.actions import BOARD
+from tests.support.leagues.served_leagues import everything
+from tests.support.servers.replicas import QUICK
 from tests.support.waiting import until
 
 ACTION = "/v1/policies/board/action"

@@ -5,7 +5,7 @@ from starlette.testclient import TestClient
 
 from serve_app.access.access_control import reject_cross_site
 from serve_app.access.errors import CrossSiteRequest
-from tests.support.actions import BOARD
+from tests.support.clients.actions import BOARD
 
 ACTION = "/v1/policies/board/action"
 BODY = {"observation": BOARD}

@@ -9,8 +9,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from tests.support.actions import BOARD, act
-from tests.support.replicas import QUICK, replica
+from tests.support.clients.actions import BOARD, act
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.waiting import until
 
 LOGGING_SETTINGS = QUICK.model_copy(update={"access_log": "logs"})

@@ -7,7 +7,7 @@ from league.registry.registry import Registry
 from serve_app.access import permissions
 from serve_app.access.permissions import PUBLIC, RequiredPermission, for_request, for_rpc
 from serve_app.app import Replica
-from tests.support.replicas import QUICK
+from tests.support.servers.replicas import QUICK
 
 
 @pytest.mark.parametrize(

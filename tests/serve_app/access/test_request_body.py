@@ -10,8 +10,8 @@ from league.registry.registry import Registry
 from serve_app.access.errors import MalformedBody
 from serve_app.access.request_body import read_bytes
 from serve_app.app import Replica
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import promote
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import QUICK
 
 DISCONNECT: Message = {"type": "http.disconnect"}
 

@@ -13,12 +13,12 @@ from starlette.testclient import TestClient
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.actions import BOARD, act, boards, rejected
-from tests.support.graphs import counting, masked_mlp
+from tests.support.clients.actions import BOARD, act, boards, rejected
+from tests.support.leagues.protocol_leagues import DTYPES, FRAME, every_kind
+from tests.support.leagues.served_leagues import build_everything, promote, publish
 from tests.support.pictures import png
-from tests.support.protocol_leagues import DTYPES, FRAME, every_kind
-from tests.support.replicas import QUICK, replica
-from tests.support.served_leagues import build_everything, promote, publish
+from tests.support.policies.graphs import counting, masked_mlp
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.waiting import until
 
 

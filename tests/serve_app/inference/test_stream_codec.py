@@ -14,7 +14,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.stream_codec import HAS_RESETS, REPLY, REQUEST, BinaryCodec, encode_request, parse_request
 from serve_app.models.version_cache import LoadedPolicy, load
-from tests.support.protocol_leagues import DTYPES, every_kind
+from tests.support.leagues.protocol_leagues import DTYPES, every_kind
 
 MAX_ROWS = 64
 """Maximum number of rows in a message."""

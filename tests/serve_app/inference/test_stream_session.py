@@ -18,12 +18,12 @@ from league.registry.storage.rows import Portion
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.inference.stream_codec import HAS_RESETS, REPLY, REQUEST, encode_request
-from tests.support.actions import BAD_BODIES, BOARD, act, boards
-from tests.support.exposition import value
-from tests.support.graphs import counting, masked_mlp
-from tests.support.replicas import QUICK, replica
-from tests.support.served_leagues import promote, publish
-from tests.support.shadows import set_shadow, wait_for
+from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards
+from tests.support.leagues.served_leagues import promote, publish
+from tests.support.policies.graphs import counting, masked_mlp
+from tests.support.servers.exposition import value
+from tests.support.servers.replicas import QUICK, replica
+from tests.support.servers.shadows import set_shadow, wait_for
 from tests.support.waiting import until
 
 ONE = {"observation": [1]}

@@ -7,8 +7,8 @@ import pytest
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
-from tests.support.protocol_leagues import every_kind
-from tests.support.protocol_servers import SETTINGS, InProcess, Listening
+from tests.support.leagues.protocol_leagues import every_kind
+from tests.support.servers.protocol_servers import SETTINGS, InProcess, Listening
 
 
 @pytest.fixture(scope="session")

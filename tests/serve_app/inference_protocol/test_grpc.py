@@ -14,9 +14,9 @@ from league.settings import Storage
 from serve_app.inference_protocol import grpc_handlers
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.grpc_service import CONTENTS
-from tests.support.protocol_leagues import DTYPES
-from tests.support.protocol_observations import observations, policy_of
-from tests.support.protocol_servers import InProcess
+from tests.support.clients.protocol_observations import observations, policy_of
+from tests.support.leagues.protocol_leagues import DTYPES
+from tests.support.servers.protocol_servers import InProcess
 
 Call = Callable[[str, Any], Any]
 Input = messages.ModelInferRequest.InferInputTensor

@@ -9,10 +9,10 @@ from tritonclient.utils import InferenceServerException
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
-from tests.support.protocol_servers import InProcess, Listening
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import everything
-from tests.support.triton import FORMS, Triton
+from tests.support.clients.triton import FORMS, Triton
+from tests.support.leagues.served_leagues import everything
+from tests.support.servers.protocol_servers import InProcess, Listening
+from tests.support.servers.replicas import QUICK
 
 VECTOR = {"observation": np.zeros((1, 2), np.float32)}
 STATUS = {

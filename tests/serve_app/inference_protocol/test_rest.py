@@ -21,10 +21,10 @@ from league.registry.registry import Registry
 from league.registry.versions import VersionRepository
 from league.settings import Storage
 from serve_app.app import Replica
-from tests.support.protocol_servers import SETTINGS
-from tests.support.replicas import QUICK
-from tests.support.replicas import replica as application
-from tests.support.served_leagues import everything, promote
+from tests.support.leagues.served_leagues import everything, promote
+from tests.support.servers.protocol_servers import SETTINGS
+from tests.support.servers.replicas import QUICK
+from tests.support.servers.replicas import replica as application
 from tests.support.waiting import until
 
 LENGTH = "Inference-Header-Content-Length"

@@ -10,11 +10,11 @@ import tritonclient.grpc
 from tritonclient.utils import InferenceServerException
 
 from league.registry.registry import Registry
-from tests.support.protocol_observations import observations, policy_of
-from tests.support.protocol_servers import Address
-from tests.support.served_leagues import promote
-from tests.support.servers import RayServer, load, processes, serving
-from tests.support.triton import FORMS, Triton, assert_same
+from tests.support.clients.protocol_observations import observations, policy_of
+from tests.support.clients.triton import FORMS, Triton, assert_same
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.protocol_servers import Address
+from tests.support.servers.under_load import RayServer, load, processes, serving
 from tests.support.waiting import until
 
 

@@ -10,9 +10,9 @@ import pytest
 from tritonclient.utils import InferenceServerException
 
 from league.settings import Storage
-from tests.support.protocol_observations import observations, policy_of
-from tests.support.protocol_servers import Address
-from tests.support.triton import FORMS, Triton, assert_same, outputs_of
+from tests.support.clients.protocol_observations import observations, policy_of
+from tests.support.clients.triton import FORMS, Triton, assert_same, outputs_of
+from tests.support.servers.protocol_servers import Address
 
 MODELS = ("board", "board.shared", "duo.left", "vector", "nested", "choice", "chess", "pistons", "kinds")
 OUTPUTS = ("action", "action_dist_inputs")

@@ -11,9 +11,9 @@ from league.registry.registry import Registry
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.version_cache import VersionCache, load
 from serve_app.runtime.ray_serve import logger
-from tests.support.graphs import masked_mlp
-from tests.support.probes import probes
-from tests.support.served_leagues import publish
+from tests.support.leagues.served_leagues import publish
+from tests.support.policies.graphs import masked_mlp
+from tests.support.policies.probes import probes
 
 pytestmark = pytest.mark.anyio
 CHAMPION = ("board", "champion")

@@ -15,9 +15,9 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import Acknowledgement
 from league.settings import Storage
 from serve_app.app import Replica
-from tests.support.actions import BOARD, act
-from tests.support.replicas import QUICK, replica
-from tests.support.served_leagues import promote
+from tests.support.clients.actions import BOARD, act
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.waiting import until
 
 

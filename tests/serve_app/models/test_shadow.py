@@ -14,11 +14,11 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.app import Replica
 from serve_app.models.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
-from tests.support.actions import BOARD, act, boards
-from tests.support.graphs import masked_mlp
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import promote
-from tests.support.shadows import set_shadow, wait_for
+from tests.support.clients.actions import BOARD, act, boards
+from tests.support.leagues.served_leagues import promote
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.replicas import QUICK
+from tests.support.servers.shadows import set_shadow, wait_for
 from tests.support.waiting import until
 
 
@@ -73,8 +73,8 @@ def test_pinned_requests_are_not_mirrored(client: TestClient, registry: Registry
 
 
 def test_state_of_another_network_is_not_mirrored(registry: Registry, client: TestClient) -> None:
-    from tests.support.graphs import counting
-    from tests.support.served_leagues import publish
+    from tests.support.leagues.served_leagues import publish
+    from tests.support.policies.graphs import counting
 
     publish(registry, "memory", {"shared": counting()}, "run/2")
     set_shadow(registry, league="memory")

@@ -14,9 +14,9 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.models.traffic_split import key_position
-from tests.support.actions import BOARD
-from tests.support.replicas import replica
-from tests.support.served_leagues import promote
+from tests.support.clients.actions import BOARD
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import replica
 from tests.support.waiting import until
 
 TRAFFIC = "/v1/leagues/board/traffic"

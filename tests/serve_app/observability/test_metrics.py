@@ -12,10 +12,10 @@ from league.registry.storage.rows import Portion
 from serve_app.app import Replica
 from serve_app.observability.metrics import BATCH_SIZES, MAX_SERIES, RequestStats
 from serve_app.observability.prometheus import METRICS, render
-from tests.support.actions import BOARD, act, boards
-from tests.support.exposition import samples, value
-from tests.support.replicas import QUICK, replica
-from tests.support.served_leagues import promote
+from tests.support.clients.actions import BOARD, act, boards
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.exposition import samples, value
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.waiting import until
 
 

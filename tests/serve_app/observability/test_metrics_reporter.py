@@ -6,7 +6,7 @@ from starlette.testclient import TestClient
 from serve_app.observability import metrics_reporter
 from serve_app.observability.metrics import Report
 from serve_app.observability.metrics_reporter import RATE, SECONDS, RequestCounts, RequestRates, request_counts
-from tests.support.actions import BOARD, act
+from tests.support.clients.actions import BOARD, act
 from tests.support.waiting import until
 
 

@@ -17,7 +17,7 @@ from serve_app.access.errors import CODES, status_of
 from serve_app.access.permissions import for_request
 from serve_app.app import Replica
 from serve_app.openapi.document import document
-from tests.support.replicas import QUICK
+from tests.support.servers.replicas import QUICK
 
 ROOT = Path(__file__).parents[3]
 NAMES = {"model": "board", "league": "board", "version": "1", "alias": "champion", "evaluation": "1", "game": "0"}

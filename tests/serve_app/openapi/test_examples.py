@@ -11,8 +11,8 @@ from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
 from serve_app.codecs.observation_codec import ObservationReader
 from serve_app.openapi.document import observation
-from tests.support.protocol_leagues import every_kind
-from tests.support.replicas import QUICK, replica
+from tests.support.leagues.protocol_leagues import every_kind
+from tests.support.servers.replicas import QUICK, replica
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from serve_app.app import Replica
 from serve_app.openapi.document import document
 from serve_app.routes import events
 from serve_app.routes.events import EventBroker
-from tests.support.event_streams import LEAGUE, listen
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import promote
-from tests.support.streaming import Listening, listening
+from tests.support.clients.event_streams import LEAGUE, listen
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import QUICK
+from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
 SOON = QUICK.model_copy(update={"poll_events": 0.02})

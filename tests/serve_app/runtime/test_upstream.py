@@ -31,8 +31,8 @@ from websockets.sync.client import connect
 
 from serve_app.runtime import haproxy, haproxy_script, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.ray_serve import AsgiReplica
-from tests.support.actions import BOARD
-from tests.support.servers import RayServer
+from tests.support.clients.actions import BOARD
+from tests.support.servers.under_load import RayServer
 from tests.support.waiting import until
 
 STATS, METRICS, HTTP, GRPC = 8404, 9101, 8000, 8001

@@ -17,10 +17,10 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.stream_codec import REPLY, encode_request
 from serve_app.runtime import uvicorn_websocket
-from tests.support.actions import BOARD, boards
-from tests.support.replicas import QUICK
-from tests.support.served_leagues import promote
-from tests.support.streaming import Listening, listening
+from tests.support.clients.actions import BOARD, boards
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.replicas import QUICK
+from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
 BODY = json.dumps({"observation": BOARD})

@@ -14,8 +14,8 @@ from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
-from tests.support.training_environments import ROUNDS
-from tests.support.training_leagues import solvable, solvable_by_dqn
+from tests.support.environments.training_environments import ROUNDS
+from tests.support.leagues.training_leagues import solvable, solvable_by_dqn
 from training.algorithms.off_policy import OffPolicy
 from training.algorithms.setup import algorithm_config, module_spec
 from training.export import parity

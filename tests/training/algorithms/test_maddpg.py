@@ -11,8 +11,8 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch
-from tests.support.training_environments import ROUNDS
-from tests.support.training_leagues import maddpg
+from tests.support.environments.training_environments import ROUNDS
+from tests.support.leagues.training_leagues import maddpg
 from training.algorithms.maddpg import MADDPG
 from training.algorithms.setup import algorithm_config, module_spec
 from training.export import parity

@@ -3,7 +3,7 @@ from typing import Any
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, EPISODE_RETURN_MEAN, LEARNER_RESULTS
 
 from league.environments.building import interface
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from training.algorithms.metrics import training_metrics
 
 

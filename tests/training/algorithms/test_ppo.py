@@ -10,8 +10,8 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_ME
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
-from tests.support.training_environments import ROUNDS
-from tests.support.training_leagues import counting, solvable, tictactoe
+from tests.support.environments.training_environments import ROUNDS
+from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from training.algorithms.ppo import PPO, algorithm_config, module_spec
 from training.sampling.env_runner import module_spaces
 
@@ -152,7 +152,7 @@ def test_unsupported_spaces_are_rejected_with_the_name_of_the_policy() -> None:
     with pytest.raises(ConfigError, match=r"training\.convolutions: no part of the observation"):
         module_spec(league.training, interface(league)).build()
     league = LeagueConfig.from_mapping(
-        {"league": "bits", "environment": {"entry_point": "tests.support.training_environments:bits"}}
+        {"league": "bits", "environment": {"entry_point": "tests.support.environments.training_environments:bits"}}
     )
     with pytest.raises(ConfigError, match=r"policies\.shared: unsupported action space MultiBinary"):
         algorithm_config(league, interface(league))

@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, LEARNER_RESULTS
 
-from benchmarks import two_step
+from benchmarks.training import two_step
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
-from tests.support.training_environments import ROUNDS
-from tests.support.training_leagues import solvable_by_dqn
+from tests.support.environments.training_environments import ROUNDS
+from tests.support.leagues.training_leagues import solvable_by_dqn
 from training.algorithms.off_policy import OffPolicy
 from training.algorithms.setup import algorithm_config, module_spec
 from training.export import parity
@@ -33,7 +33,7 @@ Inspect = Callable[[OffPolicy, dict[str, Any]], Any]
 
 
 def qmix_league(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
-    """An environment of `tests.support.training_environments`, with all agents in one team."""
+    """An environment of `tests.support.environments.training_environments`, with all agents in one team."""
     settings = {"algorithm": "qmix", "groups": {"team": ["*"]}, "mixing_width": 8}
     return solvable_by_dqn(name, kwargs, policies, **(settings | training))
 
@@ -251,7 +251,7 @@ def test_frozen_policies_do_not_change() -> None:
 def test_agents_are_trained_on_while_they_are_present(settings: dict[str, Any]) -> None:
     groups = {f"team_{i}": [f"agent_{i}"] for i in range(3)}
     document = qmix_league("discrete", groups=groups, **settings).model_dump(mode="json", by_alias=True)
-    document["environment"]["entry_point"] = "tests.support.simultaneous:meeting"
+    document["environment"]["entry_point"] = "tests.support.environments.simultaneous:meeting"
     document["environment"]["kwargs"] = {"arrives": [0, 2, 0], "leaves": [5, 6, 3], "truncated": [1]}
     document["policies"] = {f"policy_{i}": [f"agent_{i}"] for i in range(3)}
     league = LeagueConfig.from_mapping(document)

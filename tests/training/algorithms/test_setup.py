@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 
 from league.errors import ConfigError
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from training.algorithms.setup import check_policies_to_train, learning_policies
 
 POLICIES = ("a", "b", "c")

@@ -15,7 +15,7 @@ from league.policies.actions import dist_inputs_size
 from league.policies.onnx import OnnxPolicy
 from league.spaces import MultiDiscrete
 from league.spaces.conversion import to_gymnasium
-from tests.support.training_leagues import counting, solvable, tictactoe
+from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from training.algorithms.ppo import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors

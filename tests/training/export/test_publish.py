@@ -17,7 +17,7 @@ from league.registry.storage.manifest import TRAINING
 from league.settings import Storage
 from league.spaces import Discrete
 from league.stack import installed
-from tests.support.training_leagues import solvable, tictactoe
+from tests.support.leagues.training_leagues import solvable, tictactoe
 from training.export import publish as publishing
 from training.export.publish import Checkpoint, git_commit, load_modules, publish
 from training.runs.trial import build_algorithm

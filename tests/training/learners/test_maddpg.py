@@ -9,7 +9,7 @@ from ray.rllib.core.learner.learner import DEFAULT_OPTIMIZER
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from tests.support.training_leagues import maddpg
+from tests.support.leagues.training_leagues import maddpg
 from training.algorithms.maddpg import algorithm_config
 from training.learners.maddpg import AgentSlot, MADDPGLearner, critic_loss, critic_name
 from training.learners.off_policy import bootstrapped_returns

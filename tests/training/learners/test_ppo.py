@@ -13,7 +13,7 @@ from ray.rllib.utils.metrics import ALL_MODULES
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
-from tests.support.training_leagues import solvable
+from tests.support.leagues.training_leagues import solvable
 from training.algorithms.ppo import algorithm_config
 from training.learners import ppo
 from training.learners.ppo import PPOLearner

@@ -1,7 +1,7 @@
 import pytest
 
 from league.errors import ConfigError
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from training.learners.ppo import Hyperparameters, hyperparameters
 
 SETTINGS = tictactoe(gamma=0.9, per_policy={"b": {"lambda": 0.5, "lr": 0.01}}, **{"lambda": 0.8}).training

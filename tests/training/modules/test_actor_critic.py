@@ -11,7 +11,7 @@ from ray.rllib.core.columns import Columns
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
-from tests.support.training_leagues import solvable
+from tests.support.leagues.training_leagues import solvable
 from training.algorithms.ppo import module_spec
 from training.modules.actor_critic import ActorCritic, SharedEncoder
 from training.modules.policy_module import MASKED_LOGIT

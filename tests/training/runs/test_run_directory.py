@@ -4,7 +4,7 @@ import pytest
 
 from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.settings import Storage
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from training.runs.run_directory import CHECKPOINTS, RunDirectory
 
 

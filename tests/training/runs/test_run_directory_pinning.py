@@ -4,7 +4,7 @@ import pytest
 
 from league.config import LeagueConfig
 from league.errors import InvalidReference, LeagueError, UnknownVersion
-from tests.support import tictactoe
+from tests.support.leagues import tictactoe
 from training.runs.run_directory import pin_opponents, with_pins
 
 

@@ -12,8 +12,8 @@ from league.registry import runs
 from league.registry.registry import Registry
 from league.registry.storage.rows import RunRow
 from league.settings import Storage
-from tests.support.registries import interface
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.registries import interface
+from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
 from training.runs import run_reporter
 from training.runs.run_directory import RunDirectory

@@ -20,7 +20,7 @@ from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from league.settings import Storage
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
 from training.export import publish as publishing
 from training.runs.train import check_network, train
@@ -214,7 +214,7 @@ def test_a_fault_of_the_environment_in_a_runner_is_one_sentence(
     league = LeagueConfig.from_mapping(
         {
             "league": "faulty",
-            "environment": {"entry_point": f"tests.support.faulty:{entry_point}"},
+            "environment": {"entry_point": f"tests.support.environments.faulty:{entry_point}"},
             "policies": {"first": ["player_0"], "second": ["player_1"]},
             "training": {"runners": 1, "num_envs": 2, "hidden": [8], "crashes": 1},
         }

@@ -6,8 +6,8 @@ import torch
 
 from league.environments.building import interface
 from league.settings import Storage
-from tests.support.counting import Counting
-from tests.support.training_leagues import counting, tictactoe
+from tests.support.environments.counting import Counting
+from tests.support.leagues.training_leagues import counting, tictactoe
 from training.algorithms.metrics import metric_names
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, build_algorithm, read_progress
 

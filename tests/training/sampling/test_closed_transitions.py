@@ -16,9 +16,9 @@ from league.environments.lockstep import stepping
 from league.errors import EnvironmentMismatch
 from league.seeds import generator
 from league.training_config import OpponentConfig, PPOConfig
-from tests.support.scripted_environment import AgentRecord, Scripted, interface
-from tests.support.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
-from tests.support.training_leagues import tictactoe
+from tests.support.environments.scripted_environment import AgentRecord, Scripted, interface
+from tests.support.leagues.training_leagues import tictactoe
+from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.replay_buffer import NEXT, TransitionBlock
 from training.sampling.closed_transitions import (
     ACTIONS,

@@ -23,8 +23,8 @@ from ray.rllib.utils.metrics import (
 from league.config import LeagueConfig
 from league.environments.building import interface
 from tests.conformance.stepping import plain_loop
-from tests.support.counting import Counting
-from tests.support.training_leagues import counting, tictactoe
+from tests.support.environments.counting import Counting
+from tests.support.leagues.training_leagues import counting, tictactoe
 from training.algorithms.ppo import algorithm_config
 from training.learners.train_batch import train_batch
 from training.runs.trial import build_algorithm

@@ -28,19 +28,19 @@ from league.policies.actions import to_environment
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces.conversion import to_gymnasium
-from tests.support import registries
-from tests.support.environment_cases import CASES, Case
-from tests.support.graphs import masked_mlp
-from tests.support.simultaneous import Simultaneous
-from tests.support.training_leagues import solvable, tictactoe
+from tests.support.environments.cases import CASES, Case
+from tests.support.environments.simultaneous import Simultaneous
+from tests.support.leagues import registries
+from tests.support.leagues.training_leagues import solvable, tictactoe
+from tests.support.policies.graphs import masked_mlp
 from training.algorithms.ppo import algorithm_config
 from training.sampling.env_runner import LockstepEnvRunner
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import CRASHES, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 from training.sampling.reset_seeds import ResetSeeds
 
-MEETING = "tests.support.simultaneous:meeting"
-RLLIB_MEETING = "tests.support.simultaneous:rllib_meeting"
+MEETING = "tests.support.environments.simultaneous:meeting"
+RLLIB_MEETING = "tests.support.environments.simultaneous:rllib_meeting"
 
 
 def simultaneous(

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from league.environments.building import interface
-from tests.support.training_leagues import maddpg
+from tests.support.leagues.training_leagues import maddpg
 from training.algorithms.maddpg import algorithm_config
 from training.replay_buffer import TransitionBlock
 from training.sampling.closed_transitions import JOINT

@@ -14,11 +14,11 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_LEN_MEAN, NUM_EN
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import EnvironmentMismatch, IllegalAction
-from tests.support.training_leagues import COUNTING
+from tests.support.leagues.training_leagues import COUNTING
 from training.modules.actor_critic import ActorCritic
 from training.sampling.rllib_env import LeagueEnv, register
 
-MEETING = "tests.support.simultaneous:meeting"
+MEETING = "tests.support.environments.simultaneous:meeting"
 
 
 def league(entry_point: str, name: str = "together", **kwargs: Any) -> LeagueConfig:
@@ -117,7 +117,7 @@ def test_infos_of_resets_and_steps_are_passed_on() -> None:
 
 def with_infos() -> Any:
     """A simultaneous environment with infos."""
-    from tests.support.simultaneous import Simultaneous
+    from tests.support.environments.simultaneous import Simultaneous
 
     class WithInfos(Simultaneous):
         def reset(self, seed: int | None = None, options: Any = None) -> Any:

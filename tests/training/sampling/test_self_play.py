@@ -14,8 +14,8 @@ from league.errors import ConfigError
 from league.policies.actions import to_environment
 from league.seeds import generator
 from league.training_config import OpponentConfig, PPOConfig
-from tests.support.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
-from tests.support.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
+from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
+from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.sampling.opponents import OpponentPolicy
 from training.sampling.play_metrics import AgentEpisode
 from training.sampling.recorder import EpisodeRecorder

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from league.config import SweepConfig
 from league.errors import ConfigError
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from training.sweeps.search_space import applied, nested, plan
 
 

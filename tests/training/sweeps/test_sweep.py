@@ -17,7 +17,7 @@ from league.config import LeagueConfig
 from league.errors import ConfigError, NotFound
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
 from training.sweeps.sweep import sweep
 

@@ -7,7 +7,7 @@ import pytest
 
 from league.errors import ArtifactCorrupt, UnknownVersion
 from league.registry.registry import Registry
-from tests.support.registries import GRAPH, LEAGUE, publish
+from tests.support.leagues.registries import GRAPH, LEAGUE, publish
 
 
 def _flip_a_bit(directory: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from league.errors import StorageError
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.registries import registered
+from tests.support.leagues.registries import registered
 
 
 def slugs(registry: Registry) -> list[str]:

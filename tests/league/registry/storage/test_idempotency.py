@@ -13,7 +13,7 @@ from league.registry.registry import Registry
 from league.registry.storage.idempotency import KEPT, IdempotentCall
 from league.registry.storage.rows import AliasEvent
 from league.registry.storage.tables import IdempotentCallTable
-from tests.support.registries import LEAGUE, publish
+from tests.support.leagues.registries import LEAGUE, publish
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from league.registry.storage.database import Database
 from league.registry.storage.tables import Base
 from league.results.ledger import Ledger
 from league.settings import Storage
-from tests.support.ledger_matches import SCHEDULE, play_match
-from tests.support.registries import LEAGUE, registered
+from tests.support.leagues.ledger_matches import SCHEDULE, play_match
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 @pytest.fixture(autouse=True)

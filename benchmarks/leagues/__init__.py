@@ -1,0 +1,1 @@
+"""Leagues that benchmarks serve and evaluate."""

@@ -1,0 +1,72 @@
+"""A league for evaluation: configs/connect_four.yaml, and untrained versions with its network and different seeds."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.registry.registry import Registry
+from league.registry.storage.manifest import Manifest, Parity, PolicyManifest
+from league.registry.storage.rows import LeagueRow
+from league.settings import Storage
+from training.algorithms.ppo import module_spec
+from training.export.onnx_export import export_policy, graph_tensors
+from training.modules.actor_critic import ActorCritic
+
+CONFIG = LeagueConfig.load(Path(__file__).parents[2] / "configs" / "connect_four.yaml")
+
+
+def publish(home: Path, versions: int) -> tuple[Registry, list[ActorCritic]]:
+    """A registry in `home` with this number of versions, and the modules that they were exported from."""
+    registry = Registry.open(Storage.at(home))
+    registry.leagues.register(CONFIG, interface(CONFIG))
+    row = registry.leagues.get(CONFIG.league)
+    modules = [_module(row, seed) for seed in range(versions)]
+    for seed, module in enumerate(modules):
+        registry.publisher.publish(CONFIG.league, _builder(row, module, seed), source=f"untrained/{seed}", parent=None)
+    return registry, modules
+
+
+def _module(row: LeagueRow, seed: int) -> ActorCritic:
+    torch.manual_seed(seed)
+    (policy,) = row.interface.policy_ids
+    module: ActorCritic = module_spec(row.config.training, row.interface).build()[policy]
+    return module.eval()
+
+
+def _builder(row: LeagueRow, module: ActorCritic, seed: int) -> Callable[[Path, int], Manifest]:
+    (policy,) = row.interface.policy_ids
+    spaces = row.interface.of_policy(policy)
+
+    def build(directory: Path, number: int) -> Manifest:
+        export_policy(module, spaces, directory / f"{policy}.onnx")
+        taken, answered, state = graph_tensors(module, spaces)
+        return Manifest(
+            league=row.slug,
+            version=number,
+            created_at=datetime.now(UTC),
+            interface=row.interface,
+            policies={
+                policy: PolicyManifest(
+                    file=f"{policy}.onnx",
+                    observation=spaces.observation,
+                    action=spaces.action,
+                    inputs=taken,
+                    outputs=answered,
+                    state=state,
+                    parity=Parity(observations=0, mismatches=0, near_ties=0, max_difference=0.0),
+                )
+            },
+            environment=row.config.environment,
+            environment_digest=row.environment_digest,
+            algorithm="ppo",
+            settings={},
+            seed=seed,
+            steps=0,
+            stack={},
+        )
+
+    return build

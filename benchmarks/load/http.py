@@ -1,0 +1,229 @@
+"""A lightweight HTTP/1.1 load generator: raw sockets, keep-alive, one request in flight per connection.
+
+`python -m benchmarks.load.http URL --connections 32 --seconds 5 < body.json` prints one line of JSON (a `Load`). It is
+a separate process, so that it does not share an interpreter with the measured server; each request costs it a few
+microseconds.
+"""
+
+import argparse
+import asyncio
+import json
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from random import random
+from typing import cast
+from urllib.parse import urlsplit
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """The results of one run. Times in milliseconds; `failed`: dropped connections and statuses other than 200."""
+
+    requests: int
+    seconds: float
+    failed: int
+    statuses: dict[str, int]
+    p50: float
+    p99: float
+    max: float
+
+    @property
+    def rate(self) -> float:
+        """Responses with status 200 per second."""
+        return (self.requests - self.failed) / self.seconds
+
+
+OnReply = Callable[[int, bytes, float], bool]
+"""(status, body, time.perf_counter() at sending) → whether to send again. Status 0: the connection was dropped."""
+
+
+JSON = {"Content-Type": "application/json"}
+LENGTH = b"content-length: "
+LAST_CHUNK = b"0\r\n\r\n"
+
+
+class Connection(asyncio.Protocol):
+    """Sends `request` again as soon as its response is complete, or every `interval` seconds, and reports each
+    response.
+
+    A request that is due while the previous one is unanswered counts as sent when it was due, so that a slow server is
+    charged for all waiting requests (Tene's coordinated omission).
+    """
+
+    def __init__(self, request: bytes, on_reply: OnReply, interval: float = 0.0) -> None:
+        self.request = request
+        self.on_reply = on_reply
+        self.interval = interval
+        self.closed = asyncio.get_running_loop().create_future()
+        self.received = b""
+        self.sent_at = 0.0
+        self.waiting = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        self.due = time.perf_counter() + random() * self.interval
+        self.send_when_due()
+
+    def send_when_due(self) -> None:
+        early = self.due - time.perf_counter()
+        if early > 0:
+            asyncio.get_running_loop().call_later(early, self.send)
+        else:
+            self.send(self.due if self.interval else None)
+
+    def send(self, sent_at: float | None = None) -> None:
+        if self.transport.is_closing():
+            return
+        self.waiting = True
+        self.sent_at = sent_at or time.perf_counter()
+        self.due += self.interval
+        self.transport.write(self.request)
+
+    def data_received(self, data: bytes) -> None:
+        self.received = self.received + data if self.received else data
+        end = self.received.find(b"\r\n\r\n")
+        if end < 0:
+            return
+        head = self.received[:end].lower()
+        if not self.is_complete(head, end + 4):
+            return
+        reply, self.received, self.waiting = self.received, b"", False
+        if self.on_reply(int(reply[9:12]), reply[end + 4 :], self.sent_at) and b"connection: close" not in head:
+            self.send_when_due()
+        else:
+            self.transport.close()
+
+    def is_complete(self, head: bytes, body: int) -> bool:
+        """Whether a response whose body starts at `body` has arrived, with a stated length or in chunks."""
+        at = head.find(LENGTH)
+        if at < 0:
+            return self.received.endswith(LAST_CHUNK)
+        stop = head.find(b"\r", at)
+        return len(self.received) >= body + int(head[at + len(LENGTH) : stop if stop > 0 else None])
+
+    def connection_lost(self, _: Exception | None) -> None:
+        if self.waiting:
+            self.on_reply(0, b"", self.sent_at)
+        self.closed.set_result(None)
+
+
+def post(url: str, body: bytes, headers: Mapping[str, str] = JSON) -> bytes:
+    """The bytes of a POST to `url`."""
+    parts = urlsplit(url)
+    path = parts.path + (f"?{parts.query}" if parts.query else "")
+    lines = [f"POST {path} HTTP/1.1", f"Host: {parts.netloc}", f"Content-Length: {len(body)}"]
+    lines += [f"{name}: {value}" for name, value in headers.items()]
+    return "\r\n".join(lines).encode() + b"\r\n\r\n" + body
+
+
+async def drive(
+    url: str,
+    body: bytes,
+    connections: int,
+    on_reply: OnReply,
+    is_running: Callable[[], bool],
+    *,
+    rate: float = 0.0,
+    headers: Mapping[str, str] = JSON,
+) -> None:
+    """Keep `connections` busy until `is_running()` is false; dropped connections are reopened.
+
+    rate: requests per second of all connections together; 0: each as fast as it is answered.
+    """
+    parts = urlsplit(url)
+    request = post(url, body, headers)
+    interval = connections / rate if rate else 0.0
+
+    async def keep_busy() -> None:
+        loop = asyncio.get_running_loop()
+        while is_running():
+            try:
+                _, connection = await loop.create_connection(
+                    lambda: Connection(request, on_reply, interval), parts.hostname, parts.port
+                )
+            except OSError:
+                on_reply(0, b"", time.perf_counter())
+                await asyncio.sleep(0.05)
+                continue
+            await connection.closed
+
+    await asyncio.gather(*(keep_busy() for _ in range(connections)))
+
+
+async def run(
+    url: str, body: bytes, connections: int, seconds: float, warm_up: float, rate: float, headers: Mapping[str, str]
+) -> Load:
+    """Load `url` for `warm_up + seconds`; the warm-up is not counted."""
+    statuses: Counter[str] = Counter()
+    latencies: list[float] = []
+    start = time.perf_counter() + warm_up
+    stop = start + seconds
+
+    def on_reply(status: int, _: bytes, sent_at: float) -> bool:
+        now = time.perf_counter()
+        if start <= now <= stop:
+            statuses[str(status)] += 1
+            latencies.append(now - sent_at)
+        return now < stop
+
+    await drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop, rate=rate, headers=headers)
+    times = np.array(latencies or [np.nan]) * 1e3
+    p50, p99 = np.percentile(times, [50, 99])
+    requests = statuses.total()
+    return Load(
+        requests, seconds, requests - statuses["200"], dict(statuses), float(p50), float(p99), float(times.max())
+    )
+
+
+def measure(
+    url: str,
+    body: bytes,
+    *,
+    connections: int,
+    seconds: float,
+    warm_up: float = 1.0,
+    rate: float = 0.0,
+    headers: Mapping[str, str] = JSON,
+) -> Load:
+    """Run the generator in a subprocess."""
+    command = [sys.executable, "-m", "benchmarks.load.http", url]
+    command += ["--connections", str(connections), "--seconds", str(seconds), "--warm-up", str(warm_up)]
+    command += ["--rate", str(rate), "--headers", json.dumps(dict(headers))]
+    done = subprocess.run(command, input=body, stdout=subprocess.PIPE, check=True)
+    return Load(**json.loads(done.stdout))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("url")
+    parser.add_argument("--connections", type=int, default=32)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--warm-up", type=float, default=1.0)
+    parser.add_argument("--rate", type=float, default=0.0, help="requests per second; 0: as fast as they are answered")
+    parser.add_argument("--headers", type=json.loads, default=JSON, help="as a JSON object")
+    options = parser.parse_args()
+    import uvloop
+
+    body = sys.stdin.buffer.read()
+    load = uvloop.run(
+        run(
+            options.url,
+            body,
+            options.connections,
+            options.seconds,
+            options.warm_up,
+            options.rate,
+            options.headers,
+        )
+    )
+    print(json.dumps(asdict(load)))
+
+
+if __name__ == "__main__":
+    main()

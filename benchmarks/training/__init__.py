@@ -1,0 +1,1 @@
+"""Training with measured time: the parts of `benchmarks.learning`."""

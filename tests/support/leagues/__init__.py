@@ -1,0 +1,1 @@
+"""Leagues for tests: versions, matches, verdicts and training runs."""

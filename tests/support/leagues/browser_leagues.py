@@ -1,0 +1,72 @@
+"""Leagues for the browser tests: tic-tac-toe after a nightly run, connect four to play, and one without results."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from evaluation.service.snapshots import refresh
+from league.config import LeagueConfig
+from league.environments.building import interface
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.registry.storage.rows import Portion, RunPoint, VerdictRow
+from tests.support.leagues.reported_league import HOSTILE, league_after_nightly
+from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.waiting import until
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
+RUN = "ppo-17"
+KEYS = {"everything": ["act", "read", "evaluate", "promote"], "evaluator": ["evaluate", "read"], "reader": ["read"]}
+
+
+@contextmanager
+def leagues_of_every_page(home: Path) -> Iterator[Registry]:
+    """Data for each page, including hostile text."""
+    with league_after_nightly(home) as registry:
+        for name in (CONNECT_FOUR, EMPTY):
+            config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
+            registry.leagues.register(config, interface(config))
+        registry.traffic.set(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
+        registry.versions.set_note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
+        registry.runs.begin(
+            LEAGUE, RUN, algorithm="ppo", settings={"note": HOSTILE, "minutes": 10}, seed=17, target=40_000
+        )
+        for number in range(20):
+            record(registry, 1000 * (number + 1))
+        compute(registry)
+        yield registry
+
+
+def compute(registry: Registry) -> None:
+    """Compute the snapshots that the evaluation service would compute."""
+    for row in registry.leagues.all():
+        refresh(registry, row.slug)
+
+
+def record(registry: Registry, steps: int) -> None:
+    """Record progress of the run."""
+    curves = {"player/return": steps / 40_000, "player/entropy": 2 - steps / 40_000, "time/sampling": 1.5}
+    registry.runs.record(LEAGUE, RUN, RunPoint(steps, curves, datetime.now(UTC)), seconds=0.0225 * steps)
+
+
+def verdict_between_versions(registry: Registry) -> VerdictRow:
+    """A verdict that promoted a version over another version."""
+    closed = [each for each in registry.verdicts.all(LEAGUE) if each.outcome == "promote"]
+    return next(each for each in closed if not each.champion.startswith("script:"))
+
+
+def answer(method: str, url: str, body: Any = None) -> Any:
+    """The response of the evaluation service; retries while it is not ready."""
+    replies: list[httpx.Response] = []
+
+    def is_ready() -> bool:
+        replies.append(httpx.request(method, url, json=body, timeout=60))
+        return replies[-1].status_code != 503
+
+    until(is_ready, seconds=120)
+    return replies[-1].raise_for_status().json()

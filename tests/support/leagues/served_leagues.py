@@ -1,0 +1,182 @@
+"""Leagues with each kind of space, published from small handwritten graphs."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from league.config import LeagueConfig
+from league.interface import AgentInterface, Interface
+from league.policies.probes import Probes
+from league.registry.aliases import ANY
+from league.registry.registry import Registry
+from league.registry.storage.manifest import PROBES, Manifest, Parity, PolicyManifest, Tensor
+from league.registry.storage.rows import VersionRow
+from league.settings import Storage
+from league.spaces import Box, DictSpace, Discrete
+from tests.support.policies.graphs import continuous, counting, masked_mlp
+from tests.support.templates import copy_of
+
+BOARD = AgentInterface(
+    observation=DictSpace(
+        spaces={
+            "observation": Box(dtype="int8", shape=(6, 7, 2), low=0, high=1),
+            "action_mask": Box(dtype="int8", shape=(7,), low=0, high=1),
+        }
+    ),
+    action=Discrete(n=7),
+)
+MEMORY = AgentInterface(observation=Box(dtype="float32", shape=(1,), low=None, high=None), action=Discrete(n=2))
+VECTOR = AgentInterface(
+    observation=Box(dtype="float32", shape=(2,), low=-1, high=1),
+    action=Box(dtype="float32", shape=(2,), low=-1, high=1),
+)
+NESTED = AgentInterface(
+    observation=DictSpace(
+        spaces={
+            "mode": Discrete(n=3, start=1),
+            "sense": DictSpace(spaces={"speed": Box(dtype="float32", shape=(2,), low=None, high=None)}),
+        }
+    ),
+    action=Discrete(n=2),
+)
+
+
+def nested() -> bytes:
+    """Whether the sum of the speeds times the mode is positive."""
+    nodes = [
+        helper.make_node("ReduceSum", ["observation.sense.speed", "axis"], ["sum"], keepdims=0),
+        helper.make_node("Cast", ["observation.mode"], ["mode"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["sum", "mode"], ["product"]),
+        helper.make_node("Unsqueeze", ["product", "axis"], ["column"]),
+        helper.make_node("Neg", ["column"], ["negative"]),
+        helper.make_node("Concat", ["negative", "column"], ["action_dist_inputs"], axis=1),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
+    ]
+    inputs = [
+        helper.make_tensor_value_info("observation.mode", TensorProto.INT64, ["batch"]),
+        helper.make_tensor_value_info("observation.sense.speed", TensorProto.FLOAT, ["batch", 2]),
+    ]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
+        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
+    ]
+    constants = [numpy_helper.from_array(np.array([1], np.int64), "axis")]
+    graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def interface(policies: dict[str, AgentInterface]) -> Interface:
+    """One agent for each policy."""
+    agents = {f"agent_{policy}": spaces for policy, spaces in policies.items()}
+    return Interface(
+        agents=agents,
+        policies={f"agent_{policy}": policy for policy in policies},
+        sides={agent: (agent,) for agent in agents},
+    )
+
+
+def register(registry: Registry, league: str, policies: dict[str, AgentInterface]) -> None:
+    registry.leagues.register(_config(league), interface(policies))
+
+
+def publish(
+    registry: Registry, league: str, graphs: dict[str, bytes], source: str, probes: dict[str, Probes] | None = None
+) -> VersionRow:
+    """Publish a version of a registered league with these graphs, by policy, and optionally their probes."""
+    return registry.publisher.publish(league, _builder(registry, league, graphs, probes or {}), source=source)
+
+
+def promote(registry: Registry, league: str, version: int) -> None:
+    """Promote like `league promote`."""
+    registry.aliases.set(league, "champion", version, expected=ANY, actor="test", reason="test")
+
+
+def everything(storage: Storage) -> Registry:
+    """A registry with a league of each kind: `board` with three versions, the first of them its champion."""
+    return copy_of(build_everything, storage)
+
+
+def build_everything(storage: Storage) -> Registry:
+    """Like `everything`, but newly published, with other digests."""
+    registry = Registry.open(storage)
+    register(registry, "board", {"shared": BOARD})
+    for seed in range(3):
+        publish(registry, "board", {"shared": masked_mlp(seed=seed)}, f"run/{seed}")
+    register(registry, "duo", {"left": BOARD, "right": BOARD})
+    publish(registry, "duo", {"left": masked_mlp(seed=3), "right": masked_mlp(seed=4)}, "run")
+    for league, spaces, graph in (
+        ("memory", MEMORY, counting()),
+        ("vector", VECTOR, continuous()),
+        ("nested", NESTED, nested()),
+        ("headless", BOARD, masked_mlp()),
+    ):
+        register(registry, league, {"shared": spaces})
+        publish(registry, league, {"shared": graph}, "run")
+    register(registry, "empty", {"shared": BOARD})
+    for league in ("board", "duo", "memory", "vector", "nested"):
+        promote(registry, league, 1)
+    return registry
+
+
+def _config(league: str) -> LeagueConfig:
+    return LeagueConfig.from_mapping({"league": league, "environment": {"entry_point": "games.none:none"}})
+
+
+def _builder(
+    registry: Registry, league: str, graphs: dict[str, bytes], probes: dict[str, Probes]
+) -> Callable[[Path, int], Manifest]:
+    row = registry.leagues.get(league)
+
+    def build(directory: Path, number: int) -> Manifest:
+        (directory / "training").mkdir()
+        (directory / "training" / "state").write_bytes(b"weights of the trainer")
+        for policy, graph in graphs.items():
+            (directory / f"{policy}.onnx").write_bytes(graph)
+        for policy, recorded in probes.items():
+            (directory / f"{policy}{PROBES}").write_bytes(recorded.to_bytes())
+        return Manifest(
+            league=league,
+            version=number,
+            created_at=datetime.now(UTC),
+            interface=row.interface,
+            policies={
+                policy: _policy(row.interface.of_policy(policy), policy, graph, policy in probes)
+                for policy, graph in graphs.items()
+            },
+            environment=row.config.environment,
+            environment_digest=row.environment_digest,
+            algorithm="ppo",
+            settings={},
+            seed=0,
+            steps=number,
+            stack={},
+        )
+
+    return build
+
+
+def _policy(spaces: AgentInterface, policy: str, graph: bytes, has_probes: bool) -> PolicyManifest:
+    model = onnx.load_from_string(graph).graph
+    inputs, outputs = (tuple(_tensor(value) for value in values) for values in (model.input, model.output))
+    return PolicyManifest(
+        file=f"{policy}.onnx",
+        observation=spaces.observation,
+        action=spaces.action,
+        inputs=inputs,
+        outputs=outputs,
+        state=tuple(tensor for tensor in inputs if tensor.name.startswith("state_in_")),
+        parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
+        probes=f"{policy}{PROBES}" if has_probes else None,
+    )
+
+
+def _tensor(value: onnx.ValueInfoProto) -> Tensor:
+    tensor = value.type.tensor_type
+    shape = tuple(dimension.dim_value or None for dimension in tensor.shape.dim)
+    return Tensor(name=value.name, dtype=helper.tensor_dtype_to_np_dtype(tensor.elem_type).name, shape=shape)

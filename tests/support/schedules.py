@@ -1,8 +1,0 @@
-"""A configuration and an interface for schedules."""
-
-from league.environments.building import interface
-from tests.support.tictactoe import config
-
-CONFIG = config()
-
-INTERFACE = interface(CONFIG)

@@ -1,0 +1,1 @@
+"""Servers for tests: replicas with and without Ray, PostgreSQL, and servers under load."""

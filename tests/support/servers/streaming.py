@@ -1,0 +1,59 @@
+"""A replica's application on its own uvicorn, with our protocol classes, as Ray Serve runs it."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import uvicorn
+
+from league.registry.registry import Registry
+from league.settings import Storage
+from serve_app.app import Replica
+from serve_app.runtime import uvicorn_http, uvicorn_websocket
+from serve_app.settings import ServeSettings
+from tests.support.servers.replicas import QUICK, UnavailableEvaluation
+from tests.support.waiting import until
+
+
+@dataclass
+class Listening:
+    """A running server."""
+
+    url: str
+    server: Replica
+    uvicorn: uvicorn.Server
+
+    def stream(self, model: str, query: str = "") -> str:
+        """The URL of a stream."""
+        return f"ws://{self.url.removeprefix('http://')}/v1/policies/{model}/stream{query}"
+
+    def drain(self) -> None:
+        """Stop the server, as Ray Serve stops a replica after HAProxy has removed it."""
+        self.uvicorn.should_exit = True
+
+
+@contextmanager
+def listening(
+    storage: Storage, settings: ServeSettings = QUICK, replica: str = "replica-1", port: int = 0, **options: Any
+) -> Iterator[Listening]:
+    """A replica in a thread, on a local port, by default a free one. Options are those of uvicorn."""
+    server = Replica(Registry.open(storage), settings, replica, evaluation_client=UnavailableEvaluation())
+    uvicorn_http.install(server.events.end)
+    uvicorn_websocket.install(settings.max_body)
+    config = uvicorn.Config(
+        server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
+    )
+    runner = uvicorn.Server(config)
+    thread = threading.Thread(target=runner.run, daemon=True)
+    thread.start()
+    until(lambda: runner.started or not thread.is_alive())
+    assert runner.started
+    port = runner.servers[0].sockets[0].getsockname()[1]
+    try:
+        yield Listening(f"http://127.0.0.1:{port}", server, runner)
+    finally:
+        runner.should_exit = True
+        thread.join(20)
+        assert not thread.is_alive()
