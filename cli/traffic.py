@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from league.registry.traffic import Unchanged
 
 CANARY_SHARE, SHADOW_SHARE = 0.05, 1.0
-NOBODY = "none"
+NONE = "none"
 
 
 Canary = Annotated[
@@ -91,7 +91,7 @@ def _portion(
 
     if ref is None and share is None:
         return KEEP
-    if ref == NOBODY:
+    if ref == NONE:
         return None
     if ref is not None:
         return Portion(_version(league, option, ref), default if share is None else share)

@@ -58,11 +58,13 @@ class ServeEvaluationClient:
         """Send a request. Errors return as data, because exceptions would arrive with a traceback as their message."""
         try:
             async with asyncio.timeout(CALL_SHARE * self._timeout):
-                reply = await self._handle.request_game.remote(request.model_dump_json(), SERVICE_SHARE * self._timeout)
+                response = await self._handle.request_game.remote(
+                    request.model_dump_json(), SERVICE_SHARE * self._timeout
+                )
         except RayTaskError:
             raise  # a bug in the evaluation service
         except (RayError, RayServeException, TimeoutError) as error:
             raise NoEvaluationService("the evaluation service does not respond: it may be starting") from error
-        if "code" in reply:
-            raise from_document(reply)
-        return GameResponse(**reply)
+        if "code" in response:
+            raise from_document(response)
+        return GameResponse(**response)

@@ -23,7 +23,7 @@ from league.results.ledger import Ledger
 from league.results.records import Action, Game, Match
 from league.spaces import DictSpace, Space
 
-NOBODY: Mapping[str, Policy] = {}
+NO_PLAYERS: Mapping[str, Policy] = {}
 
 
 def replay(
@@ -32,7 +32,7 @@ def replay(
     interface: Interface,
     match: Match,
     index: int,
-    players: Mapping[str, Policy] = NOBODY,
+    players: Mapping[str, Policy] = NO_PLAYERS,
 ) -> Iterator[GameStep]:
     """Replay game `index` of a match in environment 0 and yield its steps. A forfeited game ends at its forfeit.
 

@@ -87,7 +87,7 @@ def _templates() -> Environment:
         "elo": _elo,
         "evidence": _evidence,
         "interval": _interval,
-        "moment": _moment,
+        "timestamp": _timestamp,
         "outcome": _outcome,
         "percent": _percent,
         "plain": _plain,
@@ -225,7 +225,7 @@ def _minus(text: str) -> str:
     return text.replace("-", "−")
 
 
-def _moment(text: str) -> str:
+def _timestamp(text: str) -> str:
     return datetime.fromisoformat(text).strftime("%Y-%m-%d %H:%M UTC")
 
 

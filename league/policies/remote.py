@@ -71,9 +71,9 @@ class RemotePolicy:
         self.close()
 
 
-def _read(reply: JsonObject, _: str) -> Actions:
-    state = {name: np.asarray(rows, np.float32) for name, rows in reply.get("state", {}).items()}
-    actions = np.array(reply["actions"])
+def _read(response: JsonObject, _: str) -> Actions:
+    state = {name: np.asarray(rows, np.float32) for name, rows in response.get("state", {}).items()}
+    actions = np.array(response["actions"])
     return Actions(actions.astype(np.float32) if actions.dtype.kind == "f" else actions, state or None)
 
 

@@ -178,7 +178,7 @@ class AccessControlMiddleware:
             self._access.backlog.watch_port(here[1])
         if self._log is not None:
             send = self._log.begin(scope, _path(scope), send)
-        reply = ResponseTracker(send)
+        response = ResponseTracker(send)
         try:
             shown = _read_headers(scope["headers"])
             method = scope.get("method", "GET")
@@ -190,16 +190,16 @@ class AccessControlMiddleware:
                 if self._log is not None:
                     scope[LOG_ENTRY]["key"] = key.name
             if kind != "http" or is_event_stream(_path(scope)):
-                await self._application(scope, receive, reply.send)
+                await self._application(scope, receive, response.send)
                 return
             timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
-            await run_within(timeout, self._application(scope, receive, reply.send))
+            await run_within(timeout, self._application(scope, receive, response.send))
         except LeagueError as error:
-            if reply.has_started:
+            if response.has_started:
                 raise
             await self._refuse(error, scope, receive, send)
         except TimeLimitExceeded:
-            if not reply.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
+            if not response.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
                 await self._refuse(_timeout_error(scope, timeout), scope, receive, send)
 
     async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:

@@ -68,10 +68,10 @@ class ObservationReader:
 
 
 def read_state(value: Any, leaves: Iterable[tuple[str, Leaf]], batch: int) -> dict[str, NDArray]:
-    """Decode recurrent state in the format of a reply: name → nested lists, with one row per observation."""
+    """Decode recurrent state in the format of a response: name → nested lists, with one row per observation."""
     expected = dict(leaves)
     if type(value) is not dict or value.keys() != expected.keys():
-        raise ObservationError(f"state must be null or the state of an earlier reply, with {', '.join(expected)}")
+        raise ObservationError(f"state must be null or the state of an earlier response, with {', '.join(expected)}")
     arrays = {name: check(name, _array(name, value[name], leaf), leaf) for name, leaf in expected.items()}
     for name, array in arrays.items():
         if len(array) != batch:

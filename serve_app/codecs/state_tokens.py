@@ -53,7 +53,7 @@ def write_tokens(model: str, version: int, sha256: str, state: dict[str, NDArray
 def read_token(text: Any) -> StateToken:
     """Decode a token. Raises InvalidState if it is malformed or damaged."""
     if type(text) is not str:
-        raise InvalidState("state must be null or the state of an earlier reply: one string per observation")
+        raise InvalidState("state must be null or the state of an earlier response: one string per observation")
     try:
         data = binascii.a2b_base64(text.translate(FROM_URL_ALPHABET) + "=" * (-len(text) % 4), strict_mode=True)
         found, version, manifest, length = HEAD.unpack_from(data)
@@ -63,7 +63,7 @@ def read_token(text: Any) -> StateToken:
     except (binascii.Error, ValueError, struct.error):
         whole = False
     if not whole:
-        raise InvalidState("state is not a complete token of an earlier reply")
+        raise InvalidState("state is not a complete token of an earlier response")
     return StateToken(model, version, manifest, data[begin:end])
 
 

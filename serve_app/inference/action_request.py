@@ -1,4 +1,4 @@
-"""An action request: parsed and checked, executed, and encoded as a reply."""
+"""An action request: parsed and checked, executed, and encoded as a response."""
 
 import asyncio
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class DecodedActionRequest:
     observations: list[Any]
     is_batch: bool
     state: dict[str, Any] | None
-    """Recurrent state as arrays, not decoded yet; empty at the start of episodes if the reply's state shall be
+    """Recurrent state as arrays, not decoded yet; empty at the start of episodes if the response's state shall be
     arrays."""
     tokens: list[StateToken | None] | None
     """Recurrent state as tokens, one per observation; None at the start of an episode."""
@@ -187,17 +187,17 @@ async def execute_request(
     return await execute(policy, observations, state, rng, request.probabilities)
 
 
-def build_reply(
+def build_response(
     request: DecodedActionRequest, answer: Actions, observations: Arrays, policy: LoadedPolicy
 ) -> dict[str, Any]:
-    """The reply's `action` or `actions`, and its `probabilities`."""
+    """The response's `action` or `actions`, and its `probabilities`."""
     actions = answer.actions.tolist()
-    reply = {"actions": actions} if request.is_batch else {"action": actions[0]}
+    response = {"actions": actions} if request.is_batch else {"action": actions[0]}
     if request.probabilities:
         assert answer.dist_inputs is not None
         likely = probabilities(answer.dist_inputs, policy.manifest.action, observations.get(ACTION_MASK))
-        reply["probabilities"] = likely if request.is_batch else likely[0]
-    return reply
+        response["probabilities"] = likely if request.is_batch else likely[0]
+    return response
 
 
 def generators(seed: int | list[int] | None, rows: int) -> Sequence[np.random.Generator]:

@@ -2,7 +2,7 @@
 
     request   format 1 · flags · 0 · rows · seed             if flagged, one byte per row: 1 starts an episode
               then each input of the policy in the order of its manifest, without recurrent state: rows × its shape
-    reply     format 1 · 0 · 0 · rows · version · 0          then the actions: rows × the shape of an action
+    response  format 1 · 0 · 0 · rows · version · 0          then the actions: rows × the shape of an action
 
 With 16 bytes the first tensor is aligned in memory and can be used without a copy.
 """
@@ -24,7 +24,7 @@ from serve_app.models.version_cache import LoadedPolicy
 
 FRAMING = 1
 REQUEST = struct.Struct("<BBHIQ")
-REPLY = struct.Struct("<BBHIII")
+RESPONSE = struct.Struct("<BBHIII")
 EXPLORE, HAS_SEED, RESET, HAS_RESETS = 1, 2, 4, 8
 FLAGS = EXPLORE | HAS_SEED | RESET | HAS_RESETS
 
@@ -53,7 +53,7 @@ class _Input:
 
 
 class BinaryCodec:
-    """Decodes requests and encodes replies of one policy."""
+    """Decodes requests and encodes responses of one policy."""
 
     def __init__(self, policy: LoadedPolicy) -> None:
         self._inputs = [_input(name, leaf) for name, _, leaf in policy.reader.leaves]
@@ -78,8 +78,10 @@ class BinaryCodec:
         return arrays
 
     def write(self, actions: NDArray, version: int) -> bytes:
-        """Encode the reply."""
-        return REPLY.pack(FRAMING, 0, 0, len(actions), version, 0) + actions.astype(self._action, copy=False).tobytes()
+        """Encode the response."""
+        return (
+            RESPONSE.pack(FRAMING, 0, 0, len(actions), version, 0) + actions.astype(self._action, copy=False).tobytes()
+        )
 
 
 def parse_request(message: bytes, max_batch: int) -> BinaryRequest:

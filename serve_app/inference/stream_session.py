@@ -26,7 +26,7 @@ from serve_app.inference.action_request import (
     KEYS,
     Arrays,
     DecodedActionRequest,
-    build_reply,
+    build_response,
     execute,
     execute_request,
     generators,
@@ -63,7 +63,7 @@ class ServedPolicy(NamedTuple):
     policy: LoadedPolicy
     codec: BinaryCodec
     signature: dict[str, Any]
-    """Identifies the version in each JSON reply."""
+    """Identifies the version in each JSON response."""
 
     @classmethod
     def of(cls, model: str, version: LoadedVersion, policy: LoadedPolicy) -> "ServedPolicy":
@@ -157,10 +157,10 @@ class StreamSession:
         answer = await execute_request(request, served.policy, observations, state)
         self._mirror(served, observations, state, None if request.explore else answer.actions)
         self._store_state(served, answer, request.is_batch)
-        reply = build_reply(request, answer, observations, served.policy) | served.signature
+        response = build_response(request, answer, observations, served.policy) | served.signature
         if return_state and self._state is not None:
-            reply["state"] = self._tokens()
-        message = _text(reply)
+            response["state"] = self._tokens()
+        message = _text(response)
         self._count(served, len(request.observations), begun)
         return message
 

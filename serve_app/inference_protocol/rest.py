@@ -134,18 +134,18 @@ class InferRoute:
                 log_version(scope, response.model, int(response.version))
             return write_response(response, request)
 
-        reply, length = await self._inference.infer(request.infer, write, scope["headers"])
+        response, length = await self._inference.infer(request.infer, write, scope["headers"])
         headers = [self._replica, (b"content-type", JSON if length is None else BINARY)]
         if length is not None:
             headers.append((HEADER_LENGTH, b"%d" % length))
         if accepted:
-            reply, chosen = await compressed(reply, accepted)
+            response, chosen = await compressed(response, accepted)
             headers.append((b"vary", b"accept-encoding"))
             if chosen is not None:
                 headers.append((b"content-encoding", chosen))
-        headers.append((b"content-length", b"%d" % len(reply)))
+        headers.append((b"content-length", b"%d" % len(response)))
         await send({"type": "http.response.start", "status": 200, "headers": headers})
-        await send({"type": "http.response.body", "body": reply})
+        await send({"type": "http.response.body", "body": response})
 
 
 def _headers(scope: Scope) -> tuple[int | None, bytes, bytes]:

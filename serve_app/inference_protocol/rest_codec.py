@@ -26,7 +26,7 @@ WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 LEVEL = 1
 """The fastest level."""
 MIN_COMPRESSED_BYTES = 1024
-"""Smaller replies are not compressed."""
+"""Smaller responses are not compressed."""
 
 
 async def decompressed(body: bytes, encoding: bytes, limit: int) -> bytes:

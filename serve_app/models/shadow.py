@@ -1,6 +1,6 @@
 """Mirrors requests that the champion has answered to a candidate, and compares their actions.
 
-    request → champion → reply
+    request → champion → response
                  ↘ bounded queue → thread: candidate → same action? latency? → counts
 
 Callers are unaffected. Requests are batched in a thread that pauses between batches to stay within its share of a core;

@@ -1,13 +1,13 @@
 """POST /v1/policies/{model}/action: observations to actions, the hot path.
 
-    request  {"observation": …}  or  {"observations": [ … ]};  optional "state", "explore", "seed", "probabilities"
-    reply    {"action": …}       or  {"actions": [ … ]};       with "model", "version", "sha256" and requested fields
+    request   {"observation": …}  or  {"observations": [ … ]};  optional "state", "explore", "seed", "probabilities"
+    response  {"action": …}       or  {"actions": [ … ]};       with "model", "version", "sha256" and requested fields
 
 `seed` is an integer, or a list with one per observation. With a seed of its own an observation gets the same action in
 every batch; with a common seed, the same action at the same position. `state` is null or the `state` of an earlier
-reply: one token per observation, whose version answers; or arrays, name → nested lists with one row per observation, to
-which the reply has arrays, too. `sha256` is the digest of the version's manifest.json, which contains the digests of
-all its files.
+response: one token per observation, whose version answers; or arrays, name → nested lists with one row per observation,
+to which the response has arrays, too. `sha256` is the digest of the version's manifest.json, which contains the digests
+of all its files.
 """
 
 from time import perf_counter_ns
@@ -24,7 +24,7 @@ from serve_app.inference.action_request import (
     KEYS,
     REPLICA,
     DecodedActionRequest,
-    build_reply,
+    build_response,
     decode_state,
     encode_state,
     execute_request,
@@ -78,11 +78,11 @@ class ActionRoute:
         model = scope["path_params"]["model"]
         requested = pinned_version(request, model, parsing.query_params(scope).get("version", CHAMPION))
         version, policy = await self._models.find(model, requested, scope["headers"])
-        reply = await _reply(request, body.count(b'"'), version, policy, self._shadow.mirror_for(model, version))
-        reply |= {"model": model, "version": version.number, "sha256": version.sha256}
+        response = await _response(request, body.count(b'"'), version, policy, self._shadow.mirror_for(model, version))
+        response |= {"model": model, "version": version.number, "sha256": version.sha256}
         if LOG_ENTRY in scope:
             log_version(scope, model, version.number)
-        await _send(send, orjson.dumps(reply), self._replica)
+        await _send(send, orjson.dumps(response), self._replica)
         self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - begun)
 
 
@@ -105,7 +105,7 @@ class ActionDispatch:
         await self._application(scope, receive, send)
 
 
-async def _reply(
+async def _response(
     request: DecodedActionRequest,
     quotes: int,
     version: LoadedVersion,
@@ -118,14 +118,14 @@ async def _reply(
     output = await execute_request(request, policy, observations, state)
     if mirror is not None:
         mirror(observations, state, None if request.explore else output.actions)
-    reply = build_reply(request, output, observations, policy)
+    response = build_response(request, output, observations, policy)
     if output.state is not None:
         if request.state is not None:
-            reply["state"] = {name: array.tolist() for name, array in output.state.items()}
+            response["state"] = {name: array.tolist() for name, array in output.state.items()}
         else:
             tokens = encode_state(output, version, policy)
-            reply["state"] = tokens if request.is_batch else tokens[0]
-    return reply
+            response["state"] = tokens if request.is_batch else tokens[0]
+    return response
 
 
 async def _send(send: Send, body: bytes, replica: tuple[bytes, bytes]) -> None:

@@ -65,9 +65,9 @@ class StreamRoute:
             try:
                 if len(data) > self._dependencies.settings.max_body:
                     raise CloseStream(TOO_BIG, f"a message is larger than {self._dependencies.settings.max_body} bytes")
-                reply = await stream.answer(data, text is not None)
+                response = await stream.answer(data, text is not None)
             except CloseStream as end:
                 await send({"type": "websocket.close", "code": end.code, "reason": end.reason})
                 return
-            key, value = ("text", reply.data.decode()) if reply.is_text else ("bytes", reply.data)
+            key, value = ("text", response.data.decode()) if response.is_text else ("bytes", response.data)
             await send({"type": "websocket.send", key: value})

@@ -274,10 +274,10 @@ def _await_replicas(application: str, deployment: str, url: str) -> None:
 
 def _ready_replica(client: httpx.Client, url: str) -> set[str]:
     try:
-        reply = client.get(f"{url}/v1/health/ready")
+        response = client.get(f"{url}/v1/health/ready")
     except httpx.TransportError:
         return set()
-    return {reply.json()["replica"]} if reply.status_code == 200 else set()
+    return {response.json()["replica"]} if response.status_code == 200 else set()
 
 
 def _reason(status: Any) -> str:

@@ -16,8 +16,8 @@ def test_a_game_is_rendered_and_described(league: League, registry: Registry, tm
     assert result.code == 0, result.err
     assert "player_1 (script:one_ply)" in result.out
     assert "player_2 (tictactoe@3)" in result.out
-    with Image.open(out) as film:
-        assert f"{film.n_frames - 1} steps" in result.out  # type: ignore[attr-defined]
+    with Image.open(out) as image:
+        assert f"{image.n_frames - 1} steps" in result.out  # type: ignore[attr-defined]
 
 
 def test_a_recorded_match_is_rendered(league: League, registry: Registry, tmp_path: Path) -> None:

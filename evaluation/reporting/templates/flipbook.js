@@ -1,9 +1,9 @@
 "use strict";
 // Shows one image at a time, with buttons. Without this script, all images are shown as a list.
 for (const game of document.querySelectorAll(".game")) {
-  const film = game.querySelector(".film");
-  if (!film) continue;
-  const steps = [...film.children];
+  const frames = game.querySelector(".frames");
+  if (!frames) continue;
+  const steps = [...frames.children];
   const controls = document.createElement("div");
   controls.className = "controls";
   controls.setAttribute("role", "group");
@@ -32,11 +32,11 @@ for (const game of document.querySelectorAll(".game")) {
     timer = null;
     play.textContent = "Play";
     play.setAttribute("aria-label", "Play");
-    film.setAttribute("aria-live", "polite");
+    frames.setAttribute("aria-live", "polite");
   };
   const start = () => {
     go(at === steps.length - 1 ? 0 : at);
-    film.setAttribute("aria-live", "off");
+    frames.setAttribute("aria-live", "off");
     play.textContent = "Pause";
     play.setAttribute("aria-label", "Pause");
     timer = setInterval(() => go(at + 1), steps.length > 60 ? 120 : 700);
@@ -53,7 +53,7 @@ for (const game of document.querySelectorAll(".game")) {
   slider.addEventListener("input", () => { pause(); go(Number(slider.value)); });
   const place = document.createElement("output");
   controls.append(slider, place);
-  film.before(controls);
+  frames.before(controls);
   game.classList.add("playing");
   go(0);
   pause();

@@ -12,7 +12,7 @@ import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.inference.stream_codec import REPLY, encode_request
+from serve_app.inference.stream_codec import RESPONSE, encode_request
 from tests.support.leagues.served_leagues import BOARD, promote, publish, register
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.streaming import listening
@@ -72,4 +72,4 @@ def test_the_c_plus_plus_framing_is_ours(tmp_path: Path) -> None:
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     message = subprocess.run([tmp_path / "shown"], check=True, capture_output=True).stdout
     assert message == encode_request([np.ones((2, 84), np.int8), np.ones((2, 7), np.int8)], 2, reset=True)
-    assert REPLY.size == 16
+    assert RESPONSE.size == 16

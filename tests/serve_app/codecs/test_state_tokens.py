@@ -72,7 +72,7 @@ def test_a_token_is_little_longer_than_its_state() -> None:
 
 @pytest.mark.parametrize("text", ["", "a", "abcd", "****", "Ä" * 40, "a" * 200, "=" * 40, "\0", "\n" * 4, "🎲" * 9])
 def test_an_invalid_token_is_rejected(text: str) -> None:
-    with pytest.raises(InvalidState, match="not a complete token of an earlier reply"):
+    with pytest.raises(InvalidState, match="not a complete token of an earlier response"):
         read_token(text)
 
 

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 from league.errors import InvalidInput, ObservationError
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.inference.stream_codec import HAS_RESETS, REPLY, REQUEST, BinaryCodec, encode_request, parse_request
+from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, BinaryCodec, encode_request, parse_request
 from serve_app.models.version_cache import LoadedPolicy, load
 from tests.support.leagues.protocol_leagues import DTYPES, every_kind
 
@@ -93,7 +93,7 @@ def test_replies_contain_the_actions(
             arrays.arrays(np.dtype(dtype), shape, elements=arrays.from_dtype(np.dtype(dtype), **numbers))
         )
         reply = BinaryCodec(policies[league]).write(actions, version)
-        assert REPLY.unpack_from(reply) == (1, 0, 0, rows, version, 0)
+        assert RESPONSE.unpack_from(reply) == (1, 0, 0, rows, version, 0)
         np.testing.assert_array_equal(np.frombuffer(reply, dtype, offset=16).reshape(shape), actions)
 
 

@@ -17,7 +17,7 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.settings import Storage
 from serve_app.app import Replica
-from serve_app.inference.stream_codec import HAS_RESETS, REPLY, REQUEST, encode_request
+from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, encode_request
 from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards
 from tests.support.leagues.served_leagues import promote, publish
 from tests.support.policies.graphs import counting, masked_mlp
@@ -52,9 +52,9 @@ def binary(stream: WebSocketTestSession, message: bytes) -> tuple[np.ndarray, in
     stream.send_bytes(message)
     reply = stream.receive()
     assert reply.get("bytes") is not None, reply
-    framing, flags, zero, rows, version, last = REPLY.unpack_from(reply["bytes"])
+    framing, flags, zero, rows, version, last = RESPONSE.unpack_from(reply["bytes"])
     assert (framing, flags, zero, last) == (1, 0, 0, 0)
-    actions = np.frombuffer(reply["bytes"], "<i8", offset=REPLY.size)
+    actions = np.frombuffer(reply["bytes"], "<i8", offset=RESPONSE.size)
     assert len(actions) == rows
     return actions, version
 
@@ -109,7 +109,7 @@ def test_vectors_are_answered_in_their_dtype(read_only_client: TestClient) -> No
         observation = np.array([[0.5, -1], [0.25, 1]], "<f4")
         stream.send_bytes(encode_request([observation], 2))
         reply = stream.receive_bytes()
-        assert reply == REPLY.pack(1, 0, 0, 2, 1, 0) + observation.tobytes()
+        assert reply == RESPONSE.pack(1, 0, 0, 2, 1, 0) + observation.tobytes()
         assert answer_to(stream, observation=[0.5, -1], probabilities=True).keys() > {"probabilities"}
 
 

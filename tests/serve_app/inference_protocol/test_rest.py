@@ -86,7 +86,7 @@ SCHEMAS |= {
     "/v2/models/board/stats": SCHEMAS["/v2/models/stats"],
     "/v2/models/board/versions/3/stats": SCHEMAS["/v2/models/stats"],
 }
-REPLY = exact(
+RESPONSE = exact(
     model_name={"const": "vector"},
     model_version={"const": "1"},
     id={"const": "tick"},
@@ -130,7 +130,7 @@ def test_documents_follow_the_protocol(client: TestClient, path: str) -> None:
 
 def test_an_inference_response_follows_the_protocol(client: TestClient) -> None:
     reply = infer(client, {"id": "tick", "inputs": [VECTOR], "outputs": [{"name": "action"}]})
-    jsonschema.validate(reply.json(), REPLY)
+    jsonschema.validate(reply.json(), RESPONSE)
     assert reply.json()["outputs"] == [{"name": "action", "datatype": "FP32", "shape": [1, 2], "data": [0.5, -1]}]
     assert reply.headers["x-league-replica"] == "replica-1"
     assert LENGTH not in reply.headers

@@ -15,7 +15,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.inference.stream_codec import REPLY, encode_request
+from serve_app.inference.stream_codec import RESPONSE, encode_request
 from serve_app.runtime import uvicorn_websocket
 from tests.support.clients.actions import BOARD, boards
 from tests.support.leagues.served_leagues import promote
@@ -73,7 +73,9 @@ def test_messages_of_one_connection_share_one_state(listener: Listening) -> None
         for kind in range(40):
             reply = stream.recv(20)
             assert isinstance(reply, str) == bool(kind % 2)
-            actions.append(json.loads(reply)["action"] if kind % 2 else int.from_bytes(reply[REPLY.size :], "little"))
+            actions.append(
+                json.loads(reply)["action"] if kind % 2 else int.from_bytes(reply[RESPONSE.size :], "little")
+            )
         assert actions == [0, 0] + [1] * 38
 
 
