@@ -10,6 +10,7 @@ from hypothesis import settings
 
 from league.registry.storage import database
 from tests.support.schema import migrated_once
+from tests.support.servers import postgresql
 
 # Tests do not measure time: other load on the machine must not make one fail.
 settings.register_profile("untimed", deadline=None)
@@ -55,3 +56,13 @@ def ray_session() -> Iterator[None]:
     ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     yield
     ray.shutdown()
+
+
+@pytest.fixture(scope="session")
+def postgresql_socket() -> Iterator[Path]:
+    """The socket of a PostgreSQL server; the test is skipped if its programs are not installed."""
+    programs = postgresql.programs()
+    if programs is None:
+        pytest.skip("PostgreSQL is not installed")
+    with postgresql.server(programs) as socket:
+        yield socket

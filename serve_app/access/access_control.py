@@ -2,13 +2,11 @@
 
 Order of the checks, with the status of a refusal:
 
-    origin → API key → rate limit → load → timeout → application
-    403      401, 403  429          429    504
+    host and origin → API key → rate limit → load → timeout → application
+    403               401, 403  429          429    504
 
-A web page of another site cannot set the headers that carry an API key, but it could call a server that requires no
-key. Browsers state the origin of a request in `Sec-Fetch-Site` (W3C, "Fetch Metadata Request Headers") or `Origin` (RFC
-6454), and a page cannot change these headers. The timeout applies to HTTP requests only: gRPC calls have their own
-deadlines, and WebSocket and event streams are long-lived.
+The timeout applies to HTTP requests only: gRPC calls have their own deadlines, and WebSocket and event streams are
+long-lived.
 """
 
 from collections.abc import Awaitable, Iterable
@@ -20,38 +18,14 @@ from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError
 from serve_app.access import permissions
 from serve_app.access.access_log import LOG_ENTRY, AccessLog
 from serve_app.access.api_keys import ApiKey, ApiKeyCache
-from serve_app.access.errors import BodyTooSlow, CrossSiteRequest, ErrorHandlers
+from serve_app.access.errors import BodyTooSlow, ErrorHandlers
 from serve_app.access.load_shedding import Backlog
 from serve_app.access.permissions import RequiredPermission
 from serve_app.access.request_body import BODY_READ
+from serve_app.access.request_origin import ORIGIN_HEADERS, reject_cross_site, reject_foreign_host
 from serve_app.runtime.serve_bypass import is_event_stream
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
-
-ORIGIN_HEADERS = frozenset((b"sec-fetch-site", b"origin"))
-"""Headers in which a browser states the origin of a request."""
-SAFE_METHODS = ("GET", "HEAD")
-SAME_ORIGIN = (b"same-origin", b"none")
-"""Values of `Sec-Fetch-Site` for a page of this server, and for a bookmark or a typed address."""
-
-
-def reject_cross_site(method: str, headers: Iterable[tuple[bytes, bytes]]) -> None:
-    """Raise CrossSiteRequest if a page of another origin sent a request that is not GET or HEAD."""
-    if method in SAFE_METHODS:
-        return
-    values = dict(headers)
-    site, origin = values.get(b"sec-fetch-site"), values.get(b"origin")
-    # "same-site" is not enough: it includes pages on other ports of this machine.
-    is_ours = site in SAME_ORIGIN if site is not None else origin is None or _authority(origin) == values.get(b"host")
-    if not is_ours:
-        shown = (origin or b"another origin").decode("latin-1")[:100]
-        raise CrossSiteRequest(f"cross-site request from {shown} refused: only pages of this server may send it")
-
-
-def _authority(origin: bytes) -> bytes:
-    """Host and port of an origin; empty for `null`, the opaque origin."""
-    return origin.partition(b"://")[2]
-
 
 KEY = "league.key"
 """Scope entry of a request with a valid key: its `ApiKey`."""
@@ -79,6 +53,11 @@ class AccessControl:
             return self._is_exposed or not self._api_keys.is_empty
         return self._settings.require_keys == "always"
 
+    @property
+    def is_local_only(self) -> bool:
+        """Whether only programs and pages of this machine may call: on loopback, while no key exists."""
+        return self._settings.require_keys == "auto" and not self.requires_key
+
     def admit(self, need: RequiredPermission, token: bytes | None) -> ApiKey | None:
         """Accept a request or an RPC, and return its key.
 
@@ -90,6 +69,18 @@ class AccessControl:
         if need.scope == "act":
             self.backlog.admit()
         return key
+
+    def admit_request(self, scope: Scope, headers: "RequestHeaders") -> ApiKey | None:
+        """Accept an HTTP request or a WebSocket handshake, and return its key.
+
+        Raises UntrustedHost, CrossSiteRequest, and the errors of `admit`.
+        """
+        method = scope.get("method", "GET")
+        if self.is_local_only:
+            reject_foreign_host(scope["headers"])
+        if headers.is_browser:
+            reject_cross_site(method, scope["headers"])
+        return self.admit(permissions.for_request(scope["type"], method, _path(scope)), headers.token)
 
     def admit_message(self, key: ApiKey | None) -> None:
         """Accept a message of a stream that was opened with `key`.
@@ -181,10 +172,7 @@ class AccessControlMiddleware:
         response = ResponseTracker(send)
         try:
             shown = _read_headers(scope["headers"])
-            method = scope.get("method", "GET")
-            if shown.is_browser:
-                reject_cross_site(method, scope["headers"])
-            key = self._access.admit(permissions.for_request(kind, method, _path(scope)), shown.token)
+            key = self._access.admit_request(scope, shown)
             if key is not None:
                 scope[KEY] = key
                 if self._log is not None:

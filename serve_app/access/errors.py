@@ -47,6 +47,10 @@ class CrossSiteRequest(Forbidden, code="cross_site"):
     """A page of another origin sent the request."""
 
 
+class UntrustedHost(Forbidden, code="untrusted_host"):
+    """The request names a host other than the loopback interface, on a server without keys."""
+
+
 class BodyTooSlow(LeagueError, code="body_too_slow"):
     """The body did not arrive in time."""
 

@@ -1,4 +1,3 @@
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
@@ -7,15 +6,6 @@ import pytest
 
 from league.settings import Storage
 from tests.support.servers import postgresql
-
-
-@pytest.fixture(scope="session")
-def postgresql_socket() -> Iterator[Path]:
-    programs = postgresql.programs()
-    if programs is None:
-        pytest.skip("PostgreSQL is not installed")
-    with postgresql.server(programs) as socket:
-        yield socket
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

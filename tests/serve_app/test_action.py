@@ -20,7 +20,7 @@ from serve_app.app import Replica
 from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards, rejected
 from tests.support.leagues.served_leagues import promote
 from tests.support.policies.graphs import masked_mlp
-from tests.support.servers.replicas import QUICK
+from tests.support.servers.replicas import LOCALHOST, QUICK
 from tests.support.waiting import until
 
 
@@ -231,7 +231,7 @@ async def test_the_number_of_concurrent_requests_is_limited(registry: Registry) 
         yield json.dumps({"observation": BOARD}).encode()
 
     transport = httpx.ASGITransport(server.application())
-    async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url="http://replica") as client:
+    async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
         slow = [asyncio.create_task(client.post("/v1/policies/board/action", content=body())) for _ in range(2)]
         while server.action.in_flight < 2:
             await asyncio.sleep(0)

@@ -23,7 +23,7 @@ from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.protocol_servers import SETTINGS
-from tests.support.servers.replicas import QUICK
+from tests.support.servers.replicas import LOCALHOST, QUICK
 from tests.support.servers.replicas import replica as application
 from tests.support.waiting import until
 
@@ -389,7 +389,7 @@ async def test_the_number_of_concurrent_requests_is_limited(leagues: Storage) ->
 
     path = "/v2/models/vector/infer"
     transport = httpx.ASGITransport(server.application())
-    async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url="http://replica") as client:
+    async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
         slow = [asyncio.create_task(client.post(path, content=body())) for _ in range(2)]
         while server.inference.in_flight < 2:
             await asyncio.sleep(0)

@@ -17,7 +17,7 @@ from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.clients.actions import BOARD, act
 from tests.support.leagues.served_leagues import promote
-from tests.support.servers.replicas import QUICK, replica
+from tests.support.servers.replicas import LOCALHOST, QUICK, replica
 from tests.support.waiting import until
 
 
@@ -88,7 +88,7 @@ def test_a_tampered_champion_is_reported(client: TestClient, registry: Registry)
 
 def test_serving_continues_without_the_database(registry: Registry) -> None:
     server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
-    with TestClient(server.application()) as client:
+    with TestClient(server.application(), base_url=LOCALHOST) as client:
         act(client, version=2, observation=BOARD)
         with outage(server.registry):
             until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")

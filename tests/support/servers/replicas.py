@@ -13,13 +13,14 @@ QUICK = ServeSettings(poll=0.03, poll_slowest=0.05, retry=0.05, heartbeat=0.2, m
 """Settings of a replica for tests: short intervals and low limits."""
 READ_ONLY = QUICK.model_copy(update={"poll": 1.0, "poll_slowest": 1.0, "heartbeat": 2.0})
 """Settings of a replica that many tests share and none changes: fast polls would slow down all tests of the process."""
+LOCALHOST = "http://localhost"
+"""Base URL of requests in this process: a server without keys accepts no other host."""
 
 
 def replica(storage: Storage, settings: ServeSettings = QUICK) -> TestClient:
     """The application of a new replica; enter it to start."""
-    return TestClient(
-        Replica(Registry.open(storage), settings, "replica-1", evaluation_client=UnavailableEvaluation()).application()
-    )
+    server = Replica(Registry.open(storage), settings, "replica-1", evaluation_client=UnavailableEvaluation())
+    return TestClient(server.application(), base_url=LOCALHOST)
 
 
 class UnavailableEvaluation:
