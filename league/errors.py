@@ -16,6 +16,11 @@ class LeagueError(Exception):
         # Ray derives a class without a code from that of an error in a remote task.
         cls.code = code or cls.code
 
+    @property
+    def public_message(self) -> str:
+        """The message for callers on other machines."""
+        return str(self)
+
 
 class InvalidInput(LeagueError, code="invalid_input"):
     """The input is invalid."""
@@ -202,7 +207,12 @@ class RemoteError(LeagueError, code="remote_error"):
 
 
 class StorageError(LeagueError, code="storage_error"):
-    """The database or the artefact store cannot be read or written."""
+    """The database or the artefact store cannot be read or written. The message may name files, hosts and users."""
+
+    @property
+    def public_message(self) -> str:
+        """The message without details of this machine, which are in the server's log."""
+        return "the registry's database or files cannot be used; see the server log"
 
 
 def one_line(error: BaseException, with_type: bool = False, first_line: bool = False) -> str:

@@ -192,7 +192,7 @@ class AccessControlMiddleware:
 
     async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
-            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": str(error)[:120]})
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": error.public_message[:120]})
             return
         await self._errors.response(_path(scope), error)(scope, receive, send)
 

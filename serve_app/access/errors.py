@@ -117,7 +117,7 @@ class ErrorHandlers:
         if isinstance(error, RateLimited):
             headers = {"retry-after": str(max(1, ceil(error.wait)))}
         self._count(path, error.code)
-        return error_response(path, status, error.code, str(error), headers)
+        return error_response(path, status, error.code, error.public_message, headers)
 
     async def http_error(self, request: Request, error: Exception) -> Response:
         """Handle an error of Starlette's router."""

@@ -242,7 +242,7 @@ class StreamSession:
 
 def error_message(error: LeagueError, retry: float) -> StreamMessage:
     """An error as a message. retry: seconds to wait after NotReady."""
-    document: dict[str, Any] = {"code": error.code, "message": str(error), "status": status_of(error)}
+    document: dict[str, Any] = {"code": error.code, "message": error.public_message, "status": status_of(error)}
     if document["status"] >= 500:
         logger.error("%s: %s", error.code, error)
     if document["status"] in (429, 503):

@@ -73,7 +73,7 @@ def _handler(rpc: str, request_type: Any) -> grpc.RpcMethodHandler:
                 raise NotReady("this process has no replica")
             return await _service.call(rpc, request, context)
         except LeagueError as error:
-            code, message = CODES.get(status_of(error), grpc.StatusCode.INTERNAL), str(error)
+            code, message = CODES.get(status_of(error), grpc.StatusCode.INTERNAL), error.public_message
         except Exception as error:
             logger.error("a call failed", exc_info=error)
             code, message = grpc.StatusCode.INTERNAL, "internal server error; see the server log"

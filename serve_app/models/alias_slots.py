@@ -81,7 +81,7 @@ class AliasSlots:
         try:
             version = await self._versions.get(league, number)
         except LeagueError as error:
-            self._stay(alias, number, str(error))
+            self._stay(alias, number, error)
             return
         if self._slots.get(alias) is not version:
             self.swaps[league] += 1
@@ -89,11 +89,11 @@ class AliasSlots:
         self._faults.pop(alias, None)
         logger.info("%s@%s is now version %d", league, name, number)
 
-    def _stay(self, alias: Alias, number: int, reason: str) -> None:
-        if self._faults.get(alias) == reason:
+    def _stay(self, alias: Alias, number: int, error: LeagueError) -> None:
+        if self._faults.get(alias) == error.public_message:
             return
-        self._faults[alias] = reason
+        self._faults[alias] = error.public_message
         old = self._slots.get(alias)
         stays = f"version {old.number} stays" if old else "no version is served"
         # Ray Serve buffers lower levels.
-        logger.error("%s@%s cannot switch to version %d, %s: %s", *alias, number, stays, reason)
+        logger.error("%s@%s cannot switch to version %d, %s: %s", *alias, number, stays, error)

@@ -8,7 +8,7 @@ from starlette.testclient import TestClient
 from league.registry.registry import Registry
 from serve_app.app import Replica
 from tests.support.leagues.served_leagues import promote
-from tests.support.servers.replicas import LOCALHOST, QUICK, replica
+from tests.support.servers.replicas import QUICK, local_client, replica
 from tests.support.waiting import until
 
 BOARD = "/v1/leagues/board/evaluations"
@@ -188,7 +188,7 @@ def test_the_number_of_active_evaluations_is_limited(registry: Registry) -> None
 
 def test_a_missing_evaluation_service_is_reported(registry: Registry) -> None:
     server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         evaluator = with_key(client, registry, "bot", ["evaluate", "read"])
         error = start(evaluator, status=503)
         assert error["code"] == "no_evaluation_service"

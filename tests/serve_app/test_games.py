@@ -24,7 +24,7 @@ from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.openapi.document import document
 from tests.support.leagues import tictactoe
-from tests.support.servers.replicas import LOCALHOST, QUICK, UnavailableEvaluation
+from tests.support.servers.replicas import QUICK, UnavailableEvaluation, local_client
 from tests.support.waiting import until
 
 LEAGUE = "/v1/leagues/tictactoe"
@@ -81,7 +81,7 @@ def client(playable: Registry) -> Iterator[TestClient]:
         server = Replica(
             Registry.open(playable.storage), LONG_TIMEOUT, "replica-1", evaluation_client=LocalEvaluation(pool)
         )
-        with TestClient(server.application(), base_url=LOCALHOST) as client:
+        with local_client(server) as client:
             yield client
     pool.close()
 
@@ -226,16 +226,14 @@ def test_errors_of_the_evaluation_service_keep_their_status(
     playable: Registry, error: LeagueError, status: int, code: str
 ) -> None:
     server = Replica(Registry.open(playable.storage), QUICK, "replica-1", evaluation_client=FailingEvaluation(error))
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         reply = client.get(f"{LEAGUE}/playable")
         assert (reply.status_code, reply.json()) == (status, {"code": code, "message": str(error)})
         assert ("retry-after" in reply.headers) == (status in (429, 503))
 
 
 def test_a_missing_evaluation_service_is_reported(playable: Registry) -> None:
-    with TestClient(
-        Replica(Registry.open(playable.storage), QUICK, "replica-1").application(), base_url=LOCALHOST
-    ) as client:
+    with local_client(Replica(Registry.open(playable.storage), QUICK, "replica-1")) as client:
         assert play(client, status=503)["code"] == "no_evaluation_service"
 
 
@@ -245,7 +243,7 @@ def test_playing_requires_the_scope_act_and_reading_the_scope_read(tmp_path_fact
     server = Replica(
         Registry.open(Storage.at(registry.storage.home)), QUICK, "replica-1", evaluation_client=UnavailableEvaluation()
     )
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         for scope, token in keys.items():
             headers = {"x-api-key": token}
             until(lambda headers=headers: client.post(PLAY, json={}, headers=headers).status_code != 401)

@@ -79,17 +79,18 @@ class ArtifactStore:
             manifest = self.manifest(league, number, sha256)
             present = set(_files(directory)) - {MANIFEST}
             for name in sorted(present - set(manifest.files)):
-                raise ArtifactCorrupt(f"{directory / name} does not belong to {league}@{number}")
+                raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
             for name, digest in manifest.files.items():
                 path = directory / name
                 # Reading a pipe or a device, which a link may point to, would not end.
-                _check(path, digest, _sha256(path) if name in present and path.is_file() else None)
+                found = _sha256(path) if name in present and path.is_file() else None
+                _check(_label(league, number, name), digest, found)
         return directory
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
         """Read the manifest of a version. Raises ArtifactCorrupt if its digest is not `sha256`."""
-        path = self.path(league, number) / MANIFEST
-        return Manifest.from_json(_verified(path, sha256), source=str(path))
+        content = self._verified(league, number, MANIFEST, sha256)
+        return Manifest.from_json(content, source=_label(league, number, MANIFEST))
 
     def read(self, manifest: Manifest, name: str) -> bytes:
         """Read and verify one file of a version. Raises ArtifactCorrupt."""
@@ -97,7 +98,15 @@ class ArtifactStore:
             raise ArtifactCorrupt(
                 f"{manifest.league}@{manifest.version} has no file {name!r}, which its manifest names"
             )
-        return _verified(self.path(manifest.league, manifest.version) / name, manifest.files[name])
+        return self._verified(manifest.league, manifest.version, name, manifest.files[name])
+
+    def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
+        path = self.path(league, number) / name
+        with disk_errors(path):
+            content = path.read_bytes() if path.is_file() else None
+        _check(_label(league, number, name), digest, None if content is None else hashlib.sha256(content).hexdigest())
+        assert content is not None
+        return content
 
     def _staging(self, league: str, number: int) -> Path:
         return self.root / league / f"{STAGING}{number}"
@@ -109,19 +118,16 @@ def _files(directory: Path) -> list[str]:
     return sorted(path.relative_to(directory).as_posix() for path in found)
 
 
-def _verified(path: Path, digest: str) -> bytes:
-    with disk_errors(path):
-        content = path.read_bytes() if path.is_file() else None
-    _check(path, digest, None if content is None else hashlib.sha256(content).hexdigest())
-    assert content is not None
-    return content
+def _label(league: str, number: int, name: str) -> str:
+    """A file as messages name it: callers on other machines need not know where the store is."""
+    return f"{league}/{number}/{name}"
 
 
-def _check(path: Path, expected: str, found: str | None) -> None:
+def _check(name: str, expected: str, found: str | None) -> None:
     if found is None:
-        raise ArtifactCorrupt(f"{path} is missing or not a regular file")
+        raise ArtifactCorrupt(f"{name} is missing or not a regular file")
     if found != expected:
-        raise ArtifactCorrupt(f"{path} was changed: its SHA-256 is {found[:12]}…, expected {expected[:12]}…")
+        raise ArtifactCorrupt(f"{name} was changed: its SHA-256 is {found[:12]}…, expected {expected[:12]}…")
 
 
 def _sha256(path: Path) -> str:

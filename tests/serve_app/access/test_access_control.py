@@ -19,7 +19,7 @@ from serve_app.app import Replica
 from serve_app.settings import ServeSettings
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import everything
-from tests.support.servers.replicas import LOCALHOST, QUICK
+from tests.support.servers.replicas import LOCALHOST, QUICK, local_client
 from tests.support.waiting import until
 
 ACTION = "/v1/policies/board/action"
@@ -39,7 +39,7 @@ def serving_replica(registry: Registry, is_exposed: bool = False, **settings: An
         "replica-1",
         is_exposed=is_exposed,
     )
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         yield client
 
 
@@ -179,7 +179,7 @@ def test_a_rejected_stream_has_an_error_response(registry: Registry) -> None:
 def test_known_keys_are_valid_while_the_database_is_unreachable(registry: Registry) -> None:
     _, token = registry.keys.create("bot", ["act"])
     server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         server.registry.database.close()
         registry.storage.home.rename(registry.storage.home.with_name("elsewhere"))
         assert client.post(ACTION, json=BODY, headers=bearer(token)).status_code == 200
@@ -205,7 +205,7 @@ def test_a_persistent_queue_is_shed(registry: Registry, monkeypatch: pytest.Monk
     def full() -> None:
         raise Overloaded("more than 64 requests wait here already")
 
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         monkeypatch.setattr(type(server.access.backlog), "admit", lambda _: full())
         for path in (ACTION, "/v2/models/board/infer"):
             reply = client.post(path, json=BODY)

@@ -7,7 +7,7 @@ from starlette.routing import Route
 from starlette.testclient import TestClient
 
 from league import errors as league_errors
-from league.errors import LeagueError
+from league.errors import LeagueError, StorageError
 from serve_app.access import errors
 from serve_app.access.errors import ErrorHandlers
 
@@ -46,12 +46,21 @@ def answer(error: Exception) -> tuple[int, dict[str, str], dict[str, str]]:
 @pytest.mark.parametrize("error", ERRORS)
 def test_an_error_has_the_status_of_its_class(error: type[LeagueError]) -> None:
     status, body, headers = answer(error("a sentence"))
-    assert body == {"code": error.code, "message": "a sentence"}
+    assert body == {"code": error.code, "message": error("a sentence").public_message}
     assert ("retry-after" in headers) == (status in (429, 503))
     for ancestor in error.__mro__:
         if ancestor.__name__ in EXPECTED:
             assert status == EXPECTED[ancestor.__name__]
             break
+
+
+def test_paths_and_hosts_are_only_logged() -> None:
+    error = StorageError("the database postgresql://admin@db.internal/league cannot be used: no route to host")
+    _, body, _ = answer(error)
+    assert body == {
+        "code": "storage_error",
+        "message": "the registry's database or files cannot be used; see the server log",
+    }
 
 
 def test_an_unexpected_exception_is_only_logged() -> None:

@@ -22,7 +22,7 @@ from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards
 from tests.support.leagues.served_leagues import promote, publish
 from tests.support.policies.graphs import counting, masked_mlp
 from tests.support.servers.exposition import value
-from tests.support.servers.replicas import LOCALHOST, QUICK, replica
+from tests.support.servers.replicas import QUICK, local_client, replica
 from tests.support.servers.shadows import set_shadow, wait_for
 from tests.support.waiting import until
 
@@ -416,7 +416,7 @@ def server(registry: Registry) -> Replica:
 @pytest.fixture
 def patchable_client(server: Replica) -> Iterator[TestClient]:
     """The application of `server`, which a test may patch."""
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         yield client
 
 

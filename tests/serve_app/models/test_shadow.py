@@ -17,7 +17,7 @@ from serve_app.models.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import promote
 from tests.support.policies.graphs import masked_mlp
-from tests.support.servers.replicas import LOCALHOST, QUICK
+from tests.support.servers.replicas import QUICK, local_client
 from tests.support.servers.shadows import set_shadow, wait_for
 from tests.support.waiting import until
 
@@ -29,7 +29,7 @@ def server(registry: Registry) -> Replica:
 
 @pytest.fixture
 def client(server: Replica) -> Iterator[TestClient]:
-    with TestClient(server.application(), base_url=LOCALHOST) as client:
+    with local_client(server) as client:
         yield client
 
 

@@ -15,7 +15,7 @@ from serve_app.observability.prometheus import METRICS, render
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.exposition import samples, value
-from tests.support.servers.replicas import LOCALHOST, QUICK, replica
+from tests.support.servers.replicas import QUICK, local_client, replica
 from tests.support.waiting import until
 
 
@@ -82,8 +82,8 @@ def test_canary_and_shadow_are_counted(client: TestClient, registry: Registry) -
 def test_each_replica_reports_for_all(registry: Registry) -> None:
     servers = [Replica(Registry.open(registry.storage), QUICK, f"replica-{number}") for number in (1, 2)]
     with (
-        TestClient(servers[0].application(), base_url=LOCALHOST) as first,
-        TestClient(servers[1].application(), base_url=LOCALHOST) as second,
+        local_client(servers[0]) as first,
+        local_client(servers[1]) as second,
     ):
         act(first, observation=BOARD)
         for _ in range(2):

@@ -17,10 +17,16 @@ LOCALHOST = "http://localhost"
 """Base URL of requests in this process: a server without keys accepts no other host."""
 
 
+def local_client(server: Replica) -> TestClient:
+    """A client of a replica in this process; enter it to start the replica."""
+    # TestClient ignores the base URL for WebSockets, hence the header.
+    return TestClient(server.application(), base_url=LOCALHOST, headers={"host": "localhost"})
+
+
 def replica(storage: Storage, settings: ServeSettings = QUICK) -> TestClient:
     """The application of a new replica; enter it to start."""
     server = Replica(Registry.open(storage), settings, "replica-1", evaluation_client=UnavailableEvaluation())
-    return TestClient(server.application(), base_url=LOCALHOST)
+    return local_client(server)
 
 
 class UnavailableEvaluation:
