@@ -137,6 +137,9 @@ def _expected(text: str) -> int | None:
 
 def rollback(
     league: LeagueName,
+    expected: Annotated[
+        int | None, typer.Option(metavar="VERSION", min=1, help="Fail unless this version is the champion.")
+    ] = None,
     reason: Reason = "rolled back by hand",
     actor: Actor = None,
     wait: Wait = False,
@@ -145,10 +148,18 @@ def rollback(
 ) -> None:
     """Restore the previous champion.
 
-    Moves the alias `champion` to the version that it pointed to before, and records the move in the history.
+    Moves the alias `champion` to the version that it pointed to before, and records the move in the history. With
+    --expected, only one of several rollbacks of the same version succeeds.
     """
+    from league.registry.aliases import ANY
+
     registry = open_registry()
-    event = registry.aliases.rollback(check_slug("league", league), actor=actor or getpass.getuser(), reason=reason)
+    event = registry.aliases.rollback(
+        check_slug("league", league),
+        expected=ANY if expected is None else expected,
+        actor=actor or getpass.getuser(),
+        reason=reason,
+    )
     _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
 
 

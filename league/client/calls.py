@@ -121,9 +121,10 @@ def promote(ref: str, alias: str, expected: int | None, reason: str | None, key:
     return _move_alias(path, body, reason, key)
 
 
-def rollback(slug: str, reason: str | None, key: str | None) -> ApiCall[Promotion]:
+def rollback(slug: str, expected: int, reason: str | None, key: str | None) -> ApiCall[Promotion]:
     """Restore the previous champion."""
-    return _move_alias(f"/v1/leagues/{check_slug('league', slug)}/rollback", {}, reason, key)
+    body = {} if expected is ANY else {"expected": expected}
+    return _move_alias(f"/v1/leagues/{check_slug('league', slug)}/rollback", body, reason, key)
 
 
 def evaluate(slug: str, options: Mapping[str, Any], reason: str | None, key: str | None) -> ApiCall[JsonObject]:

@@ -74,16 +74,25 @@ class AliasRepository(Repository):
 
             return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
 
-    def rollback(self, league: str, *, actor: str, reason: str, call: IdempotentCall | None = None) -> AliasEvent:
-        """Return the champion to the version before it. A repeated `call` changes nothing and returns its event.
+    def rollback(
+        self,
+        league: str,
+        *,
+        expected: int | AnyVersion = ANY,
+        actor: str,
+        reason: str,
+        call: IdempotentCall | None = None,
+    ) -> AliasEvent:
+        """Return the champion to the version before it, if it is `expected` now (ANY: always).
 
-        Raises UnknownLeague, NothingToRollBack or KeyReused.
+        A repeated `call` changes nothing and returns its event. Raises UnknownLeague, AliasMoved, NothingToRollBack or
+        KeyReused.
         """
         with self._database.write() as session:
             leagues.lock(session, league)
 
             def change() -> AliasEvent:
-                return _roll_back(session, league, CHAMPION, actor=actor, reason=reason)
+                return _roll_back(session, league, CHAMPION, expected, actor=actor, reason=reason)
 
             return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
 
@@ -133,11 +142,7 @@ def _set(
         verdicts.require_open(session, verdict)
     versions.require(session, league, version)
     last = _in_force(session, league, alias)
-    found = last.version if last else None
-    if expected is not ANY and found != expected:
-        now = f"is at {league}@{found} now" if found else "is not set"
-        wanted = f"{league}@{expected}" if expected else "not set"
-        raise AliasMoved(f"alias {alias} of league {league} {now}, expected {wanted}: nothing was changed")
+    _require(last, league, alias, expected)
     if last and last.version == version:
         return _row(last)
     event = AliasEventTable(
@@ -151,8 +156,11 @@ def _set(
     return _record(session, league, alias, last, event)
 
 
-def _roll_back(session: Session, league: str, alias: str, *, actor: str, reason: str) -> AliasEvent:
+def _roll_back(
+    session: Session, league: str, alias: str, expected: int | AnyVersion, *, actor: str, reason: str
+) -> AliasEvent:
     last = _in_force(session, league, alias)
+    _require(last, league, alias, expected)
     beneath = session.get(AliasEventTable, last.beneath) if last and last.beneath else None
     if beneath is None:
         was = f"has had no version before {league}@{last.version}" if last else "was never set"
@@ -171,6 +179,15 @@ def _roll_back(session: Session, league: str, alias: str, *, actor: str, reason:
 def _in_force(session: Session, league: str, alias: str) -> AliasEventTable | None:
     query = select(AliasEventTable).join(AliasTable, AliasTable.event == AliasEventTable.id)
     return session.scalar(query.where(AliasTable.league == league, AliasTable.name == alias))
+
+
+def _require(last: AliasEventTable | None, league: str, alias: str, expected: int | AnyVersion | None) -> None:
+    """Raise AliasMoved unless the alias points to `expected`."""
+    found = last.version if last else None
+    if expected is not ANY and found != expected:
+        now = f"is at {league}@{found} now" if found else "is not set"
+        wanted = f"{league}@{expected}" if expected else "not set"
+        raise AliasMoved(f"alias {alias} of league {league} {now}, expected {wanted}: nothing was changed")
 
 
 def _record(

@@ -48,7 +48,7 @@ function RollBack({ league, champion, onClose }) {
   const history = useData(apiPath(league, "aliases", "champion", "history") + "?limit=1", useChangeToken("event"));
   const last = history.data && history.data.history[0];
   const submit = async (fields) => {
-    const event = await request(apiPath(league, "rollback"), { method: "POST", body: { reason: fields.get("reason") } });
+    const event = await request(apiPath(league, "rollback"), { method: "POST", body: { expected: last.version, reason: fields.get("reason") } });
     notify(`Rolled back to ${league}@${event.version}.`);
     onClose();
   };

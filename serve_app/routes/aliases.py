@@ -3,7 +3,7 @@
     GET   /v1/leagues/{league}/aliases/{alias}/history    newest first; ?limit= &before=
                                                           ?at=2026-03-03T14:00:00Z: the event in force at that time
     POST  /v1/leagues/{league}/aliases/{alias}   {"version": 3, "expected": 2, "reason": "…"}
-    POST  /v1/leagues/{league}/rollback          {"reason": "…"}
+    POST  /v1/leagues/{league}/rollback          {"expected": 3, "reason": "…"}
 
 POST requires an API key of scope `promote`, whose name becomes the actor in the history, and an `Idempotency-Key`: a
 repeated call (a retry by a client or by HAProxy) is not applied again and gets the same response for 24 hours.
@@ -34,6 +34,12 @@ class PromotionBody(parsing.ChangeBody):
     """The body of a promotion."""
 
     version: int = Field(ge=1, le=MAX_VERSION)
+    expected: int | None = Field(default=None, ge=1, le=MAX_VERSION)
+
+
+class RollbackBody(parsing.ChangeBody):
+    """The body of a rollback."""
+
     expected: int | None = Field(default=None, ge=1, le=MAX_VERSION)
 
 
@@ -75,12 +81,16 @@ class AliasRoutes:
         return await self._apply(request, body, change)
 
     async def roll_back(self, request: Request) -> JSONResponse:
-        """Restore the previous champion. Raises UnknownLeague, NothingToRollBack, KeyReused or InvalidInput."""
+        """Restore the previous champion.
+
+        Raises UnknownLeague, AliasMoved, NothingToRollBack, KeyReused or InvalidInput.
+        """
         league = check_slug("league", request.path_params["league"])
-        body = parsing.parse_body(parsing.ChangeBody, await self._body(request) or b"{}")
+        body = parsing.parse_body(RollbackBody, await self._body(request) or b"{}")
+        expected = ANY if body.expected is None else body.expected
 
         def change(registry: Registry, actor: str, call: IdempotentCall) -> AliasEvent:
-            return registry.aliases.rollback(league, actor=actor, reason=body.reason, call=call)
+            return registry.aliases.rollback(league, expected=expected, actor=actor, reason=body.reason, call=call)
 
         return await self._apply(request, body, change)
 

@@ -66,7 +66,10 @@ def test_promotions_rollbacks_and_their_history(league: League, registry: Regist
     assert events[2]["reason"] == "the first"
     then = events[1]["at"]
     assert [event["version"] for event in league("history", "tictactoe", "--at", then, "--json").json["events"]] == [3]
-    outcome = league("rollback", "tictactoe")
+    outcome = league("rollback", "tictactoe", "--expected", "3")
+    assert outcome.code == 1
+    assert "is at tictactoe@1 now, expected tictactoe@3: nothing was changed" in outcome.err
+    outcome = league("rollback", "tictactoe", "--expected", "1")
     assert outcome.code == 1
     assert outcome.err.startswith("league: ")
 

@@ -39,7 +39,7 @@ PATH = {
 }
 CHANGES = {
     "/v1/leagues/board/aliases/candidate": {"version": 1, "expected": None, "reason": "a test"},
-    "/v1/leagues/board/rollback": {"reason": "a test"},
+    "/v1/leagues/board/rollback": {"expected": 3, "reason": "a test"},
     "/v1/leagues/board/traffic": {"canary": {"version": 2, "share": 0.5}, "shadow": None, "reason": "a test"},
     "/v1/leagues/board/versions/1/note": {"note": "a test"},
 }

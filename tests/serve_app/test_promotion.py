@@ -57,6 +57,16 @@ def test_a_rollback_returns_to_the_previous_champion(promoter: TestClient, regis
     assert (event["kind"], event["version"], event["previous"]) == ("rollback", 1, 2)
 
 
+def test_a_rollback_of_another_version_changes_nothing(promoter: TestClient, registry: Registry) -> None:
+    """Two people who roll back the same version do not go back twice."""
+    for version in (2, 3):
+        promote(registry, "board", version)
+    assert change(promoter, ROLLBACK, "a", {"expected": 3})["version"] == 2
+    error = change(promoter, ROLLBACK, "b", {"expected": 3}, 409)
+    assert (error["code"], registry.aliases.current("board")["champion"]) == ("alias_moved", 2)
+    assert change(promoter, ROLLBACK, "c", {"expected": None})["version"] == 1
+
+
 def test_a_repeated_call_changes_nothing(promoter: TestClient, registry: Registry) -> None:
     promote(registry, "board", 2)
     promote(registry, "board", 3)

@@ -176,10 +176,16 @@ class Client:
         return promotion
 
     def rollback(
-        self, league: str, *, reason: str | None = None, idempotency_key: str | None = None, wait: float = 0.0
+        self,
+        league: str,
+        *,
+        expected: int = ANY,
+        reason: str | None = None,
+        idempotency_key: str | None = None,
+        wait: float = 0.0,
     ) -> Promotion:
-        """Restore the previous champion. For arguments and errors see `promote`."""
-        promotion = self.send(calls.rollback(league, reason, idempotency_key))
+        """Restore the previous champion, if it is `expected` now. For arguments and errors see `promote`."""
+        promotion = self.send(calls.rollback(league, expected, reason, idempotency_key))
         self._wait_for_replicas(promotion, wait)
         return promotion
 

@@ -231,7 +231,7 @@ def test_promotions_are_applied_once_and_awaited_on_all_replicas(connect: Connec
         assert same[0] == same[1]
         with pytest.raises(KeyReused):
             client.promote("board@1", idempotency_key="once")
-        back = client.rollback("board", wait=30)
+        back = client.rollback("board", expected=3, wait=30)
         assert (back.kind, back.version) == ("rollback", 2)
         assert client.promote("board@1", alias="candidate", expected=None, wait=30).alias == "candidate"
         assert client.act("board@candidate", BOARD).version == 1
