@@ -17,7 +17,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from league.errors import GameHung, LeagueError, NotReady, Overloaded, WorkerLost, from_document
+from league.errors import GameHung, NotReady, Overloaded, WorkerLost, from_document
 from league.service_requests import GameRequest, GameResponse
 from league.subprocesses import Subprocess
 
@@ -57,6 +57,7 @@ class GameWorkerPool:
             GameHung: The request exceeded its time limit.
             WorkerLost: The process died.
             LeagueError: The error that the worker reported.
+            OSError: No process can be started.
         """
         line = request.model_dump_json()
         response = self._cache.get(line)
@@ -68,7 +69,7 @@ class GameWorkerPool:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(response)), timeout)
         except TimeoutError:
             raise NotReady(f"a game of {request.league} is still being computed: repeat the request") from None
-        except LeagueError:
+        except Exception:
             if self._cache.get(line) is response:
                 del self._cache[line]  # errors are not cached
             raise

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from league.errors import ArtifactCorrupt
-from league.files import disk_errors, move_durably
+from league.files import disk_errors, flush, move_durably
 from league.registry.storage.manifest import MANIFEST, Manifest
 
 STAGING = ".publishing-"
@@ -55,6 +55,7 @@ class ArtifactStore:
             text = manifest.model_copy(update={"files": digests}).to_json()
             (staging / MANIFEST).write_text(text, encoding="utf-8")
             move_durably(staging, target)
+            flush(self.root)  # the entry of a new league
         return text
 
     def discard(self, league: str, number: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from PIL import Image
@@ -120,6 +121,18 @@ def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
         "opponents": ["tictactoe@1", "script:random", "script:one_ply"],
         "draws": True,
     }
+
+
+def test_a_process_that_cannot_be_started_is_tried_again(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> NoReturn:
+        raise OSError(errno.EAGAIN, "no more processes")
+
+    with running() as pool:
+        with monkeypatch.context() as patched:
+            patched.setattr(game_worker_pool, "Subprocess", fail)
+            with pytest.raises(OSError, match="no more processes"):
+                submit(pool, PlayabilityRequest())
+        assert document_of(submit(pool, PlayabilityRequest()))["playable"] is True
 
 
 def test_a_recorded_game_has_images_and_a_video(shared: GameWorkerPool, registry: Registry) -> None:

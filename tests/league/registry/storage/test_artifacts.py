@@ -1,5 +1,6 @@
 """Only bytes with the digest of the manifest are used."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -58,3 +59,13 @@ def test_a_single_file_is_verified(local: Registry) -> None:
 def test_a_version_that_is_not_ready_cannot_be_fetched(local: Registry) -> None:
     with pytest.raises(UnknownVersion):
         local.versions.fetch(LEAGUE, 1)
+
+
+def test_the_first_version_of_a_league_survives_a_power_failure(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The directory that contains the league's directory is on the disk, too."""
+    flushed: list[str] = []
+    monkeypatch.setattr(os, "fsync", lambda number: flushed.append(os.readlink(f"/proc/self/fd/{number}")))
+    publish(registry, "run/1")
+    assert flushed[-2:] == [str(registry.artifacts.root / LEAGUE), str(registry.artifacts.root)]
