@@ -250,6 +250,7 @@ class Replica:
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
                 await running.enter_async_context(self.events.watching())
+                await running.enter_async_context(self.stream.checking_keys())
                 yield
         finally:
             self.shadow.close()

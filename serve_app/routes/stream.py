@@ -4,20 +4,46 @@
     ?follow=ALIAS   each message is answered by the version that the alias names at that time
 
 With serve_app.runtime.uvicorn_websocket, messages are answered within the call that received them; other ASGI servers
-pass them through the ASGI queue.
+pass them through the ASGI queue. A stream is closed when its key becomes invalid, even if it receives no messages.
 """
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 
 from starlette.types import Receive, Scope, Send
 
-from league.errors import InvalidInput, Overloaded
+from league.errors import InvalidInput, Overloaded, Unauthenticated
 from league.refs import CHAMPION, check_alias
-from serve_app.access.access_control import KEY
+from serve_app.access.access_control import KEY, POLICY_VIOLATION
+from serve_app.access.api_keys import ApiKey
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.routes import parsing
-from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, CloseStream
+from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, CloseStream, StreamWebSocketProtocol
 
 TOO_BIG = 1009
+KEY_CHECK_INTERVAL = 1.0
+"""Seconds between checks of the keys of open streams."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class OpenStream:
+    """A stream whose handshake was accepted."""
+
+    key: ApiKey | None
+    send: Send
+    protocol: StreamWebSocketProtocol | None
+    """The connection, if messages are answered within the call that received them."""
+
+    async def close(self, code: int, reason: str) -> None:
+        """Send a close frame."""
+        if self.protocol is not None:
+            self.protocol.end(code, reason)
+            return
+        with suppress(OSError, RuntimeError):  # it closes already
+            await self.send({"type": "websocket.close", "code": code, "reason": reason[:120]})
 
 
 class StreamRoute:
@@ -28,6 +54,7 @@ class StreamRoute:
         self._replica = replica
         self.open = 0
         """Number of open streams."""
+        self._accepted: set[OpenStream] = set()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle a stream until it closes. Raises LeagueError before the handshake is accepted."""
@@ -38,9 +65,32 @@ class StreamRoute:
         try:
             stream, headers = await self._create_session(scope)
             await send({"type": "websocket.accept", "headers": headers})
-            await self._exchange_messages(stream, scope, receive, send)
+            opened = OpenStream(scope.get(KEY), send, scope.get("extensions", {}).get(STREAM_PROTOCOL))
+            self._accepted.add(opened)
+            try:
+                await self._exchange_messages(stream, opened, receive)
+            finally:
+                self._accepted.remove(opened)
         finally:
             self.open -= 1
+
+    @asynccontextmanager
+    async def checking_keys(self) -> AsyncIterator[None]:
+        """Close the streams whose keys become invalid while the context is active."""
+        checking = asyncio.create_task(self._check_keys())
+        try:
+            yield
+        finally:
+            checking.cancel()
+
+    async def _check_keys(self) -> None:
+        while True:
+            await asyncio.sleep(KEY_CHECK_INTERVAL)
+            for stream in tuple(self._accepted):
+                try:
+                    self._dependencies.access.check_key(stream.key)
+                except Unauthenticated as error:
+                    await stream.close(POLICY_VIOLATION, str(error))
 
     async def _create_session(self, scope: Scope) -> tuple[StreamSession, list[tuple[bytes, bytes]]]:
         model, query = scope["path_params"]["model"], parsing.query_params(scope)
@@ -56,9 +106,9 @@ class StreamRoute:
         stream = StreamSession(self._dependencies, model, (version, policy), follows, scope["headers"], scope.get(KEY))
         return stream, [(name, value.encode()) for name, value in headers.items()]
 
-    async def _exchange_messages(self, stream: StreamSession, scope: Scope, receive: Receive, send: Send) -> None:
-        if (direct := scope.get("extensions", {}).get(STREAM_PROTOCOL)) is not None:
-            direct.set_handler(stream)
+    async def _exchange_messages(self, stream: StreamSession, opened: OpenStream, receive: Receive) -> None:
+        if opened.protocol is not None:
+            opened.protocol.set_handler(stream)
         while (message := await receive())["type"] == "websocket.receive":
             text = message.get("text")
             data = message["bytes"] if text is None else text.encode()
@@ -67,7 +117,7 @@ class StreamRoute:
                     raise CloseStream(TOO_BIG, f"a message is larger than {self._dependencies.settings.max_body} bytes")
                 response = await stream.answer(data, text is not None)
             except CloseStream as end:
-                await send({"type": "websocket.close", "code": end.code, "reason": end.reason})
+                await opened.close(end.code, end.reason)
                 return
             key, value = ("text", response.data.decode()) if response.is_text else ("bytes", response.data)
-            await send({"type": "websocket.send", key: value})
+            await opened.send({"type": "websocket.send", key: value})

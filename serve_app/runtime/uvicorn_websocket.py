@@ -166,7 +166,19 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
             return
         if (last_message := self._stream.closing_message()) is not None:
             self._queue_frame(last_message)
-        self._end(SERVICE_RESTART, "the replica is shutting down: reconnect")
+        self.end(SERVICE_RESTART, "the replica is shutting down: reconnect")
+
+    def end(self, code: int, reason: str) -> None:
+        """Send a close frame, and wait for the client's."""
+        self._flush()
+        if self.close_sent or self.transport.is_closing():
+            return
+        self.stop_keepalive()
+        self.conn.send_close(code, reason)
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        self._abort_later()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
 
     @property
     def _is_open_or_pending(self) -> bool:
@@ -226,7 +238,7 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         except StopIteration as done:
             self._queue_frame(done.value)
         except CloseStream as end:
-            self._end(end.code, end.reason)
+            self.end(end.code, end.reason)
         else:
             self._is_busy = True
             self.transport.pause_reading()
@@ -238,7 +250,7 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         try:
             self._queue_frame(await resume(steps, waits_for))
         except CloseStream as end:
-            self._end(end.code, end.reason)
+            self.end(end.code, end.reason)
         self._resume_after_turn()
 
     def _yield_turn(self) -> None:
@@ -266,18 +278,6 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         if self._writes:
             self.transport.write(b"".join(self._writes))
             self._writes.clear()
-
-    def _end(self, code: int, reason: str) -> None:
-        """Send a close frame, and wait for the client's."""
-        self._flush()
-        if self.close_sent or self.transport.is_closing():
-            return
-        self.stop_keepalive()
-        self.conn.send_close(code, reason)
-        self.transport.write(b"".join(self.conn.data_to_send()))
-        self.close_sent = True
-        self._abort_later()
-        self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
 
     def _abort_later(self) -> None:
         """Abort the connection after a timeout. Aborting at once could lose messages that the client has not read, and

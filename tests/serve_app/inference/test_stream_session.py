@@ -393,6 +393,14 @@ def test_revoking_a_key_ends_its_streams(client: TestClient, registry: Registry)
         assert (close.code, "bot was revoked" in close.reason) == (1008, True)
 
 
+def test_the_first_key_ends_an_idle_stream_without_one(client: TestClient, registry: Registry) -> None:
+    with open_stream(client) as stream:
+        registry.keys.create("bot", ["act"])
+        with pytest.raises(WebSocketDisconnect) as caught:
+            stream.receive_json()
+        assert (caught.value.code, caught.value.reason) == (1008, "this stream now requires an API key")
+
+
 def test_each_message_counts_for_the_rate_limit_of_a_key(registry: Registry) -> None:
     _, token = registry.keys.create("slow", ["act"], rate=0.5)
     with replica(registry.storage) as client, open_stream(client, authorization=f"Bearer {token}") as stream:

@@ -267,6 +267,20 @@ def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
         until(lambda: listener.server.stream.open == 0)
 
 
+def test_a_revoked_key_ends_an_idle_stream(registry: Registry) -> None:
+    _, token = registry.keys.create("bot", ["act"])
+    with (
+        listening(registry.storage) as listener,
+        open_stream(listener, additional_headers={"x-api-key": token}) as stream,
+    ):
+        registry.keys.revoke("bot")
+        with pytest.raises(ConnectionClosed) as caught:
+            stream.recv(timeout=60)
+        assert caught.value.rcvd is not None
+        assert (caught.value.rcvd.code, "bot was revoked" in caught.value.rcvd.reason) == (1008, True)
+        until(lambda: listener.server.stream.open == 0)
+
+
 def test_a_draining_server_sends_a_last_message(registry: Registry) -> None:
     with listening(registry.storage) as listener, listening(registry.storage) as other:
         with open_stream(listener) as plain, open_stream(listener, "memory") as recurrent:
