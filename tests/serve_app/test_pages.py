@@ -1,5 +1,6 @@
 """The files of the web pages: public, unmodified, and restricted to their own resources."""
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -85,3 +86,9 @@ def test_vendored_files_have_their_licence() -> None:
     readme = (FILES / "vendor" / "README.md").read_text()
     for path in (FILES / "vendor").iterdir():
         assert path.name == "README.md" or f"`{path.name}`" in readme
+
+
+def test_vendored_files_are_those_of_their_packages() -> None:
+    vendor = FILES / "vendor"
+    recorded = dict(re.findall(r"^([0-9a-f]{64})  (\S+)$", (vendor / "README.md").read_text(), re.MULTILINE))
+    assert {hashlib.sha256(path.read_bytes()).hexdigest(): path.name for path in vendor.glob("*.*s")} == recorded
