@@ -15,6 +15,7 @@ import secrets
 import shutil
 import signal
 import socket
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -84,7 +85,7 @@ def private_directory() -> Iterator[Path]:
 
     Directories of servers that were killed are cleaned up first.
     """
-    for abandoned in DIRECTORIES.glob(f"{PREFIX}*"):
+    for abandoned in _own_directories():
         with suppress(OSError), _locked(abandoned) as is_abandoned:
             if is_abandoned:
                 _remove(abandoned)
@@ -127,9 +128,23 @@ def free_ports(count: int, host: str = "") -> list[int]:
     raise NotReady(f"found fewer than {count} free ports from {PORTS.start} to {PORTS.stop - 1}")
 
 
+def _own_directories() -> list[Path]:
+    """The directories of this user's servers. Those of others are not opened: they may contain pipes or links."""
+    return [path for path in DIRECTORIES.glob(f"{PREFIX}*") if _is_own_directory(path)]
+
+
+def _is_own_directory(path: Path) -> bool:
+    try:
+        found = path.lstat()
+    except OSError:  # removed in the meantime
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+
+
 def _claim_grpc_ports(directory: Path) -> range:
     """Claim a block of unused ports for the gRPC servers of replicas."""
-    taken = {int(path.read_text()) for path in DIRECTORIES.glob(f"{PREFIX}*/{GRPC_PORT_FILE}")}
+    claims = (each / GRPC_PORT_FILE for each in _own_directories())
+    taken = {int(claim.read_text()) for claim in claims if claim.exists()}
     for start in random.sample(GRPC_PORTS, len(GRPC_PORTS)):
         block = range(start, start + GRPC_PORTS.step)
         if start not in taken and all(is_free("", port) for port in block):

@@ -204,8 +204,8 @@ def _engine(url: str, create: bool) -> Engine:
 def _sqlite(url: str, path: Path, create: bool) -> Engine:
     if create:
         with disk_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path.touch(mode=0o600)  # it contains digests of API keys; SQLite gives its other files the same mode
     engine = create_engine(url, json_serializer=_strict_json, connect_args={"timeout": BUSY_TIMEOUT_SECONDS})
     event.listen(engine, "do_connect", _open_existing)
     event.listen(engine, "connect", _prepare_sqlite)

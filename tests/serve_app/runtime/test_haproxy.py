@@ -1,5 +1,6 @@
 """Each server has its own HAProxy: its files, its ports, and its end."""
 
+import os
 import socket
 import subprocess
 import sys
@@ -62,6 +63,20 @@ def test_the_files_of_a_killed_server_are_removed(directories: Path) -> None:
         assert left.wait(10) != 0
         assert not abandoned.exists()
     left.stdout.close()
+
+
+@pytest.mark.timeout(60)
+def test_directories_of_other_users_are_not_opened(directories: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opening a pipe would block, and the content of a file would be trusted."""
+    foreign = directories / f"{haproxy.PREFIX}foreign"
+    foreign.mkdir()
+    os.mkfifo(foreign / haproxy.LOCK)
+    (foreign / haproxy.GRPC_PORT_FILE).write_text("not a port")
+    (directories / f"{haproxy.PREFIX}link").symlink_to(foreign)
+    monkeypatch.setattr(os, "geteuid", lambda: foreign.stat().st_uid + 1)
+    with haproxy.private_directory() as directory:
+        haproxy.environment(directory)
+    assert (foreign / haproxy.LOCK).is_fifo()
 
 
 def test_free_ports_are_free() -> None:

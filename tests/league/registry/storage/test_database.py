@@ -15,6 +15,13 @@ def slugs(registry: Registry) -> list[str]:
     return [row.slug for row in registry.leagues.all()]
 
 
+def test_a_new_database_is_readable_by_its_owner_only(local: Registry) -> None:
+    registered(local)
+    home = local.storage.home
+    readable = {path.name for path in (home, *home.glob("league.db*")) if path.stat().st_mode & 0o077}
+    assert readable <= {"league.db.lock"}, "the lock file is empty"
+
+
 def test_a_moved_file_is_reported_and_found_again(local: Registry, tmp_path: Path) -> None:
     path = tmp_path / "home" / "league.db"
     before = slugs(local)
