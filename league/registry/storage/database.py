@@ -33,7 +33,7 @@ from league.registry.storage.tables import Base
 LOCK = 5_246_001
 """Key of PostgreSQL's advisory lock."""
 LOCK_SECONDS = 60
-"""Timeout for the upgrade of an SQLite file by another process."""
+"""Timeout for an upgrade by another process."""
 
 
 def upgrade(engine: Engine) -> None:
@@ -65,6 +65,8 @@ def _exclusive(engine: Engine) -> Iterator[Connection]:
     writing = engine.execution_options(writes=True)
     if engine.dialect.name == "postgresql":
         with writing.begin() as connection:
+            connection.execute(text(f"SET LOCAL lock_timeout = '{LOCK_SECONDS}s'"))
+            connection.execute(text("SET LOCAL statement_timeout = 0"))
             connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": LOCK})
             yield connection
         return
@@ -96,6 +98,16 @@ def _apply(connection: Connection) -> None:
 
 BUSY_TIMEOUT_SECONDS = 30
 """Timeout of a transaction that waits for one of another process."""
+CONNECTION_DEFAULTS = {
+    "connect_timeout": "5",  # seconds
+    "tcp_user_timeout": "5000",  # milliseconds; without it Linux repeats lost packets for a quarter of an hour
+    "keepalives_idle": "5",
+    "keepalives_interval": "2",
+    "keepalives_count": "3",
+}
+"""Parameters of a PostgreSQL connection, unless the URL has them: a lost connection is noticed within seconds."""
+SESSION_DEFAULTS = "-c statement_timeout=30s -c lock_timeout=10s"
+"""Settings of a PostgreSQL session, unless the URL's `options` have them."""
 FILE = "file"
 """Key in a connection's `info`: its open file by device and inode."""
 STORAGE_ERRORS = (OperationalError, DatabaseError, InterfaceError, InternalError)
@@ -246,11 +258,19 @@ def _identity(path: str) -> tuple[int, int] | None:
 
 
 def _postgresql(url: str) -> Engine:
-    psycopg = make_url(url).set(drivername="postgresql+psycopg")
+    parsed = make_url(url)
+    options = " ".join([SESSION_DEFAULTS, *_values(parsed.query.get("options", ()))])
+    query = CONNECTION_DEFAULTS | parsed.query | {"options": options}
+    psycopg = parsed.set(drivername="postgresql+psycopg", query=query)
     try:
         return create_engine(psycopg, json_serializer=_strict_json, pool_pre_ping=True)
     except ModuleNotFoundError:
         raise ConfigError("PostgreSQL needs a driver: pip install 'policy-league[postgres]'") from None
+
+
+def _values(parameter: str | tuple[str, ...]) -> tuple[str, ...]:
+    """The values of a URL parameter, which may be repeated."""
+    return (parameter,) if isinstance(parameter, str) else parameter
 
 
 def _strict_json(document: Any) -> str:

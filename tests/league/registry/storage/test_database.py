@@ -1,14 +1,19 @@
-"""An SQLite file that is moved, restored or replaced while it is in use."""
+"""An SQLite file that is moved, restored or replaced while it is in use, and the timeouts of PostgreSQL."""
 
 import shutil
 from pathlib import Path
+from uuid import uuid4
 
+import psycopg
 import pytest
+from sqlalchemy import text
 
 from league.errors import StorageError
 from league.registry.registry import Registry
+from league.registry.storage.database import Database
 from league.settings import Storage
 from tests.support.leagues.registries import registered
+from tests.support.servers import postgresql
 
 
 def slugs(registry: Registry) -> list[str]:
@@ -61,3 +66,42 @@ def test_a_home_can_have_any_name(tmp_path: Path, name: str) -> None:
     Registry.open(storage).close()
     assert (tmp_path / name / "league.db").exists()
     assert slugs(Registry.open(storage, create=False)) == []
+
+
+@pytest.fixture
+def server(postgresql_socket: Path) -> str:
+    return postgresql.create(postgresql_socket, f"database_{uuid4().hex}")
+
+
+def settings_of(url: str) -> tuple[dict[str, str], str, str]:
+    """The parameters of the connection, and the timeouts of the session."""
+    database = Database(url)
+    with database.read() as session:
+        driver = session.connection().connection.driver_connection
+        assert isinstance(driver, psycopg.Connection)
+        timeouts = [session.scalars(text(f"SHOW {name}")).one() for name in ("statement_timeout", "lock_timeout")]
+        parameters = driver.info.get_parameters()
+    database.close()
+    return parameters, *timeouts
+
+
+def test_connections_to_postgresql_have_timeouts(server: str) -> None:
+    parameters, statement, lock = settings_of(server)
+    assert (parameters["connect_timeout"], parameters["tcp_user_timeout"]) == ("5", "5000")
+    assert (statement, lock) == ("30s", "10s")
+
+
+def test_the_url_can_change_the_timeouts(server: str) -> None:
+    parameters, statement, lock = settings_of(f"{server}%20-c%20statement_timeout%3D0&connect_timeout=9")
+    assert (parameters["connect_timeout"], parameters["tcp_user_timeout"]) == ("9", "5000")
+    assert (statement, lock) == ("0", "10s")
+
+
+def test_a_transaction_does_not_wait_long_for_a_lock(server: str) -> None:
+    database = Database(f"{server}%20-c%20lock_timeout%3D50ms")
+    lock = text("LOCK TABLE leagues IN EXCLUSIVE MODE")
+    with database.write() as first:
+        first.execute(lock)
+        with pytest.raises(StorageError, match="lock timeout"), database.write() as second:
+            second.execute(lock)
+    database.close()
