@@ -10,7 +10,7 @@ from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
 
 HERE = "tests.league.environments"
-SUPPORT = "tests.support"
+SUPPORT = "tests.support.environments"
 
 
 def league(entry_point: str, **kwargs: Any) -> LeagueConfig:
