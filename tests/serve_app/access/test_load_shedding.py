@@ -46,6 +46,7 @@ async def test_a_short_queue_is_never_shed() -> None:
 async def test_single_requests_are_not_a_queue_however_long_they_take() -> None:
     loop = Loop()
     assert [await loop.turn(1, 1.0) for _ in range(20)] == [1] * 20
+    assert await loop.turn(2, 0.0, each=2 * SHARE) == 2, "no queue has built up"
 
 
 async def test_the_number_of_requests_in_a_turn_depends_on_their_duration() -> None:
