@@ -9,18 +9,19 @@ pass them through the ASGI queue. A stream is closed when its key becomes invali
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from starlette.types import Receive, Scope, Send
 
-from league.errors import InvalidInput, Overloaded, Unauthenticated
+from league.errors import InvalidInput, Overloaded, Unauthenticated, one_line
 from league.refs import CHAMPION, check_alias
 from serve_app.access.access_control import KEY, POLICY_VIOLATION
 from serve_app.access.api_keys import ApiKey
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.routes import parsing
+from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, CloseStream, StreamWebSocketProtocol
 
 TOO_BIG = 1009
@@ -37,13 +38,12 @@ class OpenStream:
     protocol: StreamWebSocketProtocol | None
     """The connection, if messages are answered within the call that received them."""
 
-    async def close(self, code: int, reason: str) -> None:
+    async def close(self, end: CloseStream) -> None:
         """Send a close frame."""
         if self.protocol is not None:
-            self.protocol.end(code, reason)
-            return
-        with suppress(OSError, RuntimeError):  # it closes already
-            await self.send({"type": "websocket.close", "code": code, "reason": reason[:120]})
+            self.protocol.end(end.code, end.reason)
+        else:
+            await self.send({"type": "websocket.close", "code": end.code, "reason": end.reason})
 
 
 class StreamRoute:
@@ -90,7 +90,15 @@ class StreamRoute:
                 try:
                     self._dependencies.access.check_key(stream.key)
                 except Unauthenticated as error:
-                    await stream.close(POLICY_VIOLATION, str(error))
+                    await self._close(stream, CloseStream(POLICY_VIOLATION, str(error)))
+
+    async def _close(self, stream: OpenStream, end: CloseStream) -> None:
+        """Close a stream. A stream that cannot be closed must not prevent that others are."""
+        try:
+            async with asyncio.timeout(KEY_CHECK_INTERVAL):
+                await stream.close(end)
+        except Exception as error:
+            logger.warning("a stream cannot be closed: %s", one_line(error, with_type=True))
 
     async def _create_session(self, scope: Scope) -> tuple[StreamSession, list[tuple[bytes, bytes]]]:
         model, query = scope["path_params"]["model"], parsing.query_params(scope)
@@ -117,7 +125,7 @@ class StreamRoute:
                     raise CloseStream(TOO_BIG, f"a message is larger than {self._dependencies.settings.max_body} bytes")
                 response = await stream.answer(data, text is not None)
             except CloseStream as end:
-                await opened.close(end.code, end.reason)
+                await opened.close(end)
                 return
             key, value = ("text", response.data.decode()) if response.is_text else ("bytes", response.data)
             await opened.send({"type": "websocket.send", key: value})

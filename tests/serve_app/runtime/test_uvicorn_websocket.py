@@ -267,17 +267,19 @@ def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
         until(lambda: listener.server.stream.open == 0)
 
 
-def test_a_revoked_key_ends_an_idle_stream(registry: Registry) -> None:
-    _, token = registry.keys.create("bot", ["act"])
+@pytest.mark.parametrize("name", ["bot", "b" * 100])
+def test_a_revoked_key_ends_an_idle_stream(registry: Registry, name: str) -> None:
+    """The reason of a close frame is limited to 123 bytes, and the name of a key to 100."""
+    _, token = registry.keys.create(name, ["act"])
     with (
         listening(registry.storage) as listener,
         open_stream(listener, additional_headers={"x-api-key": token}) as stream,
     ):
-        registry.keys.revoke("bot")
+        registry.keys.revoke(name)
         with pytest.raises(ConnectionClosed) as caught:
             stream.recv(timeout=60)
         assert caught.value.rcvd is not None
-        assert (caught.value.rcvd.code, "bot was revoked" in caught.value.rcvd.reason) == (1008, True)
+        assert (caught.value.rcvd.code, f"{name} was" in caught.value.rcvd.reason) == (1008, True)
         until(lambda: listener.server.stream.open == 0)
 
 
