@@ -90,20 +90,20 @@ def test_ctrl_c_publishes_the_current_checkpoint_and_a_second_one_exits_at_once(
 
     later = Registry.open(Storage.at(home)).versions.all("tictactoe")
     budget = f"--steps={later[-1].steps + 256}"
-    third = start_command("train", str(config), "--resume", budget)
+    third = start_command("train", str(config), "--resume", budget, "--cpus=2", "--dashboard")
     out, _ = third.communicate(timeout=DEADLINE)
     assert third.returncode == 0, out
+    assert "Ray's dashboard: http://127.0.0.1:" in out
     last = Registry.open(Storage.at(home)).versions.all("tictactoe")
     assert [version.ref for version in last[: len(later)]] == [version.ref for version in later]
     assert last[-1].steps >= later[-1].steps + 256
     assert [version.steps for version in last] == sorted({version.steps for version in last})
 
 
-@pytest.mark.slow
-def test_a_sweep_prints_its_trials_and_the_best_settings(league_process: League, config: Path, home: Path) -> None:
-    result = league_process("sweep", str(config), "--steps=256", "--cpus=2", "--dashboard", timeout=DEADLINE)
+@pytest.mark.usefixtures("ray_session")
+def test_a_sweep_prints_its_trials_and_the_best_settings(league: League, config: Path, home: Path) -> None:
+    result = league("sweep", str(config), "--steps=256", "--runners=0")
     assert result.code == 0, result.err
-    assert "Ray's dashboard: http://127.0.0.1:" in result.out
     lines = [line.split() for line in result.out.splitlines()]
     rows = [line for line in lines if line[:1] in (["0"], ["1"]) and "of" not in line]
     assert [row[1:3] for row in rows] == [["[8]", "0.01"], ["[16]", "0.01"]]

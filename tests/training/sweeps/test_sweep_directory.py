@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import pytest
+
+from league.config import LeagueConfig
+from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.settings import Storage
+from tests.support.leagues.training_leagues import tictactoe
+from training.sweeps.search_space import Settings
+from training.sweeps.sweep_directory import SweepDirectory, TrialOutcome
+
+TRIALS: list[Settings] = [{"lr": 0.1}, {"lr": 0.2}]
+OUTCOME = TrialOutcome(score=0.5, steps=256, seconds=1.5, ended_early=True)
+
+
+def league() -> LeagueConfig:
+    document = tictactoe().model_dump(by_alias=True)
+    return LeagueConfig.from_mapping(document | {"sweep": {"parameters": {"lr": [0.1, 0.2]}}})
+
+
+@pytest.fixture
+def storage(tmp_path: Path) -> Storage:
+    return Storage.at(tmp_path / "home")
+
+
+@pytest.fixture
+def sweep(storage: Storage) -> SweepDirectory:
+    return SweepDirectory.begin(storage, league(), {}, TRIALS, git_commit=None)
+
+
+def test_an_interrupted_sweep_is_resumed_with_its_outcomes(storage: Storage, sweep: SweepDirectory) -> None:
+    sweep.trial(0).mkdir()
+    sweep.set_outcome(0, OUTCOME)
+    resumed = SweepDirectory.resume(storage, league(), TRIALS)
+    assert (resumed.path, resumed.record) == (sweep.path, sweep.record)
+    assert [resumed.outcome(number) for number in (0, 1)] == [OUTCOME, None]
+    assert [resumed.league(number).training.lr for number in (0, 1)] == [0.1, 0.2]
+
+
+def test_a_trial_continues_from_the_checkpoint_with_the_most_steps(sweep: SweepDirectory) -> None:
+    assert sweep.checkpoint(0) is None
+    for name in ("512", "1024", "2048.part"):
+        (sweep.trial(0) / "checkpoints" / name).mkdir(parents=True)
+    assert sweep.checkpoint(0) == sweep.trial(0) / "checkpoints" / "1024"
+
+
+def test_a_complete_sweep_keeps_no_checkpoints_and_is_not_resumed(storage: Storage, sweep: SweepDirectory) -> None:
+    (sweep.trial(1) / "checkpoints" / "512").mkdir(parents=True)
+    sweep.complete()
+    assert not list(sweep.path.rglob("checkpoints"))
+    with pytest.raises(NotFound, match=f"sweep {sweep.path.name} is complete"):
+        SweepDirectory.resume(storage, league(), TRIALS)
+
+
+def test_a_league_without_sweeps_has_nothing_to_resume(storage: Storage) -> None:
+    with pytest.raises(NotFound, match="league tictactoe has no sweep"):
+        SweepDirectory.resume(storage, league(), TRIALS)
+
+
+def test_a_changed_league_or_plan_is_not_resumed(storage: Storage, sweep: SweepDirectory) -> None:
+    with pytest.raises(ConfigError, match=f"training.* has changed since sweep {sweep.path.name} began"):
+        SweepDirectory.resume(storage, league().with_training(lr=0.3), TRIALS)
+    with pytest.raises(ConfigError, match=f"^sweep has changed since sweep {sweep.path.name} began"):
+        SweepDirectory.resume(storage, league(), TRIALS[:1])
+
+
+def test_a_sweep_has_one_driver(storage: Storage, sweep: SweepDirectory) -> None:
+    with (
+        sweep.locked(),
+        pytest.raises(AlreadyRunning, match=sweep.path.name),
+        SweepDirectory.resume(storage, league(), TRIALS).locked(),
+    ):
+        pass
+    with sweep.locked():
+        pass
