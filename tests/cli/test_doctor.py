@@ -15,10 +15,10 @@ def test_all_checks_of_doctor_pass(league_process: League) -> None:
     assert result.code == 0
 
 
-def test_doctor_explains_a_broken_home(league_process: League, home: Path) -> None:
+def test_doctor_explains_a_broken_home(league: League, home: Path) -> None:
     home.mkdir()
     (home / "league.db").write_text("no database")
-    document = league_process("doctor", "--json").json
+    document = league("doctor", "--json").json
     broken = [check for check in document["checks"] if check["status"] == "fail"]
     assert [check["what"] for check in broken] == ["registry"]
     assert "LEAGUE_HOME" in broken[0]["advice"]

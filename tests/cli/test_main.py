@@ -1,12 +1,14 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import typer
 
 from cli.main import SUBCOMMANDS, app
+from league.client import Client
 from league.registry.registry import Registry
 from tests.support.command import League
 
@@ -78,7 +80,10 @@ def test_an_unusable_home_is_reported_in_one_line(league: League, home: Path) ->
     assert "home" in result.err
 
 
-def test_an_unreachable_server_is_reported_in_one_line(league: League, registry: Registry) -> None:
+def test_an_unreachable_server_is_reported_in_one_line(
+    league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("league.client.Client", partial(Client, retry_deadline=0.5))
     result = league("act", "tictactoe@1", "--url", "http://127.0.0.1:9")
     assert result.code == 1
     assert result.err.count("\n") == 1

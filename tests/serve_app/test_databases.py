@@ -22,10 +22,8 @@ from tests.support.leagues.match_results import SCHEDULE, WON, record
 from tests.support.leagues.served_leagues import build_everything
 from tests.support.servers import postgresql
 from tests.support.servers.replicas import QUICK, READ_ONLY, replica
-from tests.support.waiting import until
 
-UNUSUAL = ("\0", "a\0b", "x" * 101, "x" * 256, "x" * 301, "x" * 5000, "-1", "0", str(2**31), str(2**63), "9" * 40)
-UNUSUAL += (" ", "é", "😀", "%", "\\", "'; --", "Board", "a b", "²", "1e3", "null")
+UNUSUAL = ("a\0b", "x" * 101, "x" * 301, "x" * 5000, "-1", "0", str(2**31), str(2**63), "9" * 40, "é", "Board", "²")
 PATH = {
     "league": "board",
     "alias": "champion",
@@ -55,9 +53,9 @@ def replicas(tmp_path_factory: pytest.TempPathFactory, postgresql_socket: Path) 
             storage = Storage.at(tmp_path_factory.mktemp(database))
             if database == "postgresql":
                 storage = replace(storage, database_url=postgresql.create(postgresql_socket, "databases"))
+            key = _fill(storage)
             clients.append(stack.enter_context(replica(storage, READ_ONLY)))
-            clients[-1].headers["x-api-key"] = _fill(storage)
-        until(lambda: all(client.get("/v1/leagues").status_code == 200 for client in clients))
+            clients[-1].headers["x-api-key"] = key
         yield clients
 
 
