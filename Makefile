@@ -26,9 +26,9 @@ test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: setup
 	$(BIN)/python -m pytest -m "not slow" -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
 
-# Learning to a level, every environment, kills and clusters: one after another, since they use all cores.
+# Learning to a level, every environment, kills and clusters.
 test-slow: setup
-	$(BIN)/python -m pytest -m slow $(PYTEST) $(TESTS)
+	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
 
 check: setup
 	$(BIN)/ruff format --check .
