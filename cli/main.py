@@ -52,6 +52,7 @@ PANELS = {
         "serve": Subcommand("cli.serving:serve", "Serve all leagues over HTTP and gRPC until Ctrl-C."),
         "act": Subcommand("cli.serving:act", "Request one action from a policy server, or compute it locally."),
         "traffic": Subcommand("cli.traffic:traffic", "Show or set the canary and the shadow of a league."),
+        "replicas": Subcommand("cli.replicas:replicas", "List the serving replicas, or remove one that has ended."),
         "keys": Subcommand("cli.keys:app", "Create, list and revoke API keys."),
     },
 }

@@ -47,7 +47,9 @@ def traffic(
     off: Annotated[bool, typer.Option("--off", help="Remove both.")] = False,
     reason: Reason = "set by hand",
     actor: Actor = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Wait until every live replica has applied the change.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait until every registered replica has applied the change.")
+    ] = False,
     timeout: Timeout = 30.0,
     as_json: AsJson = False,
 ) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from league.registry.storage.rows import AliasEvent, VersionRow
 
 Ref = Annotated[str, typer.Argument(metavar="REF", help="Version, such as connect_four@3.")]
-Wait = Annotated[bool, typer.Option("--wait", help="Wait until every live replica serves it; exit 1 on timeout.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Wait until every registered replica serves it; exit 1 on timeout.")]
 
 
 def versions(league: LeagueName, as_json: AsJson = False) -> None:
@@ -164,8 +164,7 @@ def rollback(
 
 
 def _followers(registry: "Registry", event: "AliasEvent", timeout: float) -> list[str]:
-
-    return registry.changes.wait_for_alias(event.league, event.alias, event.version, timeout)
+    return registry.changes.wait_for_alias(event, timeout)
 
 
 def _moved(event: "AliasEvent", as_json: bool, replicas: list[str] | None) -> None:

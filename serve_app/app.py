@@ -57,6 +57,7 @@ from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
 from serve_app.routes.verdicts import VerdictRoutes
 from serve_app.runtime import ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
+from serve_app.runtime.replica_process import ReplicaProcess, this_process
 from serve_app.settings import ServeSettings, is_exposed
 
 LOOPBACK = "127.0.0.1"
@@ -97,6 +98,7 @@ class PolicyServer(ray_serve.AsgiReplica):
             registry,
             settings,
             ray_serve.replica_id(),
+            process=ray_serve.replica_process(),
             machine=ray_serve.node_address(),
             is_exposed=is_exposed(ray_serve.listening_host()),
             evaluation_client=evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
@@ -121,7 +123,8 @@ class PolicyServer(ray_serve.AsgiReplica):
 class Replica:
     """The components of a replica. Independent of Ray.
 
-    `machine` is the address of its node; `is_exposed`: whether other machines reach it;
+    `process`: where it runs, by default only that it is on this machine; `machine` is the address of its node;
+    `is_exposed`: whether other machines reach it;
     `evaluation_client`: None without an evaluation service.
     """
 
@@ -130,6 +133,7 @@ class Replica:
         registry: Registry,
         settings: ServeSettings,
         replica: str,
+        process: ReplicaProcess | None = None,
         machine: str = LOOPBACK,
         is_exposed: bool = False,
         evaluation_client: EvaluationClient | None = None,
@@ -138,7 +142,10 @@ class Replica:
         self.settings = settings
         self.replica = replica
         self.versions = VersionCache(
-            partial(load, registry, inline=settings.inline), settings.cached_versions, settings.retry
+            partial(load, registry, inline=settings.inline),
+            settings.cached_versions,
+            settings.retry,
+            settings.load_timeout,
         )
         self.alias_slots = AliasSlots(self.versions)
         self.traffic = TrafficSplit(self.alias_slots)
@@ -147,11 +154,13 @@ class Replica:
         self.metrics = Metrics(self.alias_slots, self.traffic, self.shadow)
         self.errors = ErrorHandlers(settings.retry, self.metrics.count_error)
         self.models = ModelResolver(registry, self.alias_slots, self.versions, self.traffic)
-        self.watcher = AliasWatcher(registry, self.alias_slots, self.traffic, replica, settings)
+        self.watcher = AliasWatcher(
+            registry, self.alias_slots, self.traffic, replica, process or this_process(), settings
+        )
         self.api_keys = ApiKeyCache()
         self.api_key_watcher = ApiKeyWatcher(registry, self.api_keys, settings)
         self.access = AccessControl(self.api_keys, settings, is_exposed)
-        self.action = ActionRoute(self.models, self.shadow, self.metrics, settings, replica)
+        self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
         dependencies = StreamDependencies(
             self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
         )
@@ -159,7 +168,7 @@ class Replica:
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = MetricsReporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
         self.evaluations = EvaluationRoutes(self.models, settings, evaluation_client)
-        self.games = GameRoutes(self.models, settings, evaluation_client)
+        self.games = GameRoutes(self.models, evaluation_client)
         self.events = EventBroker(self.models, settings)
         self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings)
         self.inference_service = InferenceService(
@@ -178,7 +187,9 @@ class Replica:
         """The ASGI application, which follows the registry's aliases while it runs."""
         docs = DocsRoutes(self.alias_slots, self.access, self.settings)
         status = StatusRoutes(self.models, self.watcher, self.access, self.replica)
-        open_inference = RestRoutes(self.inference, self.catalogue, self.watcher, self.settings, self.replica)
+        open_inference = RestRoutes(
+            self.inference, self.catalogue, self.watcher, self.access, self.settings, self.replica
+        )
         return Starlette(
             routes=[
                 Route("/v1/policies/{model}/action", self.action, methods=["POST"]),
@@ -202,12 +213,12 @@ class Replica:
         )
 
     def _league_routes(self) -> list[Route]:
-        leagues = LeagueRoutes(self.models, self.settings)
+        leagues = LeagueRoutes(self.models)
         results = ResultRoutes(self.models)
         verdicts = VerdictRoutes(self.models)
         runs = RunRoutes(self.models)
-        aliases = AliasRoutes(self.models, self.settings)
-        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.settings, self.replica)
+        aliases = AliasRoutes(self.models)
+        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.replica)
         events = EventRoutes(self.events, self.access)
         return [
             Route("/v1/leagues", leagues.page),
@@ -255,7 +266,6 @@ class Replica:
         finally:
             self.shadow.close()
             self.models.close()
-            self.versions.close()
             self.registry.close()
 
 

@@ -55,10 +55,13 @@ class ServeSettings(BaseModel):
     of the host; clients call HAProxy, which runs on the same machine unless the cluster has several."""
     cached_versions: int = Field(default=8, ge=1)
     """Versions kept in memory after requests by number, in addition to those that aliases name."""
+    load_timeout: float = Field(default=60.0, gt=0)
+    """How long an alias waits for its version to be loaded; then it keeps the previous one, and the timeout is reported
+    as a fault. A load that succeeds later still takes effect."""
     poll: float = Field(default=0.2, gt=0)
     """Interval between polls of the registry's aliases. A promotion reaches every replica after at most this plus
     loading time; within one second if poll ≤ 0.5."""
-    poll_slowest: float = Field(default=5.0, gt=0)
+    poll_slowest: float = Field(default=2.0, gt=0)
     """Maximum interval while the database fails; the interval doubles up to it. At least `poll`."""
     poll_events: float = Field(default=0.5, gt=0)
     """Interval between polls for event streams; nothing is polled while none is open."""

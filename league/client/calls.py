@@ -166,9 +166,15 @@ def outdated_replicas(league: JsonObject, promotion: Promotion) -> list[str]:
         raise AliasMoved(f"{league['league']}@{alias} has been moved to version {current} meanwhile")
     if not league["replicas"]:
         return ["no replica has reported the versions that it serves"]
-    outdated = [each for each in league["replicas"] if each["aliases"].get(alias) != version]
+    outdated = [
+        each
+        for each in league["replicas"]
+        if each["aliases"].get(alias) != version or (each["event"] or 0) < promotion.event
+    ]
     return [
-        f"{each['replica']} serves {each['aliases'].get(alias)} ({each['fault'] or 'no error'})" for each in outdated
+        f"{each['replica']} served {each['aliases'].get(alias)} {each['silent_seconds']:.0f} s ago"
+        f" ({each['fault'] or 'no error'})"
+        for each in outdated
     ]
 
 

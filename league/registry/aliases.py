@@ -17,9 +17,9 @@ from sqlalchemy.orm import Session
 from league.errors import AliasMoved, NothingToRollBack
 from league.refs import CHAMPION, check_alias
 from league.registry import leagues, verdicts, versions
-from league.registry.storage.database import Repository
+from league.registry.storage.database import Repository, repeat_after_deadlock
 from league.registry.storage.idempotency import IdempotentCall, apply_once
-from league.registry.storage.rows import AliasEvent, detached
+from league.registry.storage.rows import AliasEvent, AliasTarget, detached
 from league.registry.storage.tables import AliasEventTable, AliasTable
 
 
@@ -40,12 +40,13 @@ class AliasRepository(Repository):
         with self._database.read() as session:
             return current(session, league)
 
-    def all(self) -> dict[tuple[str, str], int]:
-        """Return (league, alias) → version of all leagues, by one cheap query."""
+    def all(self) -> dict[tuple[str, str], AliasTarget]:
+        """Return (league, alias) → its target, of all leagues, by one cheap query."""
         with self._database.read() as session:
-            found = session.execute(select(AliasTable.league, AliasTable.name, AliasTable.version))
-            return {(league, name): version for league, name, version in found}
+            found = session.execute(select(AliasTable.league, AliasTable.name, AliasTable.version, AliasTable.event))
+            return {(league, name): AliasTarget(version, event) for league, name, version, event in found}
 
+    @repeat_after_deadlock
     def set(
         self,
         league: str,
@@ -74,6 +75,7 @@ class AliasRepository(Repository):
 
             return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
 
+    @repeat_after_deadlock
     def rollback(
         self,
         league: str,

@@ -12,7 +12,7 @@ from league.registry import aliases, evaluations, replicas, runs
 from league.registry.aliases import AliasRepository
 from league.registry.replicas import LIVENESS_TIMEOUT, ReplicaRepository
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.rows import Acknowledgement, ChangeToken, Traffic
+from league.registry.storage.rows import Acknowledgement, AliasEvent, ChangeToken, Traffic
 from league.registry.storage.tables import (
     READY,
     AliasEventTable,
@@ -28,7 +28,6 @@ from league.registry.traffic import TrafficRepository
 
 OPEN = "open"
 POLL_SECONDS = 0.02
-NO_REPORT = "has not reported on this league"
 
 
 class ChangeRepository(Repository):
@@ -44,13 +43,13 @@ class ChangeRepository(Repository):
         """Return the change token of a league, which differs after any change. Raises UnknownLeague.
 
         Cheap enough for polling: each query reads the end of an index, or a few rows.
-        since: how old the acknowledgement of a live replica may be.
+        since: how old the last report of a live replica may be.
         """
         outcomes = select(VerdictTable.outcome, func.count()).filter_by(league=league).group_by(VerdictTable.outcome)
         newest_run = select(RunTable.id).filter_by(league=league).order_by(RunTable.began_at.desc(), RunTable.id.desc())
         with self._database.read() as session:
-            acknowledged = replicas.acknowledgements(session, league, since)
-            serving = Counter(each.version for each in acknowledged if each.version)
+            acknowledged = replicas.acknowledgements(session, league)
+            serving = Counter(each.version for each in acknowledged if each.version and each.silence < since)
             return ChangeToken(
                 league=league,
                 aliases=aliases.current(session, league),
@@ -68,13 +67,16 @@ class ChangeRepository(Repository):
             )
 
     def wait_for_alias(
-        self, league: str, alias: str, version: int, timeout: float, sleep: Callable[[float], None] = time.sleep
+        self, event: AliasEvent, timeout: float, sleep: Callable[[float], None] = time.sleep
     ) -> list[str]:
-        """Wait until all live replicas, at least one, serve `version` as `alias`, and return them.
+        """Wait until all registered replicas, at least one, follow the move of an alias, and return them.
 
+        A replica is waited for until it deregisters, or is removed because its process has ended: one that does not
+        respond, or cannot reach the database, may still serve another version.
         timeout: in seconds. Raises AliasMoved if the alias points elsewhere by now, or NotReady, which names the
         replicas that do not follow, and why.
         """
+        league, alias, version = event.league, event.alias, event.version
 
         def check() -> None:
             if (now := self._aliases.current(league).get(alias)) != version:
@@ -84,8 +86,8 @@ class ChangeRepository(Repository):
             league,
             f"{league}@{alias} is version {version}",
             check=check,
-            follows=lambda acknowledged: acknowledged.aliases.get(alias) == version,
-            describe=lambda acknowledged: _serves(acknowledged, alias),
+            follows=lambda found: (found.event or 0) >= event.id and found.aliases.get(alias) == version,
+            describe=lambda found: _serves(found, alias),
             timeout=timeout,
             sleep=sleep,
         )
@@ -93,7 +95,7 @@ class ChangeRepository(Repository):
     def wait_for_traffic(
         self, setting: Traffic, timeout: float, sleep: Callable[[float], None] = time.sleep
     ) -> list[str]:
-        """Wait until all live replicas, at least one, follow a traffic setting, and return them.
+        """Wait until all registered replicas, at least one, follow a traffic setting, and return them.
 
         timeout: in seconds. Raises Conflict if there is a newer setting by now, or NotReady, which names the replicas
         that do not follow, and why.
@@ -107,8 +109,8 @@ class ChangeRepository(Repository):
             setting.league,
             f"the traffic of {setting.league} is set",
             check=check,
-            follows=lambda acknowledged: acknowledged.traffic == setting.id,
-            describe=lambda acknowledged: acknowledged.fault or "has not applied the setting",
+            follows=lambda found: found.traffic == setting.id,
+            describe=lambda found: found.fault or "has not applied the setting",
             timeout=timeout,
             sleep=sleep,
         )
@@ -128,26 +130,31 @@ class ChangeRepository(Repository):
         deadline = time.monotonic() + timeout
         while True:
             check()
-            live = self._replicas.live()
-            known = {each.replica: each for each in self._replicas.acknowledgements(league)}
-            late = [replica for replica in live if replica not in known or not follows(known[replica])]
-            if live and not late:
-                return live
+            found = self._replicas.acknowledgements(league)
+            late = [one for one in found if not follows(one)]
+            if found and not late:
+                return [one.replica for one in found]
             if time.monotonic() >= deadline:
-                reasons = [
-                    f"{replica} {describe(known[replica]) if replica in known else NO_REPORT}" for replica in late
-                ]
-                raise NotReady(f"{done}, but after {timeout:g} s {_why(len(live), reasons)}")
+                reasons = [f"{one.replica} {_silence(one)}{describe(one)}" for one in late]
+                raise NotReady(f"{done}, but after {timeout:g} s {_why(len(found), reasons)}")
             sleep(POLL_SECONDS)
 
 
-def _why(live: int, reasons: list[str]) -> str:
-    if not live:
+def _why(registered: int, reasons: list[str]) -> str:
+    if not registered:
         return "no replica has reported: is a server running on this registry?"
-    return f"{len(reasons)} of {live} replicas do not serve it: {'; '.join(reasons)}"
+    return f"{len(reasons)} of {registered} replicas have not confirmed it: {'; '.join(reasons)}"
 
 
-def _serves(acknowledged: Acknowledgement, alias: str) -> str:
-    number = acknowledged.aliases.get(alias)
+def _silence(found: Acknowledgement) -> str:
+    if found.silence < LIVENESS_TIMEOUT:
+        return ""
+    return f"has been silent for {found.silence.total_seconds():.0f} s; last known: "
+
+
+def _serves(found: Acknowledgement, alias: str) -> str:
+    if found.event is None:
+        return "has not reported on this league"
+    number = found.aliases.get(alias)
     serves = "serves nothing" if number is None else f"serves version {number}"
-    return f"{serves} ({acknowledged.fault})" if acknowledged.fault else serves
+    return f"{serves} ({found.fault})" if found.fault else serves

@@ -64,7 +64,8 @@ class Registry:
     def exclusive_lock(self, name: str) -> Iterator[None]:
         """Hold a lock across all machines that share the database. Raises AlreadyRunning or StorageError.
 
-        The lock is released when the process ends for any reason.
+        The lock is released when the process ends for any reason. If it is lost earlier, because the connection to
+        PostgreSQL ends, further changes by this thread raise StorageError.
         """
-        with exclusive_lock.hold(self.database.engine, self.storage.home, name):
+        with exclusive_lock.hold(self.database, self.storage.home, name):
             yield

@@ -18,7 +18,7 @@ from league.errors import InvalidInput
 from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, parse_version
 from league.registry import leagues, versions
-from league.registry.storage.database import Repository, upsert
+from league.registry.storage.database import Repository, repeat_after_deadlock, upsert
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic, detached
 from league.registry.storage.tables import ShadowCountTable, TrafficEventTable
@@ -39,6 +39,7 @@ KEEP = Unchanged.KEEP
 class TrafficRepository(Repository):
     """Sets and reads canaries and shadows."""
 
+    @repeat_after_deadlock
     def set(
         self,
         league: str,

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from league.errors import Conflict, InvalidInput, UnknownVerdict
 from league.registry import leagues, versions
-from league.registry.storage.database import Repository, insert
+from league.registry.storage.database import Repository, insert, repeat_after_deadlock
 from league.registry.storage.rows import NightlyRunRow, VerdictRow, detached
 from league.registry.storage.tables import AliasEventTable, NightlyRunTable, VerdictTable
 
@@ -23,6 +23,7 @@ VOID = "void"
 class VerdictRepository(Repository):
     """Opens, closes, voids and reads verdicts."""
 
+    @repeat_after_deadlock
     def open(self, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]) -> VerdictRow:
         """Open the verdict that counts the matches of `schedule`, or return it if it exists. Its id is the schedule's.
 
@@ -38,6 +39,7 @@ class VerdictRepository(Repository):
                     raise Conflict(f"verdict {schedule} was opened with {name} {found!r}, not {value!r}")
             return _row(verdict)
 
+    @repeat_after_deadlock
     def close(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
         """Record the outcome of a verdict. Idempotent. Raises UnknownVerdict, or Conflict if it has another outcome."""
         with self._database.write() as session:
@@ -47,6 +49,7 @@ class VerdictRepository(Repository):
             elif row.outcome != outcome:
                 raise Conflict(f"verdict {verdict} is already {row.outcome!r}, it cannot become {outcome!r}")
 
+    @repeat_after_deadlock
     def void(self, verdict: str, note: str) -> VerdictRow:
         """Void a verdict, open or closed. Idempotent.
 
@@ -106,6 +109,7 @@ class VerdictRepository(Repository):
 class NightlyRunRepository(Repository):
     """Opens, closes and reads nightly runs."""
 
+    @repeat_after_deadlock
     def open(self, league: str, candidates: Collection[int], alpha: float) -> NightlyRunRow:
         """Open a nightly run that judges `candidates`, or return the one that is open. Raises UnknownLeague."""
         with self._database.write() as session:
@@ -118,6 +122,7 @@ class NightlyRunRepository(Repository):
                 session.flush()
             return _nightly_row(run)
 
+    @repeat_after_deadlock
     def close(self, run: int, report: dict[str, Any] | None) -> None:
         """End a nightly run and store its report. Idempotent."""
         with self._database.write() as session:

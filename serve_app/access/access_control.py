@@ -10,6 +10,7 @@ long-lived.
 """
 
 from collections.abc import Awaitable, Iterable
+from time import monotonic
 from typing import Any, NamedTuple
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -17,18 +18,21 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
 from serve_app.access import permissions
 from serve_app.access.access_log import LOG_ENTRY, AccessLog
-from serve_app.access.api_keys import ApiKey, ApiKeyCache
+from serve_app.access.api_keys import ApiKey, ApiKeyCache, TokenBucket
 from serve_app.access.errors import BodyTooSlow, ErrorHandlers
 from serve_app.access.load_shedding import Backlog
 from serve_app.access.permissions import RequiredPermission
 from serve_app.access.request_body import BODY_READ
 from serve_app.access.request_origin import ORIGIN_HEADERS, reject_cross_site, reject_foreign_host
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.runtime.serve_bypass import is_event_stream
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
 
 KEY = "league.key"
 """Scope entry of a request with a valid key: its `ApiKey`."""
+DEADLINE = "league.deadline"
+"""Scope entry of an HTTP request: when its timeout ends, as a time of `time.monotonic`."""
 BEARER = b"bearer "
 HEADERS = ORIGIN_HEADERS | {b"authorization", b"x-api-key", b"x-request-timeout-ms"}
 DENIAL = "websocket.http.response"
@@ -82,14 +86,23 @@ class AccessControl:
             reject_cross_site(method, scope["headers"])
         return self.admit(permissions.for_request(scope["type"], method, _path(scope)), headers.token)
 
-    def admit_message(self, key: ApiKey | None) -> None:
-        """Accept a message of a stream that was opened with `key`.
+    def admit_message(self, key: ApiKey | None, size: int) -> None:
+        """Accept a message of a stream that was opened with `key`. size: in bytes.
 
         Raises Unauthenticated (also if the key is no longer valid), RateLimited or Overloaded.
         """
         self.check_key(key)
         if key is not None:
             _take_token(key)
+        self.admit_body(key, size)
+
+    def admit_body(self, key: ApiKey | None, size: int) -> None:
+        """Accept a body that is large, or that arrived in a later turn of the event loop than its request.
+
+        A body counts as one more request of its key per LARGE_BODY bytes. Raises RateLimited or Overloaded.
+        """
+        if key is not None and key.bucket is not None and (wait := key.bucket.owe(size // LARGE_BODY)):
+            raise _rate_limited(key, key.bucket, wait)
         self.backlog.admit()
 
     def check_key(self, key: ApiKey | None) -> None:
@@ -116,9 +129,11 @@ class AccessControl:
             return False
         return True
 
-    def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str) -> None:
-        """Accept an RPC of GRPCInferenceService. Raises the errors of `admit`."""
-        self.admit(permissions.for_rpc(rpc, model), _read_headers(headers_of(metadata)).token)
+    def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str, size: int) -> None:
+        """Accept an RPC of GRPCInferenceService with a message of `size` bytes. Raises the errors of `admit`."""
+        key = self.admit(permissions.for_rpc(rpc, model), _read_headers(headers_of(metadata)).token)
+        if size > LARGE_BODY:
+            self.admit_body(key, size)
 
     def _authorize(self, need: RequiredPermission, token: bytes | None) -> ApiKey:
         key = None if token is None else self._api_keys.find(token)
@@ -181,6 +196,7 @@ class AccessControlMiddleware:
                 await self._application(scope, receive, response.send)
                 return
             timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
+            scope[DEADLINE] = monotonic() + timeout
             await run_within(timeout, self._application(scope, receive, response.send))
         except LeagueError as error:
             if response.has_started:
@@ -215,9 +231,11 @@ class ResponseTracker:
 def _take_token(key: ApiKey) -> None:
     """Take a token of the key's bucket. Raises RateLimited."""
     if key.bucket is not None and (wait := key.bucket.take()):
-        raise RateLimited(
-            f"rate limit exceeded: the key {key.name} allows {key.bucket.rate:g} requests per second", wait
-        )
+        raise _rate_limited(key, key.bucket, wait)
+
+
+def _rate_limited(key: ApiKey, bucket: TokenBucket, wait: float) -> RateLimited:
+    return RateLimited(f"rate limit exceeded: the key {key.name} allows {bucket.rate:g} requests per second", wait)
 
 
 def headers_of(metadata: Iterable[tuple[str, Any]] | None) -> list[tuple[bytes, bytes]]:

@@ -33,13 +33,27 @@ class TokenBucket:
 
     def take(self) -> float:
         """Take a token. Returns 0, or the number of seconds until a token is available."""
-        now = self._clock()
-        self._tokens = min(self._size, self._tokens + (now - self._at) * self.rate)
-        self._at = now
+        self._refill()
         if self._tokens >= 1:
             self._tokens -= 1
             return 0.0
         return (1 - self._tokens) / self.rate
+
+    def owe(self, tokens: float) -> float:
+        """Take tokens that may not be available yet; until they are, `take` gives none.
+
+        Returns 0, or the number of seconds until all that is owed is available, and takes nothing.
+        """
+        self._refill()
+        if self._tokens < 0:
+            return -self._tokens / self.rate
+        self._tokens -= tokens
+        return 0.0
+
+    def _refill(self) -> None:
+        now = self._clock()
+        self._tokens = min(self._size, self._tokens + (now - self._at) * self.rate)
+        self._at = now
 
 
 class ApiKey:

@@ -35,6 +35,7 @@ class Backlog:
         "_turn_started",
         "_unaccepted",
         "_waiting",
+        "turn",
     )
 
     def __init__(
@@ -47,6 +48,8 @@ class Backlog:
         self._queue: AcceptQueue | None = None
         self._unaccepted = 0
         self._waiting = 0
+        self.turn = 0
+        """Number of turns in which requests were admitted."""
         self._turn_started = 0.0
         self._overloaded_since = NEVER
         self._is_continuing = False
@@ -71,6 +74,7 @@ class Backlog:
 
     def _end_turn(self) -> None:
         is_overloaded = self._is_overloaded()
+        self.turn += 1
         self._waiting = 0
         if not is_overloaded:
             self._overloaded_since = NEVER

@@ -11,6 +11,8 @@ from serve_app.codecs.observation_codec import json_type
 
 JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")
 """Media types accepted as JSON. The last is curl's default."""
+MAX_CHANGE_BODY = 64 * 1024
+"""Limit of bodies that are not inference requests: they hold names, numbers and a reason."""
 BODY_READ = "league.body_is_read"
 """Scope entry of a request whose body has arrived: a timeout after that is not the client's fault."""
 

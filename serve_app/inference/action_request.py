@@ -14,6 +14,7 @@ from league.policies.policy import Actions
 from league.seeds import generator
 from league.spaces import ACTION_MASK
 from serve_app.codecs.observation_codec import json_type, read_state, reject_strings
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
 from serve_app.models.resolver import version_of
@@ -153,6 +154,18 @@ def decode_state(
     if has_strings:
         reject_strings(request.state)
     return read_state(request.state, policy.state, len(request.observations))
+
+
+async def read_observations(request: DecodedActionRequest, policy: LoadedPolicy, quotes: int, size: int) -> Arrays:
+    """Decode the observations, in a thread if the body is large. quotes, size: quotation marks and bytes of the body.
+
+    Raises ObservationError, IllegalMask or BodyTooLarge.
+    """
+    policy.limits.check_size(size, len(request.observations))
+    plain = is_plain(request, policy, quotes)
+    if size <= LARGE_BODY:
+        return policy.reader.read(request.observations, plain)
+    return await asyncio.to_thread(policy.reader.read, request.observations, plain)
 
 
 def encode_state(answer: Actions, version: LoadedVersion, policy: LoadedPolicy) -> list[str]:

@@ -4,6 +4,7 @@ A stream is pinned to a version, or follows an alias. A stream that follows an a
 policy only when all its episodes start anew.
 """
 
+import asyncio
 from dataclasses import dataclass
 from math import ceil
 from time import perf_counter_ns
@@ -21,6 +22,7 @@ from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
 from serve_app.codecs.observation_codec import json_type
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import read_state, write_tokens
 from serve_app.inference.action_request import (
     KEYS,
@@ -30,10 +32,10 @@ from serve_app.inference.action_request import (
     execute,
     execute_request,
     generators,
-    is_plain,
     parse_action_request,
     parse_flag,
     pinned_version,
+    read_observations,
     reject_unknown_keys,
 )
 from serve_app.inference.stream_codec import BinaryCodec, parse_request
@@ -115,7 +117,7 @@ class StreamSession:
     async def answer(self, data: bytes, is_text: bool) -> StreamMessage:
         """The answer to a message, or an error message. Raises CloseStream."""
         try:
-            self._dependencies.access.admit_message(self._key)
+            self._dependencies.access.admit_message(self._key, len(data))
             return await (self._answer_text(data) if is_text else self._answer_binary(data))
         except Unauthenticated as error:
             self._dependencies.metrics.count_error(self._path, error.code)
@@ -138,7 +140,9 @@ class StreamSession:
 
     async def _answer_text(self, data: bytes) -> StreamMessage:
         begun = perf_counter_ns()
-        document = _parsed(data)
+        if is_large := len(data) > LARGE_BODY:
+            self._served.policy.limits.check_body(data, self._dependencies.settings.max_batch)
+        document = await asyncio.to_thread(_parsed, data) if is_large else _parsed(data)
         reject_unknown_keys(document, KEYS | STREAM_ONLY_KEYS)
         own = document.keys() & STREAM_ONLY_KEYS
         if document.keys() == {"reset"} and parse_flag(document, "reset"):
@@ -153,7 +157,7 @@ class StreamSession:
         is_anew = reset is True or ("state" in document and document["state"] is None)
         served, state = await self._select(request, is_anew, _resets(reset, request))
         quotes = data.count(b'"') - 2 * len(own)
-        observations = served.policy.reader.read(request.observations, is_plain(request, served.policy, quotes))
+        observations = await read_observations(request, served.policy, quotes, len(data))
         answer = await execute_request(request, served.policy, observations, state)
         self._mirror(served, observations, state, None if request.explore else answer.actions)
         self._store_state(served, answer, request.is_batch)

@@ -53,6 +53,7 @@ def read_request(request: messages.ModelInferRequest) -> InferRequest:
         id=request.id,
         inputs=[_tensor(tensor, raw_inputs[i] if raw_inputs else None) for i, tensor in enumerate(request.inputs)],
         outputs=[output.name for output in request.outputs],
+        size=request.ByteSize(),
         is_sequence=sequence is not None and bool(sequence.int64_param or sequence.string_param),
     )
 
@@ -64,7 +65,7 @@ def _tensor(tensor: messages.ModelInferRequest.InferInputTensor, contents: bytes
             raise InvalidInput(f"input {tensor.name[:64]!r} has both contents and raw_input_contents")
         data = contents
     elif (field := CONTENTS.get(tensor.datatype)) is not None:
-        data = list(getattr(tensor.contents, field))
+        data = getattr(tensor.contents, field)
     else:
         raise InvalidInput(f"input {tensor.name[:64]!r} has datatype {tensor.datatype[:64]!r}: send it as bytes")
     return RequestTensor(tensor.name, tensor.datatype, tensor.shape, data)
@@ -143,8 +144,9 @@ class InferenceService:
         model = getattr(request, "model_name", "") or getattr(request, "name", "")
         metadata = context.invocation_metadata()
         try:
-            self._access.admit_rpc(metadata, rpc, model)
-            if request.ByteSize() > self._settings.max_body:
+            size = request.ByteSize()
+            self._access.admit_rpc(metadata, rpc, model, size)
+            if size > self._settings.max_body:
                 raise BodyTooLarge(f"the message is larger than {self._settings.max_body} bytes")
             if rpc == INFER:
                 return await self._model_infer(request, headers_of(metadata))

@@ -14,6 +14,7 @@ from league.errors import InvalidInput, Overloaded
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.policies.policy import Actions
 from league.refs import CHAMPION
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference_protocol.statistics import Statistics
 from serve_app.inference_protocol.tensors import RequestTensor, Signature, read_inputs, signature_of
 from serve_app.models.resolver import ModelResolver, policy_ref
@@ -38,6 +39,8 @@ class InferRequest(NamedTuple):
     inputs: Sequence[RequestTensor]
     outputs: Sequence[str]
     """Names of the requested outputs; all if empty."""
+    size: int
+    """Bytes of the request."""
     is_sequence: bool = False
     """Whether the client expects the server to keep state between requests."""
 
@@ -109,7 +112,7 @@ class Inference:
             wanted = _wanted(request.outputs, served.signature)
             if request.is_sequence and served.signature.is_recurrent:
                 raise InvalidInput("sequences are not supported: send state_out_<i> back as state_in_<i>")
-            arrays = read_inputs(request.inputs, served.signature, self._settings.max_batch)
+            arrays = await self._read(request, served.signature)
             read = perf_counter_ns()
             outputs = await _run(arrays, wanted, served, mirror)
             ran = perf_counter_ns()
@@ -123,6 +126,11 @@ class Inference:
         entry.succeed(rows, begun, found, read, ran, done)
         self._metrics.count_request(API, request.model, served.version, rows, done - begun)
         return encoded
+
+    async def _read(self, request: InferRequest, signature: Signature) -> dict[str, NDArray]:
+        if request.size <= LARGE_BODY:
+            return read_inputs(request.inputs, signature, self._settings.max_batch)
+        return await asyncio.to_thread(read_inputs, request.inputs, signature, self._settings.max_batch)
 
 
 def _wanted(outputs: Sequence[str], signature: Signature) -> Sequence[str]:

@@ -7,6 +7,7 @@ M is `{league}` or `{league}.{policy}`; V is a number or an alias, by default th
 replica that answers. Errors are `{"error": "…"}`.
 """
 
+import asyncio
 from typing import Any
 
 import orjson
@@ -16,8 +17,10 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, NotReady
+from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.access_log import LOG_ENTRY, log_version
-from serve_app.access.request_body import parse_json_object, read_bytes
+from serve_app.access.request_body import MAX_CHANGE_BODY, parse_json_object, read_bytes
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
@@ -39,13 +42,13 @@ class RestRoutes:
         inference: Inference,
         catalogue: ModelCatalogue,
         watcher: AliasWatcher,
+        access: AccessControl,
         settings: ServeSettings,
         replica: str,
     ) -> None:
-        self._infer = InferRoute(inference, settings, replica)
+        self._infer = InferRoute(inference, access, settings, replica)
         self._inference = inference
         self._catalogue = catalogue
-        self._settings = settings
         self._watcher = watcher
 
     def routes(self) -> list[Route]:
@@ -99,7 +102,7 @@ class RestRoutes:
         return _json(await self._catalogue.statistics(*_named(request)))
 
     async def _index(self, request: Request) -> Response:
-        body = await read_bytes(request.scope, request.receive, self._settings.max_body)
+        body = await read_bytes(request.scope, request.receive, MAX_CHANGE_BODY)
         options = parse_json_object(body) if body else {}
         only_ready = options.pop("ready", False)
         if options or type(only_ready) is not bool:
@@ -110,8 +113,9 @@ class RestRoutes:
 class InferRoute:
     """POST …/infer as a plain ASGI application: the hot path."""
 
-    def __init__(self, inference: Inference, settings: ServeSettings, replica: str) -> None:
+    def __init__(self, inference: Inference, access: AccessControl, settings: ServeSettings, replica: str) -> None:
         self._inference = inference
+        self._access = access
         self._settings = settings
         self._replica = (REPLICA, replica.encode())
 
@@ -122,12 +126,19 @@ class InferRoute:
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         header_length, encoding, accepted = _headers(scope)
-        limit = self._settings.max_body
+        limit, turn = self._settings.max_body, self._access.backlog.turn
         body = await read_bytes(scope, receive, limit)
         if encoding:
             body = await decompressed(body, encoding, limit)
-        named = scope["path_params"]
-        request = read_request(named["model"], named.get("version", ""), body, header_length)
+        if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
+            self._access.admit_body(scope.get(KEY), len(body))
+        model, version = scope["path_params"]["model"], scope["path_params"].get("version", "")
+        if is_large:
+            found = await self._inference.find(model, version, scope["headers"])
+            found.policy.limits.check_body(memoryview(body)[:header_length], self._settings.max_batch)
+            request = await asyncio.to_thread(read_request, model, version, body, header_length)
+        else:
+            request = read_request(model, version, body, header_length)
 
         def write(response: InferResponse) -> tuple[bytes, int | None]:
             if LOG_ENTRY in scope:

@@ -111,6 +111,7 @@ def read_request(model: str, version: str, body: bytes, header_length: int | Non
         id=_string(document, "id", "the request") if "id" in document else "",
         inputs=_tensors(_list(document, "inputs", required=True), rest),
         outputs=names,
+        size=len(body),
         is_sequence=bool(parameters.get(SEQUENCE)),
     )
     is_binary = "binary_data_output" in parameters and _flag(parameters, "binary_data_output")

@@ -116,7 +116,7 @@ class RequestTensor(NamedTuple):
     data: "Data"
 
 
-Data = list[Any] | bytes | memoryview
+Data = Sequence[Any] | bytes | memoryview
 """Elements in row-major order: lists, flat or nested, or little-endian bytes."""
 
 
@@ -162,8 +162,9 @@ def _array(tensor: RequestTensor, port: TensorSpec, max_batch: int) -> NDArray:
         raise ObservationError(f"{port.name} has shape {_list(shape[:16])}, expected {_list(expected)}")
     if shape[0] > max_batch:
         raise BodyTooLarge(f"{port.name} has {shape[0]} rows, expected at most {max_batch}")
-    read = _from_list if isinstance(tensor.data, list) else _from_buffer
-    return check(port.name, read(tensor.data, shape, port), port.leaf)  # type: ignore[arg-type]
+    if isinstance(tensor.data, bytes | memoryview):
+        return check(port.name, _from_buffer(tensor.data, shape, port), port.leaf)
+    return check(port.name, _from_list(tensor.data, shape, port), port.leaf)
 
 
 def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorSpec) -> NDArray:
@@ -177,8 +178,11 @@ def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorS
     return array.reshape(shape)
 
 
-def _from_list(data: list[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:
-    flat, kinds = data, set(map(type, data))
+def _from_list(data: Sequence[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:
+    if len(data) > (size := prod(shape)):
+        raise ObservationError(f"{port.name} has {len(data)} elements, expected {size} for {_list(shape)}")
+    flat = data if isinstance(data, list) else list(data)
+    kinds = set(map(type, flat))
     while kinds == {list}:
         flat = list(chain.from_iterable(flat))
         kinds = set(map(type, flat))
@@ -186,7 +190,7 @@ def _from_list(data: list[Any], shape: tuple[int, ...], port: TensorSpec) -> NDA
     # NumPy would parse "1" as a number, and make every element as wide as the longest string.
     if not kinds <= expected:
         raise ObservationError(f"{port.name} contains values other than {port.datatype}, or lists of unequal depth")
-    if len(flat) != (size := prod(shape)):
+    if len(flat) != size:
         raise ObservationError(f"{port.name} has {len(flat)} elements, expected {size} for {_list(shape)}")
     dtype = np.dtype(port.leaf.dtype)
     try:

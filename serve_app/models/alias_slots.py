@@ -6,6 +6,8 @@ alias moves → load in a thread (verify, load, warm up) → swap → the old ve
 
 import asyncio
 from collections import Counter
+from dataclasses import dataclass
+from functools import partial
 
 from league.errors import LeagueError
 from league.refs import CHAMPION
@@ -16,6 +18,14 @@ Alias = tuple[str, str]
 """(league, alias)"""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Swap:
+    """The version that an alias is about to answer with."""
+
+    number: int
+    task: asyncio.Task[None]
+
+
 class AliasSlots:
     """The slots of a replica. All methods run on the event loop."""
 
@@ -24,6 +34,7 @@ class AliasSlots:
         self._slots: dict[Alias, LoadedVersion] = {}
         self._wanted: dict[Alias, int] = {}
         self._faults: dict[Alias, str] = {}
+        self._swaps: dict[Alias, _Swap] = {}
         self.swaps: Counter[str] = Counter()
         """league → number of hot swaps"""
 
@@ -56,17 +67,43 @@ class AliasSlots:
         faults = {alias: fault for (of, alias), fault in self._faults.items() if of == league}
         return "; ".join(f"{alias}: {fault}" for alias, fault in sorted(faults.items())) or None
 
-    async def update(self, wanted: dict[Alias, int]) -> None:
-        """Make each alias answer with the version that it names now, unless that fails to load."""
+    def update(self, wanted: dict[Alias, int]) -> None:
+        """Start to load the version that each alias names now, unless it is served. Each alias has its own load, which
+        a later update replaces if the alias names another version by then.
+        """
         self._wanted = wanted
         for gone in self._slots.keys() - wanted.keys():
             del self._slots[gone]
         for gone in self._faults.keys() - wanted.keys():
             del self._faults[gone]
+        for alias, swap in list(self._swaps.items()):
+            if wanted.get(alias) != swap.number:
+                swap.task.cancel()
+                del self._swaps[alias]
         self._keep_loaded()
-        late = [alias for alias, number in wanted.items() if not self._serves(alias, number)]
-        await asyncio.gather(*(self._swap(alias, wanted[alias]) for alias in late))
-        self._keep_loaded()
+        for alias, number in wanted.items():
+            if alias not in self._swaps and not self._serves(alias, number):
+                self._swaps[alias] = swap = _Swap(number, asyncio.create_task(self._swap(alias, number)))
+                swap.task.add_done_callback(partial(self._forget, alias, swap))
+
+    async def settle(self, timeout: float) -> None:
+        """Wait until no version is being loaded, for at most `timeout` seconds."""
+        if tasks := [swap.task for swap in self._swaps.values()]:
+            await asyncio.wait(tasks, timeout=timeout)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the version of each alias is served, or has failed to load."""
+        return all(self._serves(alias, number) or alias in self._faults for alias, number in self._wanted.items())
+
+    def close(self) -> None:
+        """Stop loading."""
+        for swap in self._swaps.values():
+            swap.task.cancel()
+
+    def _forget(self, alias: Alias, swap: "_Swap", _: asyncio.Task[None]) -> None:
+        if self._swaps.get(alias) is swap:
+            del self._swaps[alias]
 
     def _keep_loaded(self) -> None:
         live = {(league, version.number) for (league, _), version in self._slots.items()}
@@ -79,21 +116,25 @@ class AliasSlots:
     async def _swap(self, alias: Alias, number: int) -> None:
         league, name = alias
         try:
-            version = await self._versions.get(league, number)
-        except LeagueError as error:
-            self._stay(alias, number, error)
+            version = await self._versions.get_for_alias(league, number)
+        except Exception as error:  # such as MemoryError: the alias is reported, and the others are served
+            self._keep(alias, number, error)
             return
         if self._slots.get(alias) is not version:
             self.swaps[league] += 1
         self._slots[alias] = version
         self._faults.pop(alias, None)
+        self._keep_loaded()
         logger.info("%s@%s is now version %d", league, name, number)
 
-    def _stay(self, alias: Alias, number: int, error: LeagueError) -> None:
-        if self._faults.get(alias) == error.public_message:
+    def _keep(self, alias: Alias, number: int, error: Exception) -> None:
+        """Keep the version that the alias has, and report the error."""
+        bug = None if isinstance(error, LeagueError) else error
+        fault = error.public_message if isinstance(error, LeagueError) else f"{type(error).__name__} while loading"
+        if self._faults.get(alias) == fault:
             return
-        self._faults[alias] = error.public_message
+        self._faults[alias] = fault
         old = self._slots.get(alias)
         stays = f"version {old.number} stays" if old else "no version is served"
         # Ray Serve buffers lower levels.
-        logger.error("%s@%s cannot switch to version %d, %s: %s", *alias, number, stays, error)
+        logger.error("%s@%s cannot switch to version %d, %s: %s", *alias, number, stays, error, exc_info=bug)

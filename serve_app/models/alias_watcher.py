@@ -14,10 +14,14 @@ from typing import NamedTuple, TypeVar
 
 from league.errors import LeagueError, StorageError
 from league.registry.registry import Registry
+from league.registry.replicas import LIVENESS_TIMEOUT
+from league.registry.storage.rows import AliasTarget
 from league.registry.storage.rows import Traffic as Setting
 from serve_app.models.alias_slots import Alias, AliasSlots
 from serve_app.models.polling import Polling
 from serve_app.models.traffic_split import TrafficSplit, pinned_slots
+from serve_app.runtime.ray_serve import logger
+from serve_app.runtime.replica_process import ReplicaProcess
 from serve_app.settings import ServeSettings
 
 SHUTDOWN_TIMEOUT = 5.0
@@ -34,21 +38,31 @@ class _Acknowledged(NamedTuple):
     fault: str | None
     aliases: Mapping[str, int]
     traffic: int | None
+    event: int | None
 
 
 class AliasWatcher:
     """Keeps `slots` at the registry's aliases and `traffic` at its settings, and acknowledges both as `replica`."""
 
     def __init__(
-        self, registry: Registry, slots: AliasSlots, traffic: TrafficSplit, replica: str, settings: ServeSettings
+        self,
+        registry: Registry,
+        slots: AliasSlots,
+        traffic: TrafficSplit,
+        replica: str,
+        process: ReplicaProcess,
+        settings: ServeSettings,
     ) -> None:
         self._registry = registry
+        self._process = process
         self._slots = slots
         self._traffic = traffic
         self._replica = replica
         self._settings = settings
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="aliases")
         self._polling = Polling(self.poll_once, "aliases", settings)
+        self._events: dict[str, int] = {}
+        """league → the newest alias event that was read"""
         self._acknowledged: dict[str, _Acknowledged] = {}
         self._acknowledged_at = -settings.heartbeat
 
@@ -64,6 +78,7 @@ class AliasWatcher:
             async with self._polling.running():
                 yield
         finally:
+            self._slots.close()
             with suppress(LeagueError, TimeoutError):
                 await asyncio.wait_for(
                     self._call(partial(self._registry.replicas.remove, self._replica)), SHUTDOWN_TIMEOUT
@@ -71,19 +86,36 @@ class AliasWatcher:
             self._thread.shutdown(wait=False, cancel_futures=True)
 
     async def poll_once(self) -> None:
-        """Read the aliases once, swap versions, and acknowledge. Raises StorageError."""
+        """Read the aliases once, start to load what they name, and acknowledge. Raises StorageError.
+
+        A version that takes longer than a pause to load is acknowledged by a later call.
+        """
+        is_due = time.monotonic() - self._acknowledged_at >= self._settings.heartbeat
+        if is_due:
+            # Before the aliases are read for the first time: nobody waits for a replica that is not registered.
+            await self._call(self._register)
         aliases, settings = await self._call(self._wanted)
         if not aliases and self._slots.leagues():
             raise StorageError("the registry has no aliases, but had some before: it is a different database")
-        await self._slots.update(aliases | pinned_slots(settings))
+        self._events = _newest_events(aliases)
+        self._slots.update({alias: target.version for alias, target in aliases.items()} | pinned_slots(settings))
+        await self._slots.settle(self._settings.poll)
         self._traffic.update(settings)
-        self._polling.mark_ready()
-        await self._acknowledge()
+        if self._slots.is_settled:
+            self._polling.mark_ready()
+        await self._acknowledge(is_due)
 
-    async def _acknowledge(self) -> None:
+    def _register(self) -> None:
+        """Register this replica, and remove those that ended without deregistering."""
+        self._registry.replicas.register(self._replica, self._process.description)
+        for other in self._registry.replicas.registered():
+            if other.silence > LIVENESS_TIMEOUT and self._process.has_ended(other.process):
+                self._registry.replicas.remove(other.replica)
+                logger.info("replica %s has ended without deregistering", other.replica)
+
+    async def _acknowledge(self, is_due: bool) -> None:
         """Acknowledge changes at once, and everything at each heartbeat."""
         serving = {league: self._serves(league) for league in self._slots.leagues()}
-        is_due = time.monotonic() - self._acknowledged_at >= self._settings.heartbeat
         changed = {
             league: acknowledgement
             for league, acknowledgement in serving.items()
@@ -99,10 +131,18 @@ class AliasWatcher:
         champion = self._slots.champion(league)
         number, sha256 = (champion.number, champion.sha256) if champion else (None, None)
         followed = self._traffic.applied_setting(league)
-        return _Acknowledged(number, sha256, self._slots.fault(league), self._slots.numbers(league), followed)
+        aliases, event = self._slots.numbers(league), self._events.get(league)
+        return _Acknowledged(number, sha256, self._slots.fault(league), aliases, followed, event)
 
-    def _wanted(self) -> tuple[dict[Alias, int], dict[str, Setting]]:
+    def _wanted(self) -> tuple[dict[Alias, AliasTarget], dict[str, Setting]]:
         return self._registry.aliases.all(), self._registry.traffic.all()
 
     async def _call(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
+
+
+def _newest_events(aliases: Mapping[Alias, AliasTarget]) -> dict[str, int]:
+    newest: dict[str, int] = {}
+    for (league, _), target in aliases.items():
+        newest[league] = max(target.event, newest.get(league, 0))
+    return newest

@@ -12,6 +12,9 @@ from serve_app.settings import ServeSettings
 JITTER = 0.1
 """Relative variation of a pause, so that replicas do not poll at the same time."""
 
+OVERDUE = 5.0
+"""Seconds after which a poll that has not returned is logged."""
+
 
 class Polling:
     """Calls `poll` in a task on the event loop. `subject` names the polled data in log lines: `aliases`."""
@@ -50,13 +53,21 @@ class Polling:
 
     async def _run(self) -> None:
         while True:
+            overdue = asyncio.get_running_loop().call_later(OVERDUE, self._report_overdue)
             try:
                 await self._poll()
             except Exception as error:
                 self._back_off(error)
             else:
                 self._recover()
+            finally:
+                overdue.cancel()
             await asyncio.sleep(self._pause * self._random.uniform(1 - JITTER, 1 + JITTER))
+
+    def _report_overdue(self) -> None:
+        """Log that a poll does not return: until the database answers or a timeout ends it, nothing is followed."""
+        self._fault = f"a poll has not returned for {OVERDUE:g} s"
+        logger.error("cannot poll %s, keeping the last known state: %s", self._subject, self._fault)
 
     def _back_off(self, error: Exception) -> None:
         """Increase the pause. Only a bug raises anything but a LeagueError; it must not stop polling."""

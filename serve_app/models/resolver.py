@@ -9,6 +9,7 @@ from typing import TypeVar
 from league.errors import NotReady, UnknownAlias, VersionRetired
 from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
 from league.registry.registry import Registry
+from league.registry.storage.database import before
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.traffic_split import Headers, TrafficSplit
 from serve_app.models.version_cache import LoadedPolicy, LoadedVersion, VersionCache
@@ -29,6 +30,7 @@ class ModelResolver:
         self._traffic = traffic
         self._versions = versions
         self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="registry")
+        self._changes = ThreadPoolExecutor(max_workers=2, thread_name_prefix="changes")
 
     async def find(
         self, model: str, version: str = CHAMPION, headers: Headers = ()
@@ -52,9 +54,22 @@ class ModelResolver:
         """Query the registry in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, self._registry)
 
+    async def change(self, function: Callable[[Registry], T], deadline: float) -> T:
+        """Change the registry in a thread, unless `deadline` (a time of `time.monotonic`) passes before.
+
+        Changes wait for locks, so they have threads of their own. Raises DeadlineExceeded.
+        """
+
+        def apply() -> T:
+            with before(deadline):
+                return function(self._registry)
+
+        return await asyncio.get_running_loop().run_in_executor(self._changes, apply)
+
     def close(self) -> None:
         """Stop the threads."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._threads, self._changes):
+            threads.shutdown(wait=False, cancel_futures=True)
 
     async def _resolve(self, league: str, alias: str) -> LoadedVersion:
         """Resolve an alias without a slot: unknown, created since the last poll, or impossible to load."""

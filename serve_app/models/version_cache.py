@@ -4,12 +4,11 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Set
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from league.errors import ArtifactCorrupt, InvalidInput, UnknownPolicy, VersionRetired
+from league.errors import ArtifactCorrupt, DeadlineExceeded, InvalidInput, Overloaded, UnknownPolicy, VersionRetired
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.policies.probes import Probes
@@ -17,6 +16,8 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import Box, Leaf
 from serve_app.codecs.observation_codec import ObservationReader
+from serve_app.codecs.request_limits import RequestLimits
+from serve_app.models.daemon_thread import in_daemon_thread
 
 WARM_BATCH = 64
 """Large enough to measure the time per row, small enough to run in milliseconds."""
@@ -31,6 +32,7 @@ class LoadedPolicy:
     reader: ObservationReader
     state: tuple[tuple[str, Leaf], ...]
     """Recurrent inputs; empty for a feed-forward policy."""
+    limits: RequestLimits
     inline_rows: int
     """The largest batch that is fast enough to run on the event loop."""
 
@@ -69,10 +71,10 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
         raise VersionRetired(
             f"{version.ref} was retired and its files were removed: start a new episode with another version"
         )
-    registry.artifacts.verify(league, number, version.sha256)
+    registry.artifacts.verify_names(league, number, version.sha256)
     policies = {}
     for name, manifest in version.manifest.policies.items():
-        # Verify again while reading: the file may have changed since.
+        # Each file is verified as it is read. The others, such as the state of training, can be large.
         graph = registry.artifacts.read(version.manifest, manifest.file)
         policy = OnnxPolicy(graph, manifest)
         if manifest.probes is not None:
@@ -95,7 +97,8 @@ def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float) -> Loa
         (tensor.name, Box(dtype=tensor.dtype, shape=_sizes(tensor.shape[1:]), low=None, high=None))
         for tensor in manifest.state
     )
-    return LoadedPolicy(policy, manifest, reader, state, rows)
+    limits = RequestLimits.of([leaf for *_, leaf in reader.leaves] + [leaf for _, leaf in state])
+    return LoadedPolicy(policy, manifest, reader, state, limits, rows)
 
 
 def _measure(policy: Policy, reader: ObservationReader, rows: int) -> float:
@@ -116,23 +119,48 @@ def _sizes(shape: tuple[int | None, ...]) -> tuple[int, ...]:
 
 VersionKey = tuple[str, int]
 """(league, number)"""
+REQUESTED_LOADS = 1
+"""Versions that are loaded at once because requests name them: they share the processor with everything else."""
+MAX_REQUESTED = 64
+"""Versions that requests may wait for."""
+ALIAS_LOADS = 4
+"""Versions that are loaded at once because aliases name them, except those that take longer than FAST_LOAD."""
+FAST_LOAD = 1.0
+"""Seconds after which a load makes room for the next one."""
+
+
+@dataclass(slots=True)
+class _RequestedLoad:
+    """A load for requests that name the version by its number."""
+
+    task: asyncio.Task[LoadedVersion]
+    waiting: int = 0
+    """Requests that wait for it."""
 
 
 class VersionCache:
     """Loads versions in threads, each only once at a time, and keeps up to `capacity` versions that are not pinned.
 
-    load: blocks; raises LeagueError. retry: seconds until a corrupt version is tried again. All methods run on the
-    event loop.
+    A load cannot be interrupted: one that does not end, for instance on a stalled mount, keeps its thread. It delays no
+    other version that an alias names.
+
+    load: blocks. retry: seconds until a corrupt version is tried again. timeout: seconds that an alias waits for its
+    version. All methods run on the event loop.
     """
 
-    def __init__(self, load: Callable[[str, int], LoadedVersion], capacity: int, retry: float) -> None:
+    def __init__(
+        self, load: Callable[[str, int], LoadedVersion], capacity: int, retry: float, timeout: float = 60.0
+    ) -> None:
         self._load = load
         self._capacity = capacity
         self._retry = retry
-        self._threads = ThreadPoolExecutor(max_workers=2, thread_name_prefix="load")
+        self._timeout = timeout
         self._loaded: OrderedDict[VersionKey, LoadedVersion] = OrderedDict()
         self._pinned: set[VersionKey] = set()
         self._loading: dict[VersionKey, asyncio.Task[LoadedVersion]] = {}
+        self._requested: dict[VersionKey, _RequestedLoad] = {}
+        self._of_aliases = asyncio.Semaphore(ALIAS_LOADS)
+        self._of_requests = asyncio.Semaphore(REQUESTED_LOADS)
         self._corrupt: dict[VersionKey, tuple[float, ArtifactCorrupt]] = {}
 
     def pin(self, pinned: set[VersionKey]) -> None:
@@ -151,25 +179,65 @@ class VersionCache:
         return self._loaded.keys()
 
     async def get(self, league: str, number: int) -> LoadedVersion:
-        """A version, loaded if necessary. Raises UnknownLeague, UnknownVersion, ArtifactCorrupt or StorageError."""
+        """A version that a request names, loaded if necessary.
+
+        Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError; Overloaded if requests
+        wait for too many other versions.
+        """
         if (version := self.cached(league, number)) is not None:
             return version
         key = (league, number)
         self._refuse_corrupt(key)
-        task = self._loading.get(key)
-        if task is None:
+        load = self._requested.get(key)
+        if load is None:
+            if len(self._requested) >= MAX_REQUESTED:
+                raise Overloaded(f"requests wait for {MAX_REQUESTED} other versions to be loaded")
+            load = self._requested[key] = _RequestedLoad(asyncio.create_task(self._load_in_turn(key)))
+            load.task.add_done_callback(lambda _: self._requested.pop(key, None))
+        load.waiting += 1
+        try:
+            return await asyncio.shield(load.task)
+        finally:
+            load.waiting -= 1
+            if not load.waiting:
+                load.task.cancel()
+
+    async def get_for_alias(self, league: str, number: int) -> LoadedVersion:
+        """A version that an alias names, loaded if necessary, before those that requests name.
+
+        Raises what `get` raises except Overloaded; DeadlineExceeded if it takes longer than the timeout.
+        """
+        if (version := self.cached(league, number)) is not None:
+            return version
+        key = (league, number)
+        self._refuse_corrupt(key)
+        fast = min(FAST_LOAD, self._timeout)
+        async with self._of_aliases:
+            load = self._start(key)
+            await asyncio.wait({load}, timeout=fast)
+        done, _ = await asyncio.wait({load}, timeout=self._timeout - fast)
+        if not done:
+            raise DeadlineExceeded(f"{league}@{number} was not loaded within {self._timeout:g} s")
+        return load.result()
+
+    async def _load_in_turn(self, key: VersionKey) -> LoadedVersion:
+        await self._of_requests.acquire()
+        load = self._start(key)
+        load.add_done_callback(lambda _: self._of_requests.release())
+        return await asyncio.shield(load)
+
+    def _start(self, key: VersionKey) -> asyncio.Task[LoadedVersion]:
+        """The task that loads a version. It is not cancelled: its thread would continue."""
+        if (task := self._loading.get(key)) is None:
             task = self._loading[key] = asyncio.create_task(self._fill(key))
             task.add_done_callback(lambda _: self._loading.pop(key, None))
-        # Another caller may wait for the same version when this one is cancelled.
-        return await asyncio.shield(task)
-
-    def close(self) -> None:
-        """Stop the threads."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        return task
 
     async def _fill(self, key: VersionKey) -> LoadedVersion:
+        if (version := self.cached(*key)) is not None:
+            return version
         try:
-            version = await asyncio.get_running_loop().run_in_executor(self._threads, self._load, *key)
+            version = await in_daemon_thread(self._load, *key)
         except ArtifactCorrupt as error:
             self._corrupt[key] = (time.monotonic() + self._retry, error)
             raise

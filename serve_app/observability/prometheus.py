@@ -48,6 +48,9 @@ METRICS = {
     "league_evaluations": MetricDefinition(
         "gauge", "Evaluations that are queued or running, for all replicas.", ("league", "state")
     ),
+    "league_silent_replicas": MetricDefinition(
+        "gauge", "Registered replicas that are stuck or cut off from the database: no report for 15 s."
+    ),
     "league_replica_start_time_seconds": MetricDefinition(
         "gauge", "Start time of the replica, in seconds since the epoch."
     ),

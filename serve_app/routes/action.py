@@ -10,6 +10,7 @@ to which the response has arrays, too. `sha256` is the digest of the version's m
 of all its files.
 """
 
+import asyncio
 from time import perf_counter_ns
 from typing import Any
 
@@ -18,8 +19,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from league.errors import Overloaded
 from league.refs import CHAMPION
+from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import parse_json_object, read_body
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.action_request import (
     KEYS,
     REPLICA,
@@ -31,6 +34,7 @@ from serve_app.inference.action_request import (
     is_plain,
     parse_action_request,
     pinned_version,
+    read_observations,
     reject_unknown_keys,
 )
 from serve_app.models.resolver import ModelResolver
@@ -49,9 +53,16 @@ class ActionRoute:
     """The endpoint as a plain ASGI application."""
 
     def __init__(
-        self, models: ModelResolver, shadow: Shadow, metrics: Metrics, settings: ServeSettings, replica: str
+        self,
+        models: ModelResolver,
+        access: AccessControl,
+        shadow: Shadow,
+        metrics: Metrics,
+        settings: ServeSettings,
+        replica: str,
     ) -> None:
         self._models = models
+        self._access = access
         self._shadow = shadow
         self._metrics = metrics
         self._settings = settings
@@ -71,19 +82,28 @@ class ActionRoute:
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         begun = perf_counter_ns()
+        turn = self._access.backlog.turn
         body = await read_body(scope, receive, self._settings.max_body)
-        document = parse_json_object(body)
+        model, requested = scope["path_params"]["model"], parsing.query_params(scope).get("version", CHAMPION)
+        if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
+            self._access.admit_body(scope.get(KEY), len(body))
+        document = await self._parse_large(scope, body, model, requested) if is_large else parse_json_object(body)
         reject_unknown_keys(document, KEYS)
         request = parse_action_request(document, self._settings.max_batch)
-        model = scope["path_params"]["model"]
-        requested = pinned_version(request, model, parsing.query_params(scope).get("version", CHAMPION))
+        requested = pinned_version(request, model, requested)
         version, policy = await self._models.find(model, requested, scope["headers"])
-        response = await _response(request, body.count(b'"'), version, policy, self._shadow.mirror_for(model, version))
+        response = await _response(request, body, version, policy, self._shadow.mirror_for(model, version))
         response |= {"model": model, "version": version.number, "sha256": version.sha256}
         if LOG_ENTRY in scope:
             log_version(scope, model, version.number)
         await _send(send, orjson.dumps(response), self._replica)
         self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - begun)
+
+    async def _parse_large(self, scope: Scope, body: bytes, model: str, requested: str) -> dict[str, Any]:
+        """Parse a body in a thread, unless it is too large for the policy."""
+        _, policy = await self._models.find(model, requested, scope["headers"])
+        policy.limits.check_body(body, self._settings.max_batch)
+        return await asyncio.to_thread(parse_json_object, body)
 
 
 class ActionDispatch:
@@ -107,14 +127,14 @@ class ActionDispatch:
 
 async def _response(
     request: DecodedActionRequest,
-    quotes: int,
+    body: bytes,
     version: LoadedVersion,
     policy: LoadedPolicy,
     mirror: MirrorFunction | None,
 ) -> dict[str, Any]:
-    plain = is_plain(request, policy, quotes)
-    observations = policy.reader.read(request.observations, plain)
-    state = decode_state(request, version, policy, not plain)
+    quotes = body.count(b'"')
+    observations = await read_observations(request, policy, quotes, len(body))
+    state = decode_state(request, version, policy, not is_plain(request, policy, quotes))
     output = await execute_request(request, policy, observations, state)
     if mirror is not None:
         mirror(observations, state, None if request.explore else output.actions)

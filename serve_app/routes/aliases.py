@@ -24,10 +24,10 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import AliasEvent
-from serve_app.access.request_body import read_body
+from serve_app.access.access_control import DEADLINE
+from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import parsing
-from serve_app.settings import ServeSettings
 
 
 class PromotionBody(parsing.ChangeBody):
@@ -46,9 +46,8 @@ class RollbackBody(parsing.ChangeBody):
 class AliasRoutes:
     """The endpoints. Access control requires the scope `promote` for POST."""
 
-    def __init__(self, models: ModelResolver, settings: ServeSettings) -> None:
+    def __init__(self, models: ModelResolver) -> None:
         self._models = models
-        self._settings = settings
 
     async def history(self, request: Request) -> Response:
         """A page of an alias's events. Raises UnknownLeague or InvalidInput."""
@@ -95,13 +94,13 @@ class AliasRoutes:
         return await self._apply(request, body, change)
 
     async def _body(self, request: Request) -> bytes:
-        return await read_body(request.scope, request.receive, self._settings.max_body)
+        return await read_body(request.scope, request.receive, MAX_CHANGE_BODY)
 
     async def _apply(
         self, request: Request, body: parsing.ChangeBody, change: Callable[[Registry, str, IdempotentCall], AliasEvent]
     ) -> JSONResponse:
         key, call = parsing.idempotent_call(request, body)
-        event = await self._models.query(lambda registry: change(registry, key.name, call))
+        event = await self._models.change(lambda registry: change(registry, key.name, call), request.scope[DEADLINE])
         return JSONResponse(event_document(event))
 
 

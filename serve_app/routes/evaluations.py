@@ -20,9 +20,9 @@ from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
 from league.service_requests import EvaluationRequest, NightlyRequest, TournamentRequest
-from serve_app.access.access_control import KEY
+from serve_app.access.access_control import DEADLINE, KEY
 from serve_app.access.api_keys import ApiKey
-from serve_app.access.request_body import read_body
+from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.evaluation_client import EvaluationClient, require_client
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import documents, parsing
@@ -48,7 +48,7 @@ class EvaluationRoutes:
         UnknownAlias, UnknownPolicy, EnvironmentMismatch, TooManyEvaluations or KeyReused.
         """
         league = check_slug("league", request.path_params["league"])
-        body = await read_body(request.scope, request.receive, self._settings.max_body)
+        body = await read_body(request.scope, request.receive, MAX_CHANGE_BODY)
         evaluation_request = parsing.parse_body(EvaluationRequest, body or b"{}")
         key, call = parsing.idempotent_call(request, evaluation_request)
         if isinstance(evaluation_request.root, NightlyRequest) and "promote" not in key.scopes:
@@ -66,7 +66,7 @@ class EvaluationRoutes:
                 call=call,
             )
 
-        row = await self._models.query(submit)
+        row = await self._models.change(submit, request.scope[DEADLINE])
         evaluation_client.notify()
         return JSONResponse(documents.evaluation_document(row), 202, {"location": f"{request.url.path}/{row.id}"})
 
@@ -95,7 +95,9 @@ class EvaluationRoutes:
         """Request the end of an evaluation; a finished one is unchanged. Raises UnknownLeague or UnknownEvaluation."""
         league, number = parsing.evaluation_path(request)
         key: ApiKey = request.scope[KEY]
-        row = await self._models.query(lambda registry: registry.evaluations.stop(league, number, actor=key.name))
+        row = await self._models.change(
+            lambda registry: registry.evaluations.stop(league, number, actor=key.name), request.scope[DEADLINE]
+        )
         if self._evaluation_client is not None:
             self._evaluation_client.notify()
         return JSONResponse(documents.evaluation_document(row))

@@ -28,11 +28,10 @@ from league.service_requests import (
     RecordingRequest,
     VideoRequest,
 )
-from serve_app.access.request_body import read_body
+from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.evaluation_client import EvaluationClient, require_client
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import parsing
-from serve_app.settings import ServeSettings
 
 DIGITS = 10
 """Exclusive maximum of digits in the number of a game."""
@@ -41,11 +40,8 @@ DIGITS = 10
 class GameRoutes:
     """The endpoints."""
 
-    def __init__(
-        self, models: ModelResolver, settings: ServeSettings, evaluation_client: EvaluationClient | None
-    ) -> None:
+    def __init__(self, models: ModelResolver, evaluation_client: EvaluationClient | None) -> None:
         self._models = models
-        self._settings = settings
         self._evaluation_client = evaluation_client
 
     async def recording(self, request: Request) -> Response:
@@ -75,7 +71,7 @@ class GameRoutes:
         Raises InvalidInput, InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy,
         EnvironmentMismatch, IllegalAction, and the errors of the evaluation service.
         """
-        body = parsing.parse_body(PlayBody, await read_body(request.scope, request.receive, self._settings.max_body))
+        body = parsing.parse_body(PlayBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
 
         def build_operation(registry: Registry, league: str) -> HumanPlayRequest:
             opponent = pinned(body.opponent, league, registry)

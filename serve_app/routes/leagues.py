@@ -20,13 +20,12 @@ from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
 from league.registry.storage.rows import Acknowledgement, VersionRow
 from league.registry.versions import MAX_NOTE_LENGTH
-from serve_app.access.access_control import KEY
+from serve_app.access.access_control import DEADLINE, KEY
 from serve_app.access.api_keys import ApiKey
-from serve_app.access.request_body import read_body
+from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.models.resolver import ModelResolver
 from serve_app.observability.metrics_reporter import RequestCounts, request_counts
 from serve_app.routes import documents, parsing
-from serve_app.settings import ServeSettings
 
 
 class NoteBody(BaseModel):
@@ -43,9 +42,8 @@ NO_REQUESTS = RequestCounts()
 class LeagueRoutes:
     """The endpoints. Access control requires the scope `promote` for PUT."""
 
-    def __init__(self, models: ModelResolver, settings: ServeSettings) -> None:
+    def __init__(self, models: ModelResolver) -> None:
         self._models = models
-        self._settings = settings
 
     async def page(self, request: Request) -> Response:
         """Leagues with their champions and current activity. Raises InvalidInput."""
@@ -78,9 +76,11 @@ class LeagueRoutes:
         """
         league = check_slug("league", request.path_params["league"])
         ref = CheckpointRef(league, parse_version(request.path_params["version"]))
-        body = parsing.parse_body(NoteBody, await read_body(request.scope, request.receive, self._settings.max_body))
+        body = parsing.parse_body(NoteBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
         key: ApiKey = request.scope[KEY]
-        row = await self._models.query(lambda registry: registry.versions.set_note(ref, body.note, actor=key.name))
+        row = await self._models.change(
+            lambda registry: registry.versions.set_note(ref, body.note, actor=key.name), request.scope[DEADLINE]
+        )
         return JSONResponse(version_document(row))
 
 
@@ -93,9 +93,9 @@ def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[
     names = sorted(row.slug for row in registry.leagues.all() if before is None or row.slug > before)
     page, more = parsing.paginate(names, len(names) if limit is None else limit, lambda name: name)
     aliases: dict[str, dict[str, int]] = {league: {} for league in page}
-    for (league, alias), number in registry.aliases.all().items():
+    for (league, alias), target in registry.aliases.all().items():
         if league in aliases:
-            aliases[league][alias] = number
+            aliases[league][alias] = target.version
     versions, verdicts = registry.versions.numbers(), registry.verdicts.last_closed()
     summaries = registry.snapshots.of_part(SUMMARY)
     evaluations, runs = registry.evaluations.counts(), registry.runs.counts()
@@ -152,7 +152,9 @@ def _replica(acknowledgement: Acknowledgement) -> dict[str, Any]:
         "sha256": acknowledgement.sha256,
         "aliases": acknowledgement.aliases,
         "fault": acknowledgement.fault,
+        "event": acknowledgement.event,
         "seen_at": acknowledgement.seen_at.isoformat(),
+        "silent_seconds": max(0.0, acknowledgement.silence.total_seconds()),
     }
 
 

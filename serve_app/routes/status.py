@@ -6,6 +6,7 @@ from starlette.responses import JSONResponse, Response
 
 from league.errors import NotReady
 from league.registry.registry import Registry
+from league.registry.replicas import LIVENESS_TIMEOUT
 from serve_app.access.access_control import AccessControl
 from serve_app.models.alias_watcher import AliasWatcher
 from serve_app.models.resolver import ModelResolver
@@ -65,4 +66,5 @@ def _metrics(registry: Registry) -> bytes:
 def _cluster_report(registry: Registry) -> Report:
     counts = registry.evaluations.counts()
     samples = [[[league, state], count] for league, states in counts.items() for state, count in states.items()]
-    return {"league_evaluations": samples}
+    silent = sum(each.silence >= LIVENESS_TIMEOUT for each in registry.replicas.registered())
+    return {"league_evaluations": samples, "league_silent_replicas": [[[], silent]]}

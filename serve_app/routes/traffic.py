@@ -18,12 +18,12 @@ from league.refs import check_slug, parse_version
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, ShadowCounts
 from league.registry.traffic import KEEP, Unchanged
-from serve_app.access.request_body import read_body
+from serve_app.access.access_control import DEADLINE
+from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.models.resolver import ModelResolver
 from serve_app.models.shadow import Shadow
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.routes import documents, parsing
-from serve_app.settings import ServeSettings
 
 
 class VersionShare(BaseModel):
@@ -45,13 +45,10 @@ class TrafficBody(parsing.ChangeBody):
 class TrafficRoutes:
     """The endpoints."""
 
-    def __init__(
-        self, models: ModelResolver, metrics: Metrics, shadow: Shadow, settings: ServeSettings, replica: str
-    ) -> None:
+    def __init__(self, models: ModelResolver, metrics: Metrics, shadow: Shadow, replica: str) -> None:
         self._models = models
         self._metrics = metrics
         self._shadow = shadow
-        self._settings = settings
         self._replica = replica
 
     async def show(self, request: Request) -> JSONResponse:
@@ -65,14 +62,15 @@ class TrafficRoutes:
     async def put(self, request: Request) -> JSONResponse:
         """Set canary or shadow. Raises UnknownLeague, UnknownVersion, UnknownAlias, KeyReused or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
-        body = parsing.parse_body(TrafficBody, await read_body(request.scope, request.receive, self._settings.max_body))
+        body = parsing.parse_body(TrafficBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
         canary = _portion(body.canary) if "canary" in body.model_fields_set else KEEP
         shadow = _portion(body.shadow) if "shadow" in body.model_fields_set else KEEP
         key, call = parsing.idempotent_call(request, body)
-        setting = await self._models.query(
+        setting = await self._models.change(
             lambda registry: registry.traffic.set(
                 league, canary=canary, shadow=shadow, actor=key.name, reason=body.reason, call=call
-            )
+            ),
+            request.scope[DEADLINE],
         )
         return JSONResponse(documents.traffic_document(setting))
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from league.errors import NotReady
+from serve_app.runtime.replica_process import ReplicaProcess, this_process
 
 if TYPE_CHECKING:
     import grpc
@@ -37,6 +38,31 @@ def replica_id() -> str:
     from ray import serve
 
     return serve.get_replica_context().replica_id.unique_id
+
+
+def replica_process() -> ReplicaProcess:
+    """The process of this replica, known by its machine and as an actor of its Ray cluster."""
+    import ray
+
+    here, context = this_process(), ray.get_runtime_context()
+    actor = {"node": context.get_node_id(), "actor": context.get_actor_name() or ""}
+    return ReplicaProcess(
+        {**here.description, **actor}, lambda other: here.has_ended(other) or _actor_has_ended(other, context.namespace)
+    )
+
+
+def _actor_has_ended(other: Mapping[str, str], namespace: str) -> bool:
+    """Whether a replica was an actor of this cluster and has ended. Nodes have unique ids, also across clusters."""
+    import ray
+
+    node = next((node for node in ray.nodes() if node["NodeID"] == other.get("node")), None)
+    if node is None or not node["Alive"]:
+        return node is not None
+    try:
+        ray.get_actor(other["actor"], namespace)
+    except ValueError:
+        return True
+    return False
 
 
 def node_address() -> str:

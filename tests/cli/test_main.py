@@ -18,7 +18,7 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 def test_the_commands_are_complete() -> None:
     assert set(COMMANDS) == {
         "doctor", "check-env", "train", "sweep", "versions", "note", "evaluate", "promote", "rollback", "history",
-        "nightly", "replay", "serve", "act", "demo", "keys", "traffic", "verify", "void", "report",
+        "nightly", "replay", "serve", "act", "demo", "replicas", "keys", "traffic", "verify", "void", "report",
     }  # fmt: skip
 
 

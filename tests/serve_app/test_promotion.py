@@ -3,10 +3,12 @@
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import text
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
@@ -143,3 +145,37 @@ def test_changes_always_require_a_key(client: TestClient, registry: Registry) ->
     assert (reply.status_code, reply.json()["code"]) == (401, "unauthenticated")
     assert "league keys create NAME --scope promote" in reply.json()["message"]
     assert registry.aliases.current("board")["champion"] == 1
+
+
+@contextmanager
+def locked(registry: Registry) -> Iterator[None]:
+    """Another connection is changing the database."""
+    with registry.database.write() as session:
+        session.execute(text("UPDATE leagues SET slug = slug"))
+        yield
+
+
+def test_a_change_that_timed_out_is_not_applied_later(promoter: TestClient, registry: Registry) -> None:
+    headers = {"idempotency-key": "late", "x-request-timeout-ms": "300"}
+    with locked(registry):
+        reply = promoter.post(CHAMPION, json={"version": 2}, headers=headers)
+        assert reply.status_code in (503, 504), reply.text
+    assert promoter.get("/v1/health/ready").status_code == 200
+    change(promoter, CHAMPION, "next", {"version": 3, "expected": 1})
+    assert [event.version for event in registry.aliases.history("board")] == [3, 1]
+
+
+def test_waiting_changes_do_not_delay_reading(registry: Registry) -> None:
+    _, token = registry.keys.create("operator", ["promote", "read"])
+    with replica(registry.storage) as client, ThreadPoolExecutor(8) as pool:
+        client.headers["authorization"] = f"Bearer {token}"
+
+        def call(number: int) -> int:
+            headers = {"idempotency-key": str(number), "x-request-timeout-ms": "1500"}
+            return client.post(CHAMPION, json={"version": 2}, headers=headers).status_code
+
+        with locked(registry):
+            waiting = [pool.submit(call, number) for number in range(8)]
+            assert client.get("/v1/leagues/board").status_code == 200
+            assert not all(each.done() for each in waiting)
+        assert {each.result() for each in waiting} <= {200, 503, 504}

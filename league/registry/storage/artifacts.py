@@ -75,18 +75,27 @@ class ArtifactStore:
 
     def verify(self, league: str, number: int, sha256: str) -> Path:
         """Return the directory of a version after verifying all its files. Raises ArtifactCorrupt."""
-        directory = self.path(league, number)
+        directory, manifest = self.path(league, number), self.verify_names(league, number, sha256)
         with disk_errors(directory):
-            manifest = self.manifest(league, number, sha256)
-            present = set(_files(directory)) - {MANIFEST}
-            for name in sorted(present - set(manifest.files)):
-                raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
             for name, digest in manifest.files.items():
                 path = directory / name
                 # Reading a pipe or a device, which a link may point to, would not end.
-                found = _sha256(path) if name in present and path.is_file() else None
-                _check(_label(league, number, name), digest, found)
+                _check(_label(league, number, name), digest, _sha256(path) if path.is_file() else None)
         return directory
+
+    def verify_names(self, league: str, number: int, sha256: str) -> Manifest:
+        """Return the manifest of a version after verifying that exactly the files that it names exist.
+
+        Their content is not read: it can be large. `read` verifies it. Raises ArtifactCorrupt.
+        """
+        directory, manifest = self.path(league, number), self.manifest(league, number, sha256)
+        with disk_errors(directory):
+            present = set(_files(directory)) - {MANIFEST}
+        for name in sorted(present - set(manifest.files)):
+            raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
+        for name in sorted(set(manifest.files) - present):
+            _check(_label(league, number, name), manifest.files[name], None)
+        return manifest
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
         """Read the manifest of a version. Raises ArtifactCorrupt if its digest is not `sha256`."""

@@ -3,15 +3,32 @@
 import json
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from functools import wraps
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 from urllib.parse import quote
 
 from filelock import FileLock
-from sqlalchemy import Connection, CursorResult, Engine, Executable, create_engine, event, inspect, make_url, text
+from sqlalchemy import (
+    Connection,
+    CursorResult,
+    Engine,
+    Executable,
+    create_engine,
+    event,
+    func,
+    inspect,
+    make_url,
+    select,
+    text,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import (
     ArgumentError,
@@ -25,7 +42,7 @@ from sqlalchemy.exc import (
 from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from league.errors import ConfigError, InvalidInput, StorageError, one_line
+from league.errors import ConfigError, DeadlineExceeded, InvalidInput, StorageError, one_line
 from league.files import disk_errors
 from league.registry.storage.migrations import HEAD, KNOWN
 from league.registry.storage.tables import Base
@@ -99,7 +116,7 @@ def _apply(connection: Connection) -> None:
 BUSY_TIMEOUT_SECONDS = 30
 """Timeout of a transaction that waits for one of another process."""
 CONNECTION_DEFAULTS = {
-    "connect_timeout": "5",  # seconds
+    "connect_timeout": "3",  # seconds
     "tcp_user_timeout": "5000",  # milliseconds; without it Linux repeats lost packets for a quarter of an hour
     "keepalives_idle": "5",
     "keepalives_interval": "2",
@@ -110,8 +127,18 @@ SESSION_DEFAULTS = "-c statement_timeout=30s -c lock_timeout=10s"
 """Settings of a PostgreSQL session, unless the URL's `options` have them."""
 FILE = "file"
 """Key in a connection's `info`: its open file by device and inode."""
+DEADLOCKS = ("40P01", "40001")
+"""Codes of PostgreSQL for deadlock_detected and serialization_failure."""
 STORAGE_ERRORS = (OperationalError, DatabaseError, InterfaceError, InternalError)
 """Disk full, read-only, locked, not a database, no server. Other errors, such as constraints, are not translated."""
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Deadlock(StorageError):
+    """One of several transactions that waited for each other was ended. It can be repeated."""
 
 
 class Database:
@@ -121,6 +148,7 @@ class Database:
         """Open the database. create: create an SQLite file that does not exist. Raises StorageError or ConfigError."""
         self.engine = _engine(url, create)
         self._writing = self.engine.execution_options(writes=True)
+        self._of_thread = threading.local()
         try:
             with translate_errors(self.engine):
                 upgrade(self.engine)
@@ -136,17 +164,60 @@ class Database:
 
     @contextmanager
     def write(self) -> Iterator[Session]:
-        """A transaction that is committed at the end, or rolled back on an error. SQLite runs one at a time."""
+        """A transaction that is committed at the end, or rolled back on an error. SQLite runs one at a time.
+
+        Raises DeadlineExceeded, and changes nothing, if that of `before` passes.
+        """
+        deadline = _deadline.get()
         with (
             translate_errors(self.engine),
-            Session(self._writing, expire_on_commit=False) as session,
+            Session(self._write_through(), expire_on_commit=False) as session,
             session.begin(),
         ):
+            if deadline is not None and self.engine.dialect.name == "postgresql":
+                session.execute(text(f"SET LOCAL lock_timeout = {_milliseconds_until(deadline)}"))
             yield session
+            if deadline is not None:
+                _milliseconds_until(deadline)
+
+    @contextmanager
+    def through(self, connection: Connection) -> Iterator[None]:
+        """Use one connection for all write transactions of this thread. If it is lost, they fail from then on."""
+        self._of_thread.connection = connection
+        try:
+            yield
+        finally:
+            self._of_thread.connection = None
+
+    def _write_through(self) -> Engine | Connection:
+        connection: Connection | None = getattr(self._of_thread, "connection", None)
+        if connection is not None and connection.invalidated:
+            # SQLAlchemy would connect again, without the locks of the session.
+            raise StorageError("the connection to the database was lost, and with it a lock that this work requires")
+        return connection or self._writing
 
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()
+
+
+_deadline: ContextVar[float | None] = ContextVar("deadline", default=None)
+
+
+@contextmanager
+def before(deadline: float) -> Iterator[None]:
+    """Apply changes only before a deadline, a time of `time.monotonic`: later, nobody waits for the result."""
+    token = _deadline.set(deadline)
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
+
+
+def _milliseconds_until(deadline: float) -> int:
+    if (left := deadline - time.monotonic()) <= 0:
+        raise DeadlineExceeded("the database was busy until the deadline: nothing was changed")
+    return max(1, int(1000 * left))
 
 
 class Repository:
@@ -178,6 +249,13 @@ def upsert(session: Session, table: type[Base], key: Mapping[str, Any], values: 
     session.execute(statement.on_conflict_do_update(index_elements=list(key), set_=dict(values)))
 
 
+def clock(session: Session) -> datetime:
+    """Return the time of the database's clock, which all its clients share."""
+    if session.get_bind().dialect.name == "sqlite":
+        return datetime.now(UTC)  # all its clients run on one machine
+    return session.execute(select(func.clock_timestamp())).scalar_one()
+
+
 def _dialect(session: Session) -> ModuleType:
     """The dialect module with ON CONFLICT, which is equal in both databases but not standard SQL."""
     return postgresql if session.get_bind().dialect.name == "postgresql" else sqlite
@@ -195,7 +273,21 @@ def translate_errors(engine: Engine) -> Iterator[None]:
             raise
         where = engine.url.render_as_string(hide_password=True)
         reason = one_line(error.orig or error)
-        raise StorageError(f"the database {where} cannot be used: {reason}") from error
+        kind = Deadlock if getattr(error.orig, "sqlstate", None) in DEADLOCKS else StorageError
+        raise kind(f"the database {where} cannot be used: {reason}") from error
+
+
+def repeat_after_deadlock(method: Callable[P, T]) -> Callable[P, T]:
+    """Call a method, which is one transaction, once more if PostgreSQL has ended it to resolve a deadlock."""
+
+    @wraps(method)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return method(*args, **kwargs)
+        except Deadlock:
+            return method(*args, **kwargs)
+
+    return call
 
 
 def _engine(url: str, create: bool) -> Engine:
@@ -285,5 +377,10 @@ def _prepare_sqlite(connection: sqlite3.Connection, _: object) -> None:
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    writes = connection.get_execution_options().get("writes", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+    if not connection.get_execution_options().get("writes", False):
+        connection.exec_driver_sql("BEGIN")
+        return
+    deadline = _deadline.get()
+    timeout = 1000 * BUSY_TIMEOUT_SECONDS if deadline is None else _milliseconds_until(deadline)
+    connection.exec_driver_sql(f"PRAGMA busy_timeout = {timeout}")
+    connection.exec_driver_sql("BEGIN IMMEDIATE")

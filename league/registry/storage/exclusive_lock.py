@@ -9,17 +9,22 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
-from sqlalchemy import Engine, text
+from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 
 from league.errors import AlreadyRunning, StorageError
+from league.registry.storage.database import Database, translate_errors
 
 
 @contextmanager
-def hold(engine: Engine, home: Path, name: str) -> Iterator[None]:
-    """Hold the lock `name`. Raises AlreadyRunning if another process holds it, StorageError if locking fails."""
-    held = _in_database(engine, name) if engine.dialect.name == "postgresql" else _in_file(home, name)
-    with held:
+def hold(database: Database, home: Path, name: str) -> Iterator[None]:
+    """Hold the lock `name`. Raises AlreadyRunning if another process holds it, StorageError if locking fails.
+
+    If the lock is lost, because the connection to PostgreSQL ends, all further changes by this thread fail with
+    StorageError: another process may hold the lock.
+    """
+    is_file = database.engine.dialect.name == "sqlite"
+    with _in_file(home, name) if is_file else _in_database(database, name):
         yield
 
 
@@ -38,19 +43,25 @@ def _in_file(home: Path, name: str) -> Iterator[None]:
 
 
 @contextmanager
-def _in_database(engine: Engine, name: str) -> Iterator[None]:
-    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+def _in_database(database: Database, name: str) -> Iterator[None]:
+    with translate_errors(database.engine), database.engine.connect() as connection:
         # Advisory locks are 64-bit numbers per database and last as long as the connection.
         scope = f"{connection.scalar(text('SELECT current_schema()'))}/{name}"
         key = int.from_bytes(hashlib.sha256(scope.encode()).digest()[:8], signed=True)
-        if not connection.scalar(text("SELECT pg_try_advisory_lock(:key)"), {"key": key}):
+        is_free = connection.scalar(text("SELECT pg_try_advisory_lock(:key)"), {"key": key})
+        connection.commit()
+        if not is_free:
             raise _running(name, "the database's advisory lock")
         try:
-            yield
+            # A change that is committed through this connection was made while the lock was held.
+            with database.through(connection):
+                yield
         finally:
             # The lock of a lost connection is already released.
             with suppress(DBAPIError):
-                connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": key})
+                if not connection.invalidated:
+                    connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": key})
+                    connection.commit()
 
 
 def _running(name: str, holds: str) -> AlreadyRunning:

@@ -1,8 +1,8 @@
 """Immutable records that the registry returns, detached from database sessions."""
 
 from dataclasses import dataclass, fields
-from datetime import datetime
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from league.histograms import Histogram
 from league.interface import Interface
@@ -103,9 +103,35 @@ class Acknowledgement:
     """Why it does not serve what it should, if so."""
     aliases: dict[str, int]
     """alias → version that it serves"""
-    seen_at: datetime
-    traffic: int | None = None
+    event: int | None
+    """Id of the newest alias event of the league that it has read; None if it has not reported on the league."""
+    traffic: int | None
     """Id of the traffic setting that it follows completely."""
+    seen_at: datetime
+    """Time of its last report, by the clock of the database."""
+    silence: timedelta
+    """Time since its last report, by the clock of the database."""
+
+
+class AliasTarget(NamedTuple):
+    """What an alias points to."""
+
+    version: int
+    event: int
+    """Id of the event that set it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegisteredReplica:
+    """A replica that has started and has not deregistered."""
+
+    replica: str
+    process: dict[str, str]
+    """Where it runs: from this, other replicas can tell that it has ended."""
+    seen_at: datetime
+    """Time of its last report, by the clock of the database."""
+    silence: timedelta
+    """Time since its last report, by the clock of the database."""
 
 
 @dataclass(frozen=True, slots=True)

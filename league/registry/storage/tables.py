@@ -169,7 +169,21 @@ class AcknowledgementTable(Base):
     """alias → version that it serves"""
     traffic: Mapped[int | None]
     """Id of the traffic setting that it follows."""
+    event: Mapped[int | None]
+    """Id of the newest alias event of the league that it has read."""
     seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
+
+
+class ReplicaTable(Base):
+    """A replica that has started and has not deregistered."""
+
+    __tablename__ = "replicas"
+
+    replica: Mapped[str] = mapped_column(String(255), primary_key=True)
+    process: Mapped[dict[str, str]] = mapped_column(JSON)
+    """Where it runs: from this, other replicas can tell that it has ended."""
+    seen_at: Mapped[datetime] = mapped_column(Utc)
+    """Time of its last report, by the clock of the database."""
 
 
 class TrafficEventTable(Base):

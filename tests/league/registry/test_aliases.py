@@ -37,7 +37,11 @@ def test_an_alias_is_set_moved_and_resolved(registry: Registry) -> None:
     registry.aliases.set(LEAGUE, "candidate", 1, expected=None, actor="ann", reason="to look at")
     promote(registry, 2, expected=1)
     assert registry.aliases.current(LEAGUE) == {"champion": 2, "candidate": 1}
-    assert registry.aliases.all() == {(LEAGUE, "champion"): 2, (LEAGUE, "candidate"): 1}
+    events = {alias: registry.aliases.history(LEAGUE, alias)[0].id for alias in ("champion", "candidate")}
+    assert registry.aliases.all() == {
+        (LEAGUE, "champion"): (2, events["champion"]),
+        (LEAGUE, "candidate"): (1, events["candidate"]),
+    }
     assert registry.versions.resolve("tictactoe@champion").number == 2
     assert [version.aliases for version in registry.versions.all(LEAGUE)] == [("candidate",), ("champion",), ()]
 

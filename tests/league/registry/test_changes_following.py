@@ -1,7 +1,7 @@
 """Waiting for replicas to follow an alias."""
 
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from typing import Any
 
 import pytest
@@ -10,8 +10,9 @@ from sqlalchemy import update
 from league.errors import AliasMoved, NotReady
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
-from league.registry.replicas import LIVENESS_TIMEOUT
-from league.registry.storage.tables import AcknowledgementTable
+from league.registry.storage.database import clock
+from league.registry.storage.rows import AliasEvent
+from league.registry.storage.tables import ReplicaTable
 from tests.support.leagues.registries import LEAGUE, registered
 
 
@@ -31,7 +32,13 @@ def champion(registry: Registry, version: int) -> None:
 
 
 def acknowledge(registry: Registry, replica: str, version: int, fault: str | None = None) -> None:
-    registry.replicas.acknowledge(replica, LEAGUE, version, "0" * 64, fault, {"champion": version})
+    """Acknowledge a version after reading the newest event."""
+    aliases = {"champion": version}
+    registry.replicas.acknowledge(replica, LEAGUE, version, "0" * 64, fault, aliases, event=newest(registry).id)
+
+
+def newest(registry: Registry, alias: str = "champion") -> AliasEvent:
+    return registry.aliases.history(LEAGUE, alias)[0]
 
 
 def sleep_with_events(*events: Callable[[], Any]) -> Callable[[float], None]:
@@ -47,7 +54,7 @@ def test_waiting_ends_when_the_last_replica_has_followed(served: Registry) -> No
         lambda: acknowledge(served, "replica-3", 2),
         lambda: acknowledge(served, "replica-2", 2),
     )
-    assert served.changes.wait_for_alias(LEAGUE, "champion", 2, 60, sleep) == ["replica-1", "replica-2", "replica-3"]
+    assert served.changes.wait_for_alias(newest(served), 60, sleep) == ["replica-1", "replica-2", "replica-3"]
 
 
 def test_a_replica_that_does_not_follow_is_named_with_its_fault(served: Registry) -> None:
@@ -56,40 +63,73 @@ def test_a_replica_that_does_not_follow_is_named_with_its_fault(served: Registry
     registered(served, "another")
     served.replicas.acknowledge("replica-3", "another", 1, "0" * 64)
     with pytest.raises(NotReady) as caught:
-        served.changes.wait_for_alias(LEAGUE, "champion", 2, 0)
+        served.changes.wait_for_alias(newest(served), 0)
     assert "2 of 3 replicas" in str(caught.value)
     assert "replica-2 serves version 1 (champion: shared.onnx was changed)" in str(caught.value)
     assert "replica-3 has not reported on this league" in str(caught.value)
     assert "replica-1" not in str(caught.value)
 
 
-def test_dead_replicas_are_not_awaited(served: Registry) -> None:
+def silence(registry: Registry, replica: str, seconds: float) -> None:
+    """Let the last report of a replica be older."""
+    with registry.database.write() as session:
+        seen_at = clock(session) - timedelta(seconds=seconds)
+        session.execute(update(ReplicaTable).filter_by(replica=replica).values(seen_at=seen_at))
+
+
+def test_a_silent_replica_is_awaited_and_named(served: Registry) -> None:
+    """It may still serve the previous version: its database connection may be lost, or its process stopped."""
     acknowledge(served, "replica-1", 2)
+    silence(served, "replica-2", 3600)
+    with pytest.raises(NotReady, match="replica-2 has been silent for 3600 s; last known: serves version 1"):
+        served.changes.wait_for_alias(newest(served), 0)
 
-    def die() -> None:
-        with served.database.write() as session:
-            at = datetime.now(UTC) - LIVENESS_TIMEOUT - timedelta(seconds=1)
-            session.execute(update(AcknowledgementTable).filter_by(replica="replica-2").values(seen_at=at))
 
-    assert served.changes.wait_for_alias(LEAGUE, "champion", 2, 60, sleep_with_events(die)) == ["replica-1"]
+def test_a_replica_that_followed_before_it_fell_silent_is_no_obstacle(served: Registry) -> None:
+    for replica in ("replica-1", "replica-2"):
+        acknowledge(served, replica, 2)
+    silence(served, "replica-2", 3600)
+    assert served.changes.wait_for_alias(newest(served), 0) == ["replica-1", "replica-2"]
+
+
+def test_a_replica_is_awaited_from_its_registration_until_it_is_removed(served: Registry) -> None:
+    for replica in ("replica-1", "replica-2"):
+        acknowledge(served, replica, 2)
+    served.replicas.register("replica-3", {})
+    with pytest.raises(NotReady, match="replica-3 has not reported on this league"):
+        served.changes.wait_for_alias(newest(served), 0)
+    served.replicas.remove("replica-3")
+    assert len(served.changes.wait_for_alias(newest(served), 0)) == 2
+
+
+def test_an_acknowledgement_of_an_earlier_event_does_not_count(served: Registry) -> None:
+    """A replica that switched to version 2 and lost its connection before it said so is not at version 1 any more."""
+    acknowledge(served, "replica-1", 1)
+    read = newest(served).id
+    champion(served, 1)
+    assert newest(served).id > read
+    acknowledge(served, "replica-2", 1)
+    with pytest.raises(NotReady, match="1 of 2 replicas have not confirmed it: replica-1 serves version 1"):
+        served.changes.wait_for_alias(newest(served), 0)
 
 
 def test_other_aliases_are_awaited_separately(served: Registry) -> None:
     served.aliases.set(LEAGUE, "candidate", 1, expected=None, actor="test", reason="test")
     with pytest.raises(NotReady, match="2 of 2"):
-        served.changes.wait_for_alias(LEAGUE, "candidate", 1, 0)
+        served.changes.wait_for_alias(newest(served, "candidate"), 0)
     for replica in ("replica-1", "replica-2"):
-        served.replicas.acknowledge(replica, LEAGUE, 2, "0" * 64, None, {"champion": 2, "candidate": 1})
-    assert len(served.changes.wait_for_alias(LEAGUE, "candidate", 1, 0)) == 2
+        aliases, event = {"champion": 2, "candidate": 1}, newest(served, "candidate").id
+        served.replicas.acknowledge(replica, LEAGUE, 2, "0" * 64, None, aliases, event=event)
+    assert len(served.changes.wait_for_alias(newest(served, "candidate"), 0)) == 2
 
 
 def test_waiting_ends_if_the_alias_moves_again(served: Registry) -> None:
     with pytest.raises(AliasMoved, match="set to version 1"):
-        served.changes.wait_for_alias(LEAGUE, "champion", 2, 60, sleep_with_events(lambda: champion(served, 1)))
+        served.changes.wait_for_alias(newest(served), 60, sleep_with_events(lambda: champion(served, 1)))
 
 
 def test_waiting_without_a_server_fails(local: Registry) -> None:
     registered(local, LEAGUE, versions=1)
     champion(local, 1)
     with pytest.raises(NotReady, match="is a server running"):
-        local.changes.wait_for_alias(LEAGUE, "champion", 1, 0)
+        local.changes.wait_for_alias(newest(local), 0)

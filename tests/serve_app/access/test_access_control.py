@@ -11,11 +11,14 @@ from typing import Any
 import httpx
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
+from starlette.types import Message
 
 from league.errors import Overloaded
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.access.load_shedding import Backlog
 from serve_app.app import Replica
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.settings import ServeSettings
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import everything
@@ -161,6 +164,46 @@ def test_a_rate_limit_is_enforced(registry: Registry) -> None:
         assert reply.headers["retry-after"] == "2"
         for _ in range(20):
             assert client.post(ACTION, json=BODY, headers=bearer(tokens[1])).status_code == 200
+
+
+def test_a_large_body_counts_as_several_requests(registry: Registry) -> None:
+    _, token = registry.keys.create("slow", ["act"], rate=0.5)
+    with serving_replica(registry) as client:
+        large = json.dumps(BODY).encode() + b" " * LARGE_BODY
+        assert client.post(ACTION, content=large, headers=bearer(token)).status_code == 413
+        reply = client.post(ACTION, json=BODY, headers=bearer(token))
+        assert_rejected(reply, 429, "rate_limited", "the key slow allows 0.5 requests per second")
+        assert reply.headers["retry-after"] == "4"
+
+
+@pytest.mark.parametrize(("is_late", "admissions"), [(False, 1), (True, 2)])
+def test_a_body_that_arrives_late_is_admitted_like_a_request(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch, is_late: bool, admissions: int
+) -> None:
+    """Otherwise clients could open many requests, and send all bodies at the same time."""
+    server, sent = Replica(Registry.open(registry.storage), QUICK, "replica-1"), []
+    admitted: list[None] = []
+    admit = Backlog.admit
+    monkeypatch.setattr(Backlog, "admit", lambda backlog: admitted.append(admit(backlog)))
+
+    async def receive() -> Message:
+        for _ in range(3 * is_late):
+            await asyncio.sleep(0)
+        return {"type": "http.request", "body": json.dumps(BODY).encode()}
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    scope = {"type": "http", "method": "POST", "headers": [], "query_string": b"", "path_params": {"model": "board"}}
+
+    async def call() -> None:
+        server.access.backlog.admit()  # as the middleware does
+        await server.action(scope, receive, send)
+
+    with local_client(server) as client:
+        assert client.portal is not None
+        client.portal.call(call)
+    assert (sent[0]["status"], len(admitted)) == (200, admissions)
 
 
 def test_a_rejected_stream_has_an_error_response(registry: Registry) -> None:

@@ -45,3 +45,15 @@ def test_the_rate_plus_a_burst_is_never_exceeded(rate: float, gaps: list[float])
         clock.now += gap
         taken += bucket.take() == 0
         assert taken <= max(1, rate) + rate * (clock.now - begin) + 1e-6
+
+
+def test_tokens_can_be_owed_once() -> None:
+    clock = Clock()
+    bucket = TokenBucket(10, clock)
+    assert bucket.take() == 0
+    assert bucket.owe(109) == 0
+    assert bucket.take() == pytest.approx(10.1)
+    assert bucket.owe(1) == pytest.approx(10)
+    clock.now += 10.15
+    assert bucket.take() == 0
+    assert bucket.take() > 0

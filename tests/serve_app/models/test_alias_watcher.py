@@ -1,20 +1,28 @@
 """A replica follows the registry, acknowledges its versions, and serves on without the registry."""
 
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from sqlalchemy import update
 from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
-from league.errors import StorageError
+from league.errors import NotReady, StorageError
+from league.registry.aliases import AliasRepository
 from league.registry.registry import Registry
-from league.registry.storage.rows import Acknowledgement
+from league.registry.storage.artifacts import ArtifactStore
+from league.registry.storage.database import clock
+from league.registry.storage.manifest import Manifest
+from league.registry.storage.rows import Acknowledgement, AliasTarget
+from league.registry.storage.tables import ReplicaTable
 from league.settings import Storage
 from serve_app.app import Replica
+from serve_app.runtime.replica_process import this_process
 from tests.support.clients.actions import BOARD, act
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import QUICK, local_client, replica
@@ -22,8 +30,8 @@ from tests.support.waiting import until
 
 
 def acknowledgement(registry: Registry, league: str = "board") -> Acknowledgement | None:
-    found = registry.replicas.acknowledgements(league, since=timedelta(minutes=1))
-    return found[0] if found else None
+    found = registry.replicas.acknowledgements(league)
+    return found[0] if found and found[0].event else None
 
 
 def serves(registry: Registry, version: int) -> bool:
@@ -148,3 +156,68 @@ def test_an_empty_registry_replacing_the_followed_one_is_ignored(
         (tmp_path / "away").rename(home)
         promote(registry, "board", 2)
         until(lambda: act(client, observation=BOARD)["version"] == 2)
+
+
+def backdate(registry: Registry, replica: str, seconds: float) -> None:
+    with registry.database.write() as session:
+        seen_at = clock(session) - timedelta(seconds=seconds)
+        session.execute(update(ReplicaTable).filter_by(replica=replica).values(seen_at=seen_at))
+
+
+def names(registry: Registry) -> set[str]:
+    return {each.replica for each in registry.replicas.registered()}
+
+
+def test_a_replica_registers_before_it_reads_the_aliases(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise it could read an alias, and a promotion of that moment would wait for all replicas but this one."""
+    seen: list[set[str]] = []
+    read = AliasRepository.all
+
+    def observed(aliases: AliasRepository) -> dict[tuple[str, str], AliasTarget]:
+        seen.append(names(registry))
+        return read(aliases)
+
+    monkeypatch.setattr(AliasRepository, "all", observed)
+    with replica(registry.storage):
+        pass
+    assert seen[0] == {"replica-1"}
+    assert names(registry) == set()
+
+
+def test_replicas_that_ended_are_removed_and_silent_ones_are_not(registry: Registry) -> None:
+    here = dict(this_process().description)
+    processes = {
+        "ended": here | {"start": "1"},
+        "stuck": here,
+        "elsewhere": here | {"machine": "another", "start": "1"},
+    }
+    for name, process in processes.items():
+        registry.replicas.register(name, process)
+        backdate(registry, name, 20)
+    with replica(registry.storage):
+        until(lambda: names(registry) == {"replica-1", "stuck", "elsewhere"})
+
+
+def test_a_stalled_load_delays_neither_other_leagues_nor_acknowledgements(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, read = threading.Event(), ArtifactStore.read
+
+    def stalled(artifacts: ArtifactStore, manifest: Manifest, name: str) -> bytes:
+        if (manifest.league, manifest.version) == ("board", 2):
+            assert gate.wait(60)
+        return read(artifacts, manifest, name)
+
+    monkeypatch.setattr(ArtifactStore, "read", stalled)
+    with replica(registry.storage) as client:
+        promote(registry, "board", 2)
+        event = registry.aliases.history("board")[0]
+        until(lambda: (row := acknowledgement(registry)) and (row.event or 0) >= event.id)
+        with pytest.raises(NotReady, match="replica-1 serves version 1"):
+            registry.changes.wait_for_alias(event, 0)
+        other = registry.aliases.set("vector", "candidate", 1, expected=None, actor="test", reason="test")
+        assert registry.changes.wait_for_alias(other, 30) == ["replica-1"]
+        promote(registry, "board", 3)
+        assert registry.changes.wait_for_alias(registry.aliases.history("board")[0], 30) == ["replica-1"]
+        assert act(client, observation=BOARD)["version"] == 3
+        gate.set()

@@ -105,7 +105,8 @@ def test_a_failing_candidate_is_counted_and_does_not_affect_requests(
 async def replica_with_shadow(registry: Registry) -> tuple[Replica, Shadow]:
     server = Replica(registry, QUICK.model_copy(update={"shadow_waiting": 4}), "replica-1")
     server.traffic.update({"board": registry.traffic.set("board", shadow=Portion(2, 1), actor="test", reason="test")})
-    await server.alias_slots.update({("board", "champion"): 1, ("board", "2"): 2})
+    server.alias_slots.update({("board", "champion"): 1, ("board", "2"): 2})
+    await server.alias_slots.settle(30)
     return server, server.shadow
 
 

@@ -7,23 +7,25 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from league.errors import ArtifactCorrupt, StorageError
-from serve_app.models.version_cache import LoadedVersion, VersionCache
+from league.errors import ArtifactCorrupt, Overloaded, StorageError
+from serve_app.models.version_cache import MAX_REQUESTED, LoadedVersion, VersionCache
 
 pytestmark = pytest.mark.anyio
 
 
 class Loader:
-    """A loader without files that counts its calls; waits for `gate`, and raises `faults`."""
+    """A loader without files that counts its calls; raises `faults`, and waits for `gate` if a version is in `slow`."""
 
     def __init__(self) -> None:
         self.calls: Counter[int] = Counter()
         self.gate = threading.Event()
         self.gate.set()
         self.faults: dict[int, Exception] = {}
+        self.slow: set[int] | None = None
 
     def __call__(self, league: str, number: int) -> LoadedVersion:
-        assert self.gate.wait(10)
+        if self.slow is None or number in self.slow:
+            assert self.gate.wait(10)
         self.calls[number] += 1
         if number in self.faults:
             raise self.faults[number]
@@ -84,6 +86,49 @@ async def test_a_storage_error_is_not_cached() -> None:
         await versions.get("board", 1)
     loader.faults.clear()
     assert (await versions.get("board", 1)).number == 1
+
+
+async def test_requests_wait_in_turn_and_leave_the_queue_when_they_end() -> None:
+    loader = Loader()
+    loader.gate.clear()
+    versions = VersionCache(loader, capacity=8, retry=1)
+    tasks = {number: asyncio.create_task(versions.get("board", number)) for number in range(1, 6)}
+    await asyncio.sleep(0)
+    for number in (2, 3, 4):
+        tasks[number].cancel()
+    await asyncio.wait([tasks[number] for number in (2, 3, 4)])
+    loader.gate.set()
+    await asyncio.gather(tasks[1], tasks[5])
+    assert loader.calls == {1: 1, 5: 1}, "nobody waits for the others any more"
+
+
+async def test_requests_wait_for_a_limited_number_of_versions() -> None:
+    loader = Loader()
+    loader.gate.clear()
+    versions = VersionCache(loader, capacity=1, retry=1)
+    tasks = [asyncio.create_task(versions.get("board", number)) for number in range(MAX_REQUESTED)]
+    await asyncio.sleep(0)
+    with pytest.raises(Overloaded, match="wait for 64 other versions"):
+        await versions.get("board", MAX_REQUESTED)
+    again = asyncio.create_task(versions.get("board", 0))
+    loader.gate.set()
+    await asyncio.gather(*tasks, again)
+    assert (await versions.get("board", MAX_REQUESTED)).number == MAX_REQUESTED
+
+
+async def test_aliases_do_not_wait_for_requests() -> None:
+    loader = Loader()
+    loader.slow = {1}
+    loader.gate.clear()
+    versions = VersionCache(loader, capacity=8, retry=1)
+    requests = [asyncio.create_task(versions.get("board", number)) for number in (1, 2, 3)]
+    await asyncio.sleep(0)
+    assert (await versions.get_for_alias("board", 4)).number == 4
+    assert (await versions.get_for_alias("board", 3)).number == 3, "also if a request waits for the same version"
+    assert loader.calls == {4: 1, 3: 1}
+    loader.gate.set()
+    assert [version.number for version in await asyncio.gather(*requests)] == [1, 2, 3]
+    assert loader.calls[3] == 1
 
 
 async def until(attempt: Callable[[], Awaitable[LoadedVersion]]) -> LoadedVersion:

@@ -87,7 +87,7 @@ def settings_of(url: str) -> tuple[dict[str, str], str, str]:
 
 def test_connections_to_postgresql_have_timeouts(server: str) -> None:
     parameters, statement, lock = settings_of(server)
-    assert (parameters["connect_timeout"], parameters["tcp_user_timeout"]) == ("5", "5000")
+    assert (parameters["connect_timeout"], parameters["tcp_user_timeout"]) == ("3", "5000")
     assert (statement, lock) == ("30s", "10s")
 
 

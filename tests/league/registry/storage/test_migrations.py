@@ -102,10 +102,11 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
         operations = Operations(MigrationContext.configure(connection))
         for index in ("ix_matches_league_played_at", "ix_matches_league_first_second_played_at"):
             operations.drop_index(index, "matches")
-        for table, columns in (("schedules", ("kind",)), ("matches", ("league", "first", "second"))):
+        added = {"schedules": ("kind",), "matches": ("league", "first", "second"), "acknowledgements": ("event",)}
+        for table, columns in added.items():
             for column in columns:
                 operations.drop_column(table, column)
-        for table in ("snapshots", "run_points", "runs", "version_notes"):
+        for table in ("snapshots", "run_points", "runs", "version_notes", "replicas"):
             operations.drop_table(table)
         connection.execute(text("UPDATE alembic_version SET version_num = '0005'"))
     registry.close()

@@ -1,0 +1,55 @@
+"""`league replicas`: the serving replicas that promotions wait for."""
+
+from typing import Annotated
+
+import typer
+
+from cli.options import AsJson, open_registry
+from cli.output import emit, say, table
+from league.errors import Conflict, NotFound
+
+
+def replicas(
+    remove: Annotated[
+        str | None, typer.Option(metavar="REPLICA", help="Remove a replica whose machine is gone for good.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the serving replicas, or remove one that has ended.
+
+    Commands with --wait wait for each of these replicas. A replica deregisters when it stops; one that was killed is
+    removed by the others on its machine or in its Ray cluster after 15 seconds, or else after a day. One that is silent
+    but has not ended may still serve an old version.
+    """
+    from league.registry.replicas import LIVENESS_TIMEOUT
+
+    repository = open_registry().replicas
+    found = {each.replica: each for each in repository.registered()}
+    if remove is not None:
+        if remove not in found:
+            raise NotFound(f"there is no replica {remove!r}; known: {', '.join(found) or 'none'}")
+        if (silence := found[remove].silence) < LIVENESS_TIMEOUT:
+            raise Conflict(f"replica {remove} reported {silence.total_seconds():.0f} s ago: stop it instead")
+        repository.remove(remove)
+        say(f"Removed replica {remove}.")
+        return
+    if as_json:
+        emit(
+            {
+                "replicas": [
+                    {
+                        "replica": each.replica,
+                        "seen_at": each.seen_at,
+                        "silent_seconds": each.silence.total_seconds(),
+                        "silent": each.silence >= LIVENESS_TIMEOUT,
+                    }
+                    for each in found.values()
+                ]
+            }
+        )
+        return
+    rows = [
+        (each.replica, each.seen_at, "silent" if each.silence >= LIVENESS_TIMEOUT else "reports")
+        for each in found.values()
+    ]
+    table(("replica", "last report", "state"), rows)

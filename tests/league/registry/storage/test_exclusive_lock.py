@@ -1,0 +1,91 @@
+"""A lock that is lost ends the work of its holder."""
+
+import threading
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+from sqlalchemy import text
+
+from league.errors import AlreadyRunning, StorageError
+from league.registry.aliases import ANY
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.support.leagues.registries import LEAGUE, registered
+from tests.support.servers import postgresql
+
+HOLDERS = "SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted"
+
+
+@pytest.fixture
+def registry(tmp_path: Path, postgresql_socket: Path) -> Registry:
+    """A registry on PostgreSQL: with SQLite, only the end of the process releases the lock."""
+    url = postgresql.create(postgresql_socket, f"lock_{uuid4().hex}")
+    storage = Storage(tmp_path / "home", url, tmp_path / "artifacts")
+    return registered(Registry.open(storage), LEAGUE, versions=3)
+
+
+def promote(registry: Registry, version: int) -> None:
+    registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="test", reason="test")
+
+
+def champion(registry: Registry) -> int | None:
+    return registry.aliases.current(LEAGUE).get("champion")
+
+
+def terminate_holder(registry: Registry) -> None:
+    with registry.database.write() as session:
+        database = "database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+        ended = session.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({HOLDERS} AND {database}) AS holders"))
+        assert len(ended.all()) == 1
+
+
+def test_changes_are_made_while_the_lock_is_held(registry: Registry) -> None:
+    with registry.exclusive_lock("nightly"):
+        for version in (1, 2):
+            promote(registry, version)
+            assert champion(registry) == version
+        with pytest.raises(AlreadyRunning), Registry.open(registry.storage).exclusive_lock("nightly"):
+            pass
+    promote(registry, 3)
+    with registry.exclusive_lock("nightly"):
+        pass
+
+
+def test_a_holder_that_lost_its_lock_changes_nothing(registry: Registry) -> None:
+    other = Registry.open(registry.storage)
+    with registry.exclusive_lock("nightly"):
+        promote(registry, 1)
+        terminate_holder(other)
+        with other.exclusive_lock("nightly"):
+            promote(other, 2)
+            for _ in range(3):
+                with pytest.raises(StorageError):
+                    promote(registry, 3)
+            assert champion(registry) == 2, "reading continues"
+    promote(registry, 3)
+    assert champion(other) == 3
+
+
+def test_a_transaction_during_which_the_lock_is_lost_is_rolled_back(registry: Registry) -> None:
+    other = Registry.open(registry.storage)
+    promote(registry, 1)
+
+    def change() -> None:
+        with registry.database.write() as session:
+            session.execute(text("UPDATE aliases SET version = 2"))
+            terminate_holder(other)
+
+    with registry.exclusive_lock("nightly"), pytest.raises(StorageError):
+        change()
+    assert champion(other) == 1
+
+
+def test_other_threads_are_unaffected(registry: Registry) -> None:
+    other = Registry.open(registry.storage)
+    with registry.exclusive_lock("nightly"):
+        terminate_holder(other)
+        thread = threading.Thread(target=promote, args=(registry, 2))
+        thread.start()
+        thread.join()
+    assert champion(registry) == 2
