@@ -21,6 +21,7 @@ ORDER = (
     "footprint",
     "faults",
     "fuzz",
+    "hostile",
     "fresh_machine",
     "strength",
     "calibration",

@@ -50,8 +50,12 @@ def publish(home: Path, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Regi
     """A registry in `home` whose league has this number of versions, the first of them its champion. hidden: units of
     the network.
     """
+    return fill(Registry.open(Storage.at(home)), versions, hidden)
+
+
+def fill(registry: Registry, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Registry:
+    """The registry, with the league of `publish`."""
     config = LeagueConfig.load(ROOT / "configs" / "connect_four.yaml")
-    registry = Registry.open(Storage.at(home))
     registry.leagues.register(config, interface(config))
     for seed in range(versions):
         registry.publisher.publish(LEAGUE, builder(registry, seed, hidden), source=f"random/{seed}")

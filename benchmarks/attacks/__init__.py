@@ -1,0 +1,1 @@
+"""Callers and failures that a server must withstand; see benchmarks/hostile.py."""

@@ -1,0 +1,114 @@
+"""A replica whose connection to PostgreSQL drops all packets for a while, in a network namespace of its own."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
+
+from benchmarks.attacks.confirmations import forwarding
+from benchmarks.attacks.postgresql_leagues import StandaloneReplica, league_in_postgresql, standalone_replica
+from benchmarks.leagues.served_league import BODY, LEAGUE
+from league.registry.registry import Registry
+
+NAMESPACE, HERE, THERE = f"league-{os.getpid()}", "10.213.7.1", "10.213.7.2"
+NOTICED, USED = 10.0, 5.0
+"""Limits in seconds: until the loss is logged, and until the restored connection is used."""
+CALL = """
+import json, sys, time, urllib.request
+url, body, count, failed = sys.argv[1], sys.stdin.buffer.read(), 0, 0
+end = time.monotonic() + float(sys.argv[2])
+while time.monotonic() < end:
+    request = urllib.request.Request(url, body, {"content-type": "application/json"})
+    try:
+        with urllib.request.urlopen(request, timeout=5) as reply:
+            json.load(reply)
+    except OSError:
+        failed += 1
+    count += 1
+    time.sleep(0.005)
+print(count, failed)
+"""
+
+
+def lost_database(seconds: float, rounds: int) -> bool:
+    """Print the times; whether they are within the limits, and no action was lost. Requires root."""
+    if os.geteuid() or not shutil.which("ip"):
+        print("lost database: not run, it requires root and the command `ip`")
+        return False
+    with league_in_postgresql() as (registry, socket), ExitStack() as stack:
+        link = stack.enter_context(_namespace())
+        port, _ = stack.enter_context(forwarding(socket / ".s.PGSQL.5432", HERE))
+        url = registry.storage.database_url.replace("@/", f"@{HERE}:{port}/").replace(f"host={socket}&", "")
+        replica = stack.enter_context(
+            standalone_replica(registry.storage, "remote", prefix=_inside(), database_url=url)
+        )
+        met = [_round(registry, replica, link, seconds) for _ in range(rounds)]
+    return all(met)
+
+
+def _round(registry: Registry, replica: StandaloneReplica, link: str, seconds: float) -> bool:
+    address, logged = f"{replica.url}/v1/policies/{LEAGUE}/action", replica.log.stat().st_size
+    command = [*_inside(), sys.executable, "-c", CALL, address, str(seconds + 10)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as calls:
+        assert calls.stdin is not None
+        calls.stdin.write(BODY)
+        calls.stdin.close()
+        calls.stdin = None
+        time.sleep(2)
+        _ip("link", "set", link, "down")
+        cut, noticed = time.monotonic(), float("inf")
+        while time.monotonic() - cut < seconds:
+            if noticed == float("inf") and "cannot poll aliases" in replica.log.read_text()[logged:]:
+                noticed = time.monotonic() - cut
+            time.sleep(0.05)
+        seen = _seen(registry, replica)
+        _ip("link", "set", link, "up")
+        restored = time.monotonic()
+        while _seen(registry, replica) == seen and time.monotonic() - restored < 60:
+            time.sleep(0.05)
+        used = time.monotonic() - restored
+        output, _ = calls.communicate()
+    count, failed = map(int, output.split())
+    print(
+        f"connection dropped for {seconds:g} s: noticed after {noticed:.1f} s, used again {used:.1f} s after its ",
+        end="",
+    )
+    print(f"return, {failed} of {count:,} actions lost   (at most {NOTICED:g} s, {USED:g} s, 0)", flush=True)
+    return noticed <= NOTICED and used <= USED and not failed
+
+
+def _seen(registry: Registry, replica: StandaloneReplica) -> datetime | None:
+    return next((each.seen_at for each in registry.replicas.registered() if each.replica == replica.name), None)
+
+
+def _inside() -> list[str]:
+    return ["ip", "netns", "exec", NAMESPACE]
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True)
+
+
+@contextmanager
+def _namespace() -> Iterator[str]:
+    """A network namespace that reaches this one; yields the link that connects them, on this side."""
+    here, there = f"h{os.getpid()}", f"t{os.getpid()}"
+    _ip("netns", "add", NAMESPACE)
+    try:
+        _ip("link", "add", here, "type", "veth", "peer", "name", there, "netns", NAMESPACE)
+        _ip("addr", "add", f"{HERE}/30", "dev", here)
+        _ip("link", "set", here, "up")
+        for arguments in (
+            ("addr", "add", f"{THERE}/30", "dev", there),
+            ("link", "set", there, "up"),
+            ("link", "set", "lo", "up"),
+        ):
+            _ip("-n", NAMESPACE, *arguments)
+        yield here
+    finally:
+        with suppress(subprocess.CalledProcessError):
+            _ip("netns", "del", NAMESPACE)

@@ -1,0 +1,65 @@
+"""One replica in a process of its own, without Ray, whose clock may be wrong.
+
+`python -m benchmarks.attacks.replica NAME HOME DATABASE_URL ARTIFACTS [--hours 1]` prints its port as soon as it is
+ready. Its log is the standard error.
+"""
+
+import argparse
+import asyncio
+import datetime
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+
+def main() -> None:
+    """Serve until the process is ended."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name")
+    parser.add_argument("home", type=Path)
+    parser.add_argument("database_url")
+    parser.add_argument("artifacts", type=Path)
+    parser.add_argument("--hours", type=float, default=0.0, help="how far the clock is ahead")
+    options = parser.parse_args()
+    if options.hours:
+        _set_clock(options.hours)
+    asyncio.run(_serve(options))
+
+
+def _set_clock(hours: float) -> None:
+    """Change the clock as Python code sees it. Modules that are imported later use it."""
+    real, real_time = datetime.datetime, time.time
+
+    class Clock(real):  # type: ignore[misc, valid-type]
+        @classmethod
+        def now(cls, tz: datetime.tzinfo | None = None) -> datetime.datetime:
+            return real.now(tz) + datetime.timedelta(hours=hours)
+
+    datetime.datetime = Clock  # type: ignore[misc]
+    time.time = lambda: real_time() + 3600 * hours
+
+
+async def _serve(options: argparse.Namespace) -> None:
+    import uvicorn
+
+    from league.registry.registry import Registry
+    from league.settings import Storage
+    from serve_app.app import Replica
+    from serve_app.settings import ServeSettings
+
+    registry = Registry.open(Storage(options.home, options.database_url, options.artifacts), create=False)
+    application = Replica(registry, ServeSettings(), options.name).application()
+    server = uvicorn.Server(uvicorn.Config(application, host="127.0.0.1", port=0, log_level="error"))
+    serving = asyncio.create_task(server.serve())
+    while not server.started:
+        await asyncio.sleep(0.01)
+        if serving.done():
+            sys.exit("the replica did not start")
+    listener: Any = server.servers[0].sockets[0]
+    print(listener.getsockname()[1], flush=True)
+    await serving
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""Changes are applied before their deadline or not at all, and repeated after a deadlock."""
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import pytest
+from sqlalchemy import text
+
+from league.errors import DeadlineExceeded, StorageError
+from league.registry.aliases import ANY
+from league.registry.registry import Registry
+from league.registry.storage.database import Deadlock, Repository, before, repeat_after_deadlock
+from tests.support.leagues.registries import LEAGUE, registered
+from tests.support.waiting import until
+
+
+@pytest.fixture
+def served(empty: Registry) -> Registry:
+    """A league with two versions, of which the first is the champion."""
+    registry = registered(empty, LEAGUE, versions=2)
+    promote(registry, 1)
+    return registry
+
+
+def promote(registry: Registry, version: int) -> None:
+    registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="test", reason="test")
+
+
+@contextmanager
+def locked(registry: Registry) -> Iterator[None]:
+    """Another connection holds the lock that changes of the league wait for."""
+    other = Registry.open(registry.storage)
+    with other.database.write() as session:
+        session.execute(text("UPDATE leagues SET slug = slug"))
+        yield
+    other.close()
+
+
+def test_a_change_waits_for_a_lock_until_its_deadline(served: Registry) -> None:
+    with locked(served), pytest.raises((StorageError, DeadlineExceeded)), before(time.monotonic() + 0.2):
+        promote(served, 2)
+    assert served.aliases.current(LEAGUE) == {"champion": 1}
+    promote(served, 2)
+    assert served.aliases.current(LEAGUE) == {"champion": 2}
+
+
+def test_a_change_after_its_deadline_does_not_start(served: Registry) -> None:
+    with before(time.monotonic()), pytest.raises(DeadlineExceeded, match="nothing was changed"):
+        promote(served, 2)
+    assert served.aliases.current(LEAGUE) == {"champion": 1}
+
+
+def test_a_transaction_that_ends_after_its_deadline_is_rolled_back(served: Registry) -> None:
+    deadline = time.monotonic() + 0.5
+
+    def change() -> None:
+        with served.database.write() as session:
+            session.execute(text("UPDATE aliases SET version = 2"))
+            until(lambda: time.monotonic() > deadline)
+
+    with before(deadline), pytest.raises(DeadlineExceeded):
+        change()
+    assert served.aliases.current(LEAGUE) == {"champion": 1}
+
+
+def test_deadlines_do_not_outlast_their_block(served: Registry) -> None:
+    """With SQLite, the timeout of a lock belongs to the connection."""
+    with before(time.monotonic() + 5):
+        promote(served, 2)
+    with ThreadPoolExecutor() as pool, locked(served):
+        change = pool.submit(promote, served, 1)
+        time.sleep(0.05)
+        assert not change.done()
+    assert served.aliases.current(LEAGUE) == {"champion": 1}
+
+
+class Swaps(Repository):
+    """Updates the alias and the league, in either order."""
+
+    barrier = threading.Barrier(2, timeout=30)
+    attempts = 0
+
+    @repeat_after_deadlock
+    def update(self, first: str, second: str, wait: list[bool]) -> None:
+        """Update two tables, and wait between them at the first attempt only."""
+        with self._database.write() as session:
+            session.execute(text(f"UPDATE {first} SET {_column(first)} = {_column(first)}"))
+            type(self).attempts += 1
+            if wait:
+                wait.pop()
+                self.barrier.wait()
+            session.execute(text(f"UPDATE {second} SET {_column(second)} = {_column(second)}"))
+
+
+def _column(table: str) -> str:
+    return {"leagues": "slug", "aliases": "version"}[table]
+
+
+def test_a_deadlock_is_resolved_by_one_repetition(served: Registry) -> None:
+    if served.database.engine.dialect.name == "sqlite":
+        pytest.skip("SQLite runs one write transaction at a time")
+    swaps = Swaps(served.database)
+    with ThreadPoolExecutor() as pool:
+        orders = [("leagues", "aliases"), ("aliases", "leagues")]
+        for change in [pool.submit(swaps.update, *order, [True]) for order in orders]:
+            change.result()
+    assert Swaps.attempts == 3
+
+
+def test_a_second_deadlock_is_reported() -> None:
+    calls = []
+
+    @repeat_after_deadlock
+    def change() -> None:
+        calls.append(None)
+        raise Deadlock("deadlock detected")
+
+    with pytest.raises(StorageError, match="deadlock detected"):
+        change()
+    assert len(calls) == 2
