@@ -25,9 +25,12 @@ CLOCKS = (1.0, -1.0, 25.0)
 FORWARD = """
 import socket, sys, threading
 def pump(source, target):
-    while data := source.recv(65536):
-        target.sendall(data)
-    target.shutdown(socket.SHUT_WR)
+    try:
+        while data := source.recv(65536):
+            target.sendall(data)
+        target.shutdown(socket.SHUT_WR)
+    except OSError:
+        target.close()
 listener = socket.create_server((sys.argv[2], 0))
 print(listener.getsockname()[1], flush=True)
 while True:

@@ -22,22 +22,23 @@ def main() -> None:
     parser.add_argument("artifacts", type=Path)
     parser.add_argument("--hours", type=float, default=0.0, help="how far the clock is ahead")
     options = parser.parse_args()
-    if options.hours:
-        _set_clock(options.hours)
     asyncio.run(_serve(options))
 
 
 def _set_clock(hours: float) -> None:
-    """Change the clock as Python code sees it. Modules that are imported later use it."""
+    """Change the clock as the modules of the product see it."""
     real, real_time = datetime.datetime, time.time
 
-    class Clock(real):  # type: ignore[misc, valid-type]
+    class Clock(real):
         @classmethod
-        def now(cls, tz: datetime.tzinfo | None = None) -> datetime.datetime:
+        def now(cls, tz: datetime.tzinfo | None = None) -> datetime.datetime:  # type: ignore[override]
             return real.now(tz) + datetime.timedelta(hours=hours)
 
-    datetime.datetime = Clock  # type: ignore[misc]
-    time.time = lambda: real_time() + 3600 * hours
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] in ("league", "serve_app"):
+            for attribute, value in (("datetime", Clock), ("time", lambda: real_time() + 3600 * hours)):
+                if getattr(module, attribute, None) in (real, real_time):
+                    setattr(module, attribute, value)
 
 
 async def _serve(options: argparse.Namespace) -> None:
@@ -48,6 +49,8 @@ async def _serve(options: argparse.Namespace) -> None:
     from serve_app.app import Replica
     from serve_app.settings import ServeSettings
 
+    if options.hours:
+        _set_clock(options.hours)
     registry = Registry.open(Storage(options.home, options.database_url, options.artifacts), create=False)
     application = Replica(registry, ServeSettings(), options.name).application()
     server = uvicorn.Server(uvicorn.Config(application, host="127.0.0.1", port=0, log_level="error"))
