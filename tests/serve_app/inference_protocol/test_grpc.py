@@ -1,11 +1,14 @@
 """gRPC without a client library: tensors in the fields of their datatype, and invalid messages."""
 
+import gc
 import socket
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import grpc
 import numpy as np
+import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -233,3 +236,24 @@ def test_no_message_causes_a_server_error(call: Call, request: Any) -> None:
     except grpc.RpcError as error:
         failure = error
     assert failure is None or failure.code() in CLIENT_ERRORS, failure  # type: ignore[attr-defined]
+
+
+def test_rejected_messages_are_released_at_once(call: Call) -> None:
+    """Not by the garbage collector, which may run after hundreds of calls."""
+    large = messages.ModelReadyRequest(name="x" * 3_000_000)
+    process = psutil.Process()
+
+    def send(count: int) -> None:
+        for _ in range(count):
+            with suppress(grpc.RpcError):
+                call("ModelReady", large)
+
+    send(5)
+    gc.collect()
+    gc.disable()
+    try:
+        before = process.memory_info().rss
+        send(40)
+        assert process.memory_info().rss - before < 60 * 2**20
+    finally:
+        gc.enable()
