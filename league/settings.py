@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 from league.errors import ConfigError
 
@@ -31,6 +32,12 @@ class Storage:
             database_url=os.environ.get("LEAGUE_DATABASE_URL") or default.database_url,
             artifacts=Path(artifacts).expanduser().absolute() if artifacts else default.artifacts,
         )
+
+    @property
+    def has_password(self) -> bool:
+        """Whether the database's URL contains a password, which must not be shown where the URL is."""
+        parts = urlsplit(self.database_url)
+        return parts.password is not None or "password" in parse_qs(parts.query)
 
     def check_reach(self, machines: set[str]) -> None:
         """Raise ConfigError if several machines cannot share the storage: SQLite, or artefacts in `home`."""

@@ -109,7 +109,7 @@ class PolicyServer(ray_serve.AsgiReplica):
         application = self._replica.application()
         serve_bypass.install(application)
         uvicorn_http.install(self._replica.events.end)
-        uvicorn_websocket.install(self._replica.settings.max_body)
+        uvicorn_websocket.install(self._replica.settings.max_body, self._replica.settings.max_incomplete)
         grpc_handlers.install(self._replica.inference_service)
         gc.freeze()  # permanent objects: collecting them again and again would stall the event loop
         return application
@@ -179,8 +179,8 @@ class Replica:
         return {
             "action": self.action.in_flight,
             "infer": self.inference.in_flight,
-            "stream": self.stream.open,
-            "events": self.events.open,
+            "stream": self.stream.connections.open,
+            "events": self.events.connections.open,
         }
 
     def application(self) -> Starlette:

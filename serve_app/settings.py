@@ -27,12 +27,18 @@ class ServeSettings(BaseModel):
     """Larger request bodies are refused with 413, and larger messages close their stream with 1009. A replica may hold
     `max_in_flight` bodies at once, and HAProxy retries a request on another replica only if it fits into
     RAY_SERVE_HAPROXY_TUNE_BUFSIZE."""
+    max_incomplete: int = Field(default=64 * 2**20, ge=1024)
+    """Bytes of incomplete messages of all streams of a replica; a stream that exceeds them is closed with 1013."""
     max_in_flight: int = Field(default=256, ge=1)
     """Inference requests in flight per replica; further ones are refused with 429."""
     max_streams: int = Field(default=1024, ge=1)
     """Open streams per replica; further ones are refused with 429."""
     max_listeners: int = Field(default=200, ge=1)
     """Open event streams per replica; further ones are refused with 429."""
+    max_streams_per_key: int = Field(default=256, ge=1)
+    """Open streams of one API key per replica; further ones are refused with 429."""
+    max_listeners_per_key: int = Field(default=50, ge=1)
+    """Open event streams of one API key per replica; further ones are refused with 429."""
     max_batch: int = Field(default=1024, ge=1)
     """Maximum observations in one request."""
     timeout: float = Field(default=4.5, gt=0)
@@ -86,6 +92,8 @@ class ServeSettings(BaseModel):
     """Evaluations that run at the same time; others are queued."""
     max_evaluations: int = Field(default=16, ge=1)
     """Evaluations that may be queued or running in all leagues; further ones are refused with 429."""
+    max_evaluations_per_league: int = Field(default=8, ge=1)
+    """Evaluations of one league that may be queued or running; further ones are refused with 429."""
     inline: float = Field(default=0.001, gt=0)
     """Inference that takes longer runs in a thread, so that it delays neither other requests nor health checks."""
 

@@ -68,9 +68,17 @@ def test_each_pod_has_the_environment_the_files_and_the_image(template: Any) -> 
     }
     assert CLUSTER["authOptions"] == {"mode": "token"}
     assert "LEAGUE_DATABASE_URL" in environment, "SQLite supports only one machine"
-    (mount,), (volume,) = container["volumeMounts"], template["spec"]["volumes"]
-    assert mount["name"] == volume["name"]
-    assert str(environment["LEAGUE_ARTIFACTS"]).startswith(mount["mountPath"])
+    mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
+    volumes = {volume["name"]: volume for volume in template["spec"]["volumes"]}
+    assert {mount["name"] for mount in mounts.values()} == volumes.keys()
+    store, home = (
+        mounts[str(Path(str(environment["LEAGUE_ARTIFACTS"])).parent)],
+        mounts[str(environment["LEAGUE_HOME"])],
+    )
+    assert store["readOnly"]
+    assert volumes[store["name"]]["persistentVolumeClaim"]["readOnly"]
+    assert not home.get("readOnly")
+    assert volumes[home["name"]] == {"name": "home", "emptyDir": {}}, "each pod has its own"
     assert {port["containerPort"] for port in container["ports"]} == {8000, 8001}
     assert container["image"] == HEAD["spec"]["containers"][0]["image"]
 

@@ -43,12 +43,13 @@ class EvaluationRepository(Repository):
         key: str | None = None,
         reason: str | None = None,
         max_active: int,
+        max_of_league: int | None = None,
         call: IdempotentCall | None = None,
     ) -> EvaluationRow:
         """Queue an evaluation. A repeated `call` queues nothing and returns its evaluation in its current state.
 
         key: the id of the client's API key. max_active: the limit of queued and running evaluations in all leagues;
-        two concurrent submissions for different leagues may exceed it by one.
+        two concurrent submissions for different leagues may exceed it by one. max_of_league: the limit of this league.
         Raises UnknownLeague, TooManyEvaluations or KeyReused.
         """
         with self._database.write() as session:
@@ -58,7 +59,14 @@ class EvaluationRepository(Repository):
                 call,
                 "evaluation",
                 change=lambda: _submit(
-                    session, league, request, actor=actor, key=key, reason=reason, max_active=max_active
+                    session,
+                    league,
+                    request,
+                    actor=actor,
+                    key=key,
+                    reason=reason,
+                    max_active=max_active,
+                    max_of_league=max_active if max_of_league is None else max_of_league,
                 ),
                 load=lambda number: _row(session.get_one(EvaluationTable, number)),
             )
@@ -162,12 +170,17 @@ def _submit(
     key: str | None,
     reason: str | None,
     max_active: int,
+    max_of_league: int,
 ) -> EvaluationRow:
-    waiting = session.scalar(select(func.count()).where(EvaluationTable.state.in_((QUEUED, RUNNING)))) or 0
-    if waiting >= max_active:
-        raise TooManyEvaluations(
-            f"{waiting} evaluations are queued or running, the limit is {max_active}: try again later"
-        )
+    active = select(func.count()).where(EvaluationTable.state.in_((QUEUED, RUNNING)))
+    for query, limit, where in (
+        (active, max_active, ""),
+        (active.where(EvaluationTable.league == league), max_of_league, f" of {league}"),
+    ):
+        if (waiting := session.scalar(query) or 0) >= limit:
+            raise TooManyEvaluations(
+                f"{waiting} evaluations{where} are queued or running, the limit is {limit}: try again later"
+            )
     evaluation = EvaluationTable(
         league=league,
         request=request,

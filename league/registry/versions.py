@@ -76,6 +76,12 @@ class VersionRepository(Repository):
         """Return a local directory with the verified files of a version. Raises ArtifactCorrupt."""
         return self._artifacts.verify(league, number, self.get(league, number).sha256)
 
+    def copy(self, league: str, number: int, folder: str, target: Path) -> Path:
+        """Copy a folder of a version to the new directory `target`, and return it. Raises ArtifactCorrupt."""
+        manifest = self._artifacts.verify_names(league, number, self.get(league, number).sha256)
+        self._artifacts.copy(manifest, folder, target)
+        return target
+
     def set_note(self, ref: CheckpointRef, text: str, *, actor: str) -> VersionRow:
         """Replace the note of a version; an empty text removes it.
 

@@ -12,6 +12,7 @@ from google.protobuf.message import Message
 
 from league.errors import ArtifactCorrupt, BodyTooLarge, InvalidInput, LeagueError, NotFound, NotReady, StorageError
 from serve_app.access.access_control import AccessControl, headers_of
+from serve_app.access.request_body import MAX_CHANGE_BODY
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.catalogue import Document, ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferRequest, InferResponse
@@ -141,13 +142,15 @@ class InferenceService:
         """Answer a call. Raises LeagueError."""
         if self._settings.grpc_local_only and not is_local_peer(context.peer(), self._machine):
             raise NotReady("replicas accept gRPC from their own machine only: call the server's port")
-        model = getattr(request, "model_name", "") or getattr(request, "name", "")
+        size, limit = request.ByteSize(), self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY
+        # Names in a message that is too large are not even read.
+        is_too_large = size > limit
+        model = "" if is_too_large else getattr(request, "model_name", "") or getattr(request, "name", "")
         metadata = context.invocation_metadata()
         try:
-            size = request.ByteSize()
             self._access.admit_rpc(metadata, rpc, model, size)
-            if size > self._settings.max_body:
-                raise BodyTooLarge(f"the message is larger than {self._settings.max_body} bytes")
+            if is_too_large:
+                raise BodyTooLarge(f"the message is larger than {limit} bytes")
             if rpc == INFER:
                 return await self._model_infer(request, headers_of(metadata))
             return await self.rpcs[rpc](request)

@@ -63,6 +63,7 @@ class EvaluationRoutes:
                 key=key.id,
                 reason=evaluation_request.root.reason,
                 max_active=self._settings.max_evaluations,
+                max_of_league=self._settings.max_evaluations_per_league,
                 call=call,
             )
 

@@ -18,11 +18,13 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import DeadlineExceeded, NotReady, Overloaded, Unauthenticated
+from league.errors import DeadlineExceeded, NotReady, Unauthenticated
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import ChangeToken
 from serve_app.access.access_control import KEY, AccessControl
+from serve_app.access.api_keys import ApiKey
+from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.models.polling import Polling
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import documents, parsing
@@ -69,8 +71,7 @@ class EventBroker:
         self._settings = settings
         self._topics: dict[str, Topic] = {}
         self._is_over = False
-        self.open = 0
-        """Number of listeners."""
+        self.connections = ConnectionLimit("event streams", settings.max_listeners, settings.max_listeners_per_key)
         slowest = max(settings.poll_events, settings.poll_slowest)
         pace = settings.model_copy(update={"poll": settings.poll_events, "poll_slowest": slowest})
         self._polling = Polling(self._poll, "event streams", pace)
@@ -90,7 +91,9 @@ class EventBroker:
                 self.end()
 
     @asynccontextmanager
-    async def subscribe(self, name: str, query: Query) -> AsyncIterator[AsyncIterator[Document | None]]:
+    async def subscribe(
+        self, name: str, query: Query, key: ApiKey | None = None
+    ) -> AsyncIterator[AsyncIterator[Document | None]]:
         """Follow the result of `query`, which is the same for all listeners of `name`.
 
         Yields the current state and each change; None if nothing has changed for KEEPALIVE_INTERVAL seconds. Raises
@@ -98,10 +101,7 @@ class EventBroker:
         """
         if self._is_over:
             raise NotReady("this replica is shutting down: reconnect")
-        if self.open >= self._settings.max_listeners:
-            raise Overloaded(f"{self.open} event streams are open in this replica")
-        self.open += 1
-        try:
+        with self.connections.opened(key):
             topic = self._topics.get(name) or self._topics.setdefault(name, await self._create_topic(query))
             topic.listeners += 1
             try:
@@ -110,8 +110,6 @@ class EventBroker:
                 topic.listeners -= 1
                 if not topic.listeners:
                     del self._topics[name]
-        finally:
-            self.open -= 1
 
     def end(self) -> None:
         """End all streams: the replica stops."""
@@ -183,7 +181,7 @@ class EventRoutes:
             return Response(headers=HEADERS, media_type=EVENT_STREAM)
 
         async def stream(scope: Scope, receive: Receive, send: Send) -> None:
-            async with self._events.subscribe(scope["path"], query) as states:
+            async with self._events.subscribe(scope["path"], query, scope.get(KEY)) as states:
                 messages = _messages(states, kind, is_last, lambda: self._access.check_key(scope.get(KEY)))
                 await StreamingResponse(messages, headers=HEADERS, media_type=EVENT_STREAM)(scope, receive, send)
 

@@ -14,17 +14,17 @@ from dataclasses import dataclass
 
 from starlette.types import Receive, Scope, Send
 
-from league.errors import InvalidInput, Overloaded, Unauthenticated, one_line
+from league.errors import InvalidInput, Unauthenticated, one_line
 from league.refs import CHAMPION, check_alias
 from serve_app.access.access_control import KEY, POLICY_VIOLATION
 from serve_app.access.api_keys import ApiKey
+from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.routes import parsing
 from serve_app.runtime.ray_serve import logger
-from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, CloseStream, StreamWebSocketProtocol
+from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, TOO_BIG, CloseStream, StreamWebSocketProtocol
 
-TOO_BIG = 1009
 KEY_CHECK_INTERVAL = 1.0
 """Seconds between checks of the keys of open streams."""
 
@@ -52,17 +52,14 @@ class StreamRoute:
     def __init__(self, dependencies: StreamDependencies, replica: str) -> None:
         self._dependencies = dependencies
         self._replica = replica
-        self.open = 0
-        """Number of open streams."""
+        settings = dependencies.settings
+        self.connections = ConnectionLimit("streams", settings.max_streams, settings.max_streams_per_key)
         self._accepted: set[OpenStream] = set()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle a stream until it closes. Raises LeagueError before the handshake is accepted."""
         await receive()  # the handshake
-        if self.open >= self._dependencies.settings.max_streams:
-            raise Overloaded(f"{self.open} streams are open in this replica")
-        self.open += 1
-        try:
+        with self.connections.opened(scope.get(KEY)):
             stream, headers = await self._create_session(scope)
             await send({"type": "websocket.accept", "headers": headers})
             opened = OpenStream(scope.get(KEY), send, scope.get("extensions", {}).get(STREAM_PROTOCOL))
@@ -71,8 +68,6 @@ class StreamRoute:
                 await self._exchange_messages(stream, opened, receive)
             finally:
                 self._accepted.remove(opened)
-        finally:
-            self.open -= 1
 
     @asynccontextmanager
     async def checking_keys(self) -> AsyncIterator[None]:

@@ -10,6 +10,7 @@ read from the connection either, which gives backpressure.
 import asyncio
 import struct
 from collections.abc import Generator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -38,6 +39,12 @@ MAX_MESSAGES_PER_TURN = 16
 CLOSE_TIMEOUT = 2.0
 """Seconds for a client to answer a close frame and read earlier messages."""
 SERVICE_RESTART = 1012
+TRY_AGAIN_LATER = 1013
+TOO_BIG = 1009
+MAX_FRAGMENTS = 1024
+"""Frames of a fragmented message: empty ones would take memory without being counted as bytes."""
+SMALL = 64 * 1024
+"""Bytes that a connection may hold in any case."""
 
 
 class StreamMessage(NamedTuple):
@@ -66,12 +73,20 @@ class MessageHandler(Protocol):
         """The last message before the server closes the connection, or None."""
 
 
-def install(max_size: int) -> None:
+@dataclass(slots=True)
+class IncompleteMessages:
+    """Received bytes of messages that are not complete or not answered yet, of all connections of this process."""
+
+    limit: int
+    held: int = 0
+
+
+def install(max_size: int, max_incomplete: int) -> None:
     """Make this the default WebSocket protocol of uvicorn servers in this process, including Ray Serve's.
 
-    max_size: maximum size of a message in bytes.
+    max_size: maximum size of a message in bytes. max_incomplete: of all incomplete messages together.
     """
-    auto.AutoWebSocketsProtocol = partial(StreamWebSocketProtocol, max_size)
+    auto.AutoWebSocketsProtocol = partial(StreamWebSocketProtocol, max_size, IncompleteMessages(max_incomplete))
 
 
 class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
@@ -80,6 +95,7 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
     def __init__(
         self,
         max_size: int,
+        incomplete: IncompleteMessages,
         config: Config,
         server_state: ServerState,
         app_state: dict[str, Any],
@@ -88,6 +104,9 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         config.ws_max_size, config.ws_per_message_deflate = max_size, False
         super().__init__(config, server_state, app_state, _loop)
         self._max_size = max_size
+        self._incomplete = incomplete
+        self._held = 0
+        """The part of `incomplete` that this connection holds."""
         self._stream: MessageHandler | None = None
         self._pending = bytearray()
         """Received data that was not processed yet: a partial frame, or messages that wait."""
@@ -118,6 +137,20 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 self.transport.pause_reading()  # until the handshake is complete: clients must not send before
         else:
             self._work(data)
+        self._count_incomplete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Release what the connection holds."""
+        super().connection_lost(exc)
+        self._pending.clear()
+        self.frames = []
+        self._count_incomplete()
+
+    def handle_cont(self, event: Frame) -> None:
+        """Handle a further frame of a fragmented message."""
+        super().handle_cont(event)
+        if len(self.frames) > MAX_FRAGMENTS:
+            self.end(TOO_BIG, f"a message has more than {MAX_FRAGMENTS} frames")
 
     def send_receive_event_to_app(self) -> None:
         """Answer a message that was fragmented, or that the library had to parse."""
@@ -262,11 +295,25 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         self._is_busy = False
         self._resume()
 
+    def _count_incomplete(self) -> None:
+        """Close the connection if incomplete messages take too much memory and it holds more than a small part."""
+        held = len(self._pending) + sum(map(len, self.frames))
+        if held == self._held:
+            return
+        self._incomplete.held += held - self._held
+        self._held = held
+        if held > SMALL and self._incomplete.held > self._incomplete.limit:
+            self.frames = []
+            self._pending.clear()
+            self.end(TRY_AGAIN_LATER, "incomplete messages take too much memory in this replica")
+            self._count_incomplete()
+
     def _resume(self) -> None:
         """Answer pending messages, then resume reading."""
         if self.transport.is_closing():
             return
         self._work(self._pending)
+        self._count_incomplete()
         if not self._is_held:
             self.transport.resume_reading()
 

@@ -140,6 +140,14 @@ def test_invalid_options_are_rejected_in_one_line(
     assert message in result.err
 
 
+def test_a_job_gets_no_password(league: League, config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LEAGUE_DATABASE_URL", "postgresql://league:secret@127.0.0.1:9/league")
+    result = league("train", str(config), "--job", "--address", "http://127.0.0.1:9")
+    assert result.code == 2
+    assert "LEAGUE_DATABASE_URL contains a password" in result.err
+    assert "secret" not in result.err
+
+
 @pytest.fixture
 def cluster() -> Iterator[str]:
     """A cluster of one machine with its own ports, as other Ray instances may be running; yields the address of its

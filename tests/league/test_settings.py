@@ -45,3 +45,16 @@ def test_several_machines_need_a_database_server_and_a_mount(url: str, artifacts
         return
     with pytest.raises(ConfigError, match=r"2 machines: set LEAGUE_DATABASE_URL .* LEAGUE_ARTIFACTS"):
         storage.check_reach({"192.0.2.1", "192.0.2.2"})
+
+
+@pytest.mark.parametrize(
+    ("url", "has_password"),
+    [
+        ("sqlite:////home/league.db", False),
+        ("postgresql://league@db/league", False),
+        ("postgresql+psycopg://league:secret@db/league", True),
+        ("postgresql://db/league?user=league&password=secret", True),
+    ],
+)
+def test_a_password_in_the_url_is_noticed(url: str, has_password: bool) -> None:
+    assert Storage(Path("/home"), url, Path("/artifacts")).has_password is has_password

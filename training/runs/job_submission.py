@@ -37,7 +37,7 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
         say: Prints a line.
 
     Raises:
-        ConfigError: There is no such cluster, or it cannot reach the storage.
+        ConfigError: There is no such cluster, it cannot reach the storage, or the database's URL has a password.
         LeagueError: The job failed.
     """
     host = urlsplit(address).hostname
@@ -45,6 +45,11 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
         raise ConfigError(f"--job: expected --address http://HOST:8265, the cluster's dashboard, got {address!r}")
     if host not in LOOPBACK:
         _check_reach(host, storage)
+    if storage.has_password:
+        raise ConfigError(
+            "--job: LEAGUE_DATABASE_URL contains a password, which Ray would show in its dashboard: leave it out, and"
+            " give the cluster's nodes a password file (PGPASSFILE)"
+        )
     silence_job_submission()
     client = _client(address)
     with tempfile.TemporaryDirectory() as directory:

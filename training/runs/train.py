@@ -1,5 +1,6 @@
 """Runs one training run: Ray Tune trains, and the driver publishes each checkpoint as a version."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from training.runs.run_reporter import RunReporter
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
 from training.runs.tune import Interrupted, cpu_share, fit, placement, run_config
 
+START = "start"
+"""In the directory of checkpoints: the state of a version that the attempt starts from."""
 NETWORK_SETTINGS = (
     *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
     *("dueling", "noisy", "distributional"),
@@ -147,17 +150,20 @@ def _publish_remaining(run: RunDirectory, publisher: PublishQueue) -> None:
     run.remove_checkpoints()
 
 
-def _start(run: RunDirectory, registry: Registry) -> StartState:
-    """Return the state to train from: the run's newest version, otherwise its parent, otherwise none."""
+def _start(run: RunDirectory, registry: Registry, private: Path) -> StartState:
+    """Return the state to train from: the run's newest version, otherwise its parent, otherwise none.
+
+    RLlib unpickles it. Therefore it is verified in a private copy, which nobody else can change in between.
+    """
     parent, league = run.record.parent, run.record.config.league
     before = registry.versions.get(league, parent).steps if parent is not None else 0
     published = published_versions(registry, run)
     if published:
-        state = registry.versions.fetch(league, published[-1].number) / TRAINING
+        state = registry.versions.copy(league, published[-1].number, TRAINING, private)
         steps, seconds = read_progress(state)
         return StartState(state, steps, before, seconds)
     if parent is not None:
-        return StartState(registry.versions.fetch(league, parent) / TRAINING, before, before, 0.0)
+        return StartState(registry.versions.copy(league, parent, TRAINING, private), before, before, 0.0)
     return FROM_SCRATCH
 
 
@@ -173,7 +179,7 @@ def _tune(
     config, attempt = run.record.config, run.next_attempt()
     (attempt / CHECKPOINTS).mkdir(parents=True)
     share = cpu_share(config.training.runners)
-    start = _start(run, registry)
+    start = _start(run, registry, attempt / CHECKPOINTS / START)
     if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
         progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
     plan = TrialPlan(start, attempt / CHECKPOINTS, attempt / STOP_FILE, registry.storage, cpus=share)
@@ -195,7 +201,10 @@ def _tune(
             run.path, [_ResultCallback(publisher, progress, reporter)], _StopOnPublishError(publisher)
         ),
     )
-    result = fit(tuner, request_stop)[0]
+    try:
+        result = fit(tuner, request_stop)[0]
+    finally:
+        shutil.rmtree(attempt / CHECKPOINTS / START, ignore_errors=True)
     if result.error is not None:
         raise training_error(result.error, config.league, attempt / "error.txt") from result.error
     return bool((result.metrics or {}).get("spent"))

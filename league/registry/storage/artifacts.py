@@ -7,7 +7,7 @@
 import hashlib
 import shutil
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from league.errors import ArtifactCorrupt
 from league.files import disk_errors, flush, move_durably
@@ -109,6 +109,26 @@ class ArtifactStore:
                 f"{manifest.league}@{manifest.version} has no file {name!r}, which its manifest names"
             )
         return self._verified(manifest.league, manifest.version, name, manifest.files[name])
+
+    def copy(self, manifest: Manifest, folder: str, target: Path) -> None:
+        """Copy the files of a folder of a version to the new directory `target`, each verified as it is copied.
+
+        What the store contains later, which others may be able to change, has no influence. Raises ArtifactCorrupt.
+        """
+        league, number = manifest.league, manifest.version
+        source = self.path(league, number)
+        with disk_errors(target):
+            target.mkdir(mode=0o700)
+        for name, digest in manifest.files.items():
+            if not name.startswith(f"{folder}/"):
+                continue
+            copied = target / PurePosixPath(name).relative_to(folder)
+            with disk_errors(copied):
+                copied.parent.mkdir(parents=True, exist_ok=True)
+                is_file = (source / name).is_file()
+                if is_file:
+                    shutil.copyfile(source / name, copied)
+                _check(_label(league, number, name), digest, _sha256(copied) if is_file else None)
 
     def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
         path = self.path(league, number) / name

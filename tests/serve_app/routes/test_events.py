@@ -100,7 +100,7 @@ def test_all_listeners_share_a_poll_and_there_is_none_without_listeners(
     with listen(server, "/v1/leagues/memory/events"):
         with ExitStack() as stack:
             listeners = [stack.enter_context(listen(server)) for _ in range(5)]
-            assert server.server.events.open == 6
+            assert server.server.events.connections.open == 6
             wait_for_polls("memory", 10)
             assert polls.count("board") <= 11
             promote(registry, "board", 2)
@@ -114,7 +114,7 @@ def test_the_number_of_listeners_is_limited(registry: Registry) -> None:
     with listening(registry.storage, SOON.model_copy(update={"max_listeners": 1})) as server:
         with listen(server), listen(server) as rejected:
             assert (rejected.reply.status_code, rejected.reply.headers["retry-after"]) == (429, "1")
-        until(lambda: server.server.events.open == 0)
+        until(lambda: server.server.events.connections.open == 0)
         with listen(server) as stream:
             assert stream.reply.status_code == 200
 
@@ -133,7 +133,7 @@ def test_an_unknown_resource_is_reported_before_a_stream_starts(
 ) -> None:
     reply = httpx.get(f"{server.url}{path}")
     assert (reply.status_code, reply.json()["code"]) == (status, code)
-    assert server.server.events.open == 0
+    assert server.server.events.connections.open == 0
 
 
 def test_a_head_request_is_answered_at_once(server: Listening) -> None:
@@ -174,7 +174,7 @@ def test_a_registry_that_does_not_respond_times_out(registry: Registry, monkeypa
         reply = httpx.get(f"{server.url}{LEAGUE}")
         answer.set()
         assert (reply.status_code, reply.json()["code"]) == (504, "deadline_exceeded")
-        assert server.server.events.open == 0
+        assert server.server.events.connections.open == 0
 
 
 def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,5 +217,5 @@ def test_closed_streams_are_removed(server: Listening) -> None:
     with ExitStack() as stack:
         for path in (LEAGUE, LEAGUE, "/v1/leagues/memory/events"):
             stack.enter_context(listen(server, path))
-        assert (server.server.events.open, server.server.events.topics) == (3, 2)
-    until(lambda: (server.server.events.open, server.server.events.topics) == (0, 0))
+        assert (server.server.events.connections.open, server.server.events.topics) == (3, 2)
+    until(lambda: (server.server.events.connections.open, server.server.events.topics) == (0, 0))

@@ -184,7 +184,7 @@ class TestUvicorn:
         for module, name in ((uvicorn_http, "AutoHTTPProtocol"), (uvicorn_websocket, "AutoWebSocketsProtocol")):
             monkeypatch.setattr(module.auto, name, getattr(module.auto, name))
         uvicorn_http.install(lambda: None)
-        uvicorn_websocket.install(1024)
+        uvicorn_websocket.install(1024, 1024)
         config = uvicorn.Config(lambda: None, log_config=None)
         config.load()
         http, websocket = config.http_protocol_class, config.ws_protocol_class

@@ -178,6 +178,35 @@ def frame(payload: bytes, first: int = 0x81, mask: bytes = b"\1\2\3\4") -> bytes
     return bytes([first]) + length + mask + bytes(byte ^ mask[at % 4] for at, byte in enumerate(payload))
 
 
+def test_a_message_of_too_many_fragments_closes_the_stream(listener: Listening) -> None:
+    raw = RawClient(listener)
+    raw.socket.sendall(frame(BODY.encode(), 0x01) + frame(b"", 0x00) * 1025)
+    assert raw.end() == 1009
+
+
+def test_incomplete_messages_have_limited_memory(storage: Storage) -> None:
+    """The stream that exceeds the limit is closed, unless it holds little; others are not affected."""
+    settings = QUICK.model_copy(update={"max_body": 2**20, "max_batch": 1024, "max_incomplete": 300_000})
+    half = frame(b" " * 200_000, 0x01)
+    with listening(storage, settings) as listener:
+        first, small, second = (RawClient(listener) for _ in range(3))
+        ping = frame(b"", 0x89)
+        for raw, part in ((first, half), (small, frame(BODY.encode(), 0x01))):
+            raw.socket.sendall(part + ping)
+            assert raw.frame() == (0x8A, b"")
+        second.socket.sendall(half)
+        assert second.end() == 1013
+        first.socket.sendall(frame(b"", 0x80))
+        assert b"malformed_body" in first.frame()[1]
+        small.socket.sendall(frame(b"", 0x80))
+        assert b"action" in small.frame()[1]
+        again = RawClient(listener)
+        again.socket.sendall(half + frame(b"", 0x80))
+        assert b"malformed_body" in again.frame()[1], "what was held is released"
+        for raw in (first, small, again):
+            raw.socket.close()
+
+
 INVALID_MESSAGE = frame(b'{"wrong": 1}' + b" " * 50)
 
 
@@ -264,7 +293,7 @@ def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
             until(lambda: answer_to(stream, BODY) and False)
         assert caught.value.rcvd is not None
         assert (caught.value.rcvd.code, "bot was revoked" in caught.value.rcvd.reason) == (1008, True)
-        until(lambda: listener.server.stream.open == 0)
+        until(lambda: listener.server.stream.connections.open == 0)
 
 
 @pytest.mark.parametrize("name", ["bot", "b" * 100])
@@ -280,7 +309,7 @@ def test_a_revoked_key_ends_an_idle_stream(registry: Registry, name: str) -> Non
             stream.recv(timeout=60)
         assert caught.value.rcvd is not None
         assert (caught.value.rcvd.code, f"{name} was" in caught.value.rcvd.reason) == (1008, True)
-        until(lambda: listener.server.stream.open == 0)
+        until(lambda: listener.server.stream.connections.open == 0)
 
 
 def test_a_draining_server_sends_a_last_message(registry: Registry) -> None:
@@ -324,7 +353,7 @@ def test_a_client_that_does_not_respond_is_disconnected(storage: Storage) -> Non
         first, payload = raw.frame()
         assert (first, payload[:2]) == (0x88, (1011).to_bytes(2, "big"))
         assert raw.file.read() == b""
-        until(lambda: listener.server.stream.open == 0)
+        until(lambda: listener.server.stream.connections.open == 0)
 
 
 def test_broken_connections_are_removed(listener: Listening) -> None:
@@ -335,4 +364,4 @@ def test_broken_connections_are_removed(listener: Listening) -> None:
         raw.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         raw.file.close()
         raw.socket.close()
-    until(lambda: listener.server.stream.open == 0)
+    until(lambda: listener.server.stream.connections.open == 0)

@@ -41,7 +41,7 @@ def listening(
     """A replica in a thread, on a local port, by default a free one. Options are those of uvicorn."""
     server = Replica(Registry.open(storage), settings, replica, evaluation_client=UnavailableEvaluation())
     uvicorn_http.install(server.events.end)
-    uvicorn_websocket.install(settings.max_body)
+    uvicorn_websocket.install(settings.max_body, settings.max_incomplete)
     config = uvicorn.Config(
         server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
     )

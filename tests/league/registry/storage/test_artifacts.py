@@ -8,6 +8,7 @@ import pytest
 
 from league.errors import ArtifactCorrupt, UnknownVersion
 from league.registry.registry import Registry
+from league.registry.storage.manifest import TRAINING
 from tests.support.leagues.registries import GRAPH, LEAGUE, publish
 
 
@@ -69,3 +70,23 @@ def test_the_first_version_of_a_league_survives_a_power_failure(
     monkeypatch.setattr(os, "fsync", lambda number: flushed.append(os.readlink(f"/proc/self/fd/{number}")))
     publish(registry, "run/1")
     assert flushed[-2:] == [str(registry.artifacts.root / LEAGUE), str(registry.artifacts.root)]
+
+
+def test_a_folder_is_copied_with_verified_files(local: Registry, tmp_path: Path) -> None:
+    version = publish(local, "run")
+    source, target = local.artifacts.path(LEAGUE, version.number), tmp_path / "copy"
+    assert local.versions.copy(LEAGUE, version.number, TRAINING, target) == target
+    names = sorted(path.relative_to(source / TRAINING) for path in (source / TRAINING).rglob("*") if path.is_file())
+    assert names
+    assert sorted(path.relative_to(target) for path in target.rglob("*") if path.is_file()) == names
+    assert all((target / name).read_bytes() == (source / TRAINING / name).read_bytes() for name in names)
+    assert target.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_changed_file_is_not_copied(local: Registry, tmp_path: Path) -> None:
+    version = publish(local, "run")
+    directory = local.artifacts.path(LEAGUE, version.number) / TRAINING
+    state = next(path for path in directory.iterdir() if path.is_file())
+    state.write_bytes(b"a pickle")
+    with pytest.raises(ArtifactCorrupt, match=r"training/.* was changed"):
+        local.versions.copy(LEAGUE, version.number, TRAINING, tmp_path / "copy")
