@@ -59,7 +59,7 @@ def lost_locks(runs: int) -> bool:
         expected = _undisturbed(_league(Path(scratch) / "quiet", postgresql.create(socket, "quiet")))
         for number in range(runs):
             registry = _league(Path(scratch) / str(number), postgresql.create(socket, f"run_{number}"))
-            changes, found = _disturbed(registry, delay=0.05 * number)
+            changes, found = _disturbed(registry, delay=0.02 * (number % 10))
             at_work += changes > 0
             unequal += found != expected
     print(f"{runs} nightly runs lost their lock: {at_work} changed something afterwards, ", end="")
@@ -90,7 +90,7 @@ def _disturbed(registry: Registry, delay: float) -> tuple[int, list[tuple[object
         time.sleep(delay)
         with registry.database.write() as session:
             session.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({HOLDERS}) AS holders"))
-        _until(lambda: bool(_holders(registry)))
+        _until(lambda: bool(_holders(registry)) or second.poll() is not None)
         os.kill(second.pid, signal.SIGSTOP)
         before = _counts(registry)
         failed = first.wait(DEADLINE) != 0

@@ -62,6 +62,8 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_USAGE_STATS_ENABLED": "0",
         # Inference in a replica uses one thread.
         "OMP_NUM_THREADS": "1",
+        # Otherwise each thread keeps buffers of messages of megabytes for the next ones.
+        "MALLOC_MMAP_THRESHOLD_": "262144",
         # Fixed by default, which would conflict with another server on this machine.
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
