@@ -183,11 +183,12 @@ class Database:
     @contextmanager
     def through(self, connection: Connection) -> Iterator[None]:
         """Use one connection for all write transactions of this thread. If it is lost, they fail from then on."""
+        previous = getattr(self._of_thread, "connection", None)
         self._of_thread.connection = connection
         try:
             yield
         finally:
-            self._of_thread.connection = None
+            self._of_thread.connection = previous
 
     def _write_through(self) -> Engine | Connection:
         connection: Connection | None = getattr(self._of_thread, "connection", None)

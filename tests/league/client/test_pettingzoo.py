@@ -183,6 +183,7 @@ def test_a_promotion_during_an_episode_changes_no_player(client: Client, registr
             until(lambda seen=seen: client.act("tictactoe", seen).version == 2)
         steps.append(step)
     promote(registry, "tictactoe", 1)
+    registry.changes.wait_for_alias(registry.aliases.history("tictactoe")[0], 30)
     assert {step.response.version for step in steps if step.response} == {1}
 
 

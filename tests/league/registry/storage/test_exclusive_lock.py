@@ -81,6 +81,17 @@ def test_a_transaction_during_which_the_lock_is_lost_is_rolled_back(registry: Re
     assert champion(other) == 1
 
 
+def test_an_inner_lock_does_not_release_the_outer_one(registry: Registry) -> None:
+    other = Registry.open(registry.storage)
+    with registry.exclusive_lock("nightly"):
+        with registry.exclusive_lock("snapshots"):
+            promote(registry, 1)
+        terminate_holder(other)
+        with pytest.raises(StorageError):
+            promote(registry, 2)
+    assert champion(other) == 1
+
+
 def test_other_threads_are_unaffected(registry: Registry) -> None:
     other = Registry.open(registry.storage)
     with registry.exclusive_lock("nightly"):
