@@ -40,7 +40,7 @@ def leaves(dtype: str, rows: int) -> st.SearchStrategy[np.ndarray]:
 
 @st.composite
 def request_data(draw: st.DrawFn) -> dict[str, Any]:
-    rows = draw(st.integers(1, 5))
+    rows = draw(st.integers(1, 3))
     return {
         "rows": rows,
         "seed": draw(st.none() | st.integers(0, 2**63 - 1)),
