@@ -156,13 +156,12 @@ def decode_state(
     return read_state(request.state, policy.state, len(request.observations))
 
 
-async def read_observations(request: DecodedActionRequest, policy: LoadedPolicy, quotes: int, size: int) -> Arrays:
-    """Decode the observations, in a thread if the body is large. quotes, size: quotation marks and bytes of the body.
+async def read_observations(request: DecodedActionRequest, policy: LoadedPolicy, plain: bool, size: int) -> Arrays:
+    """Decode the observations, in a thread if the body is large. plain: see `is_plain`. size: bytes of the body.
 
     Raises ObservationError, IllegalMask or BodyTooLarge.
     """
     policy.limits.check_size(size, len(request.observations))
-    plain = is_plain(request, policy, quotes)
     if size <= LARGE_BODY:
         return policy.reader.read(request.observations, plain)
     return await asyncio.to_thread(policy.reader.read, request.observations, plain)

@@ -32,6 +32,7 @@ from serve_app.inference.action_request import (
     execute,
     execute_request,
     generators,
+    is_plain,
     parse_action_request,
     parse_flag,
     pinned_version,
@@ -156,8 +157,8 @@ class StreamSession:
             raise InvalidState("state is an object, expected a token: streams do not accept arrays")
         is_anew = reset is True or ("state" in document and document["state"] is None)
         served, state = await self._select(request, is_anew, _resets(reset, request))
-        quotes = data.count(b'"') - 2 * len(own)
-        observations = await read_observations(request, served.policy, quotes, len(data))
+        plain = is_plain(request, served.policy, data.count(b'"') - 2 * len(own))
+        observations = await read_observations(request, served.policy, plain, len(data))
         answer = await execute_request(request, served.policy, observations, state)
         self._mirror(served, observations, state, None if request.explore else answer.actions)
         self._store_state(served, answer, request.is_batch)

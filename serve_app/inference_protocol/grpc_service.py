@@ -38,8 +38,8 @@ CONTENTS = {
 """Field with the elements of a datatype if they are not sent as bytes. FP16 has none."""
 
 
-def read_request(request: messages.ModelInferRequest) -> InferRequest:
-    """Convert a message to a request. Raises InvalidInput."""
+def read_request(request: messages.ModelInferRequest, size: int) -> InferRequest:
+    """Convert a message of `size` bytes to a request. Raises InvalidInput."""
     for tensor in (*request.inputs, *request.outputs):
         for name in UNSUPPORTED:
             if name in tensor.parameters:
@@ -54,7 +54,7 @@ def read_request(request: messages.ModelInferRequest) -> InferRequest:
         id=request.id,
         inputs=[_tensor(tensor, raw_inputs[i] if raw_inputs else None) for i, tensor in enumerate(request.inputs)],
         outputs=[output.name for output in request.outputs],
-        size=request.ByteSize(),
+        size=size,
         is_sequence=sequence is not None and bool(sequence.int64_param or sequence.string_param),
     )
 
@@ -152,7 +152,7 @@ class InferenceService:
             if is_too_large:
                 raise BodyTooLarge(f"the message is larger than {limit} bytes")
             if rpc == INFER:
-                return await self._model_infer(request, headers_of(metadata))
+                return await self._model_infer(request, size, headers_of(metadata))
             return await self.rpcs[rpc](request)
         except LeagueError as error:
             self._count(f"/v2/models/{model}", error.code)
@@ -190,9 +190,9 @@ class InferenceService:
         models = await self._catalogue.index(request.ready)
         return _message({"models": models}, messages.RepositoryIndexResponse())
 
-    async def _model_infer(self, request: messages.ModelInferRequest, headers: Headers) -> Message:
+    async def _model_infer(self, request: messages.ModelInferRequest, size: int, headers: Headers) -> Message:
         with self._inference.admitted():
-            return await self._inference.infer(read_request(request), write_response, headers)
+            return await self._inference.infer(read_request(request, size), write_response, headers)
 
 
 def _message(document: Document, empty: Message) -> Message:

@@ -11,13 +11,14 @@ of all its files.
 """
 
 import asyncio
+from contextlib import suppress
 from time import perf_counter_ns
 from typing import Any
 
 import orjson
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import Overloaded
+from league.errors import NotReady, Overloaded
 from league.refs import CHAMPION
 from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.access_log import LOG_ENTRY, log_version
@@ -87,7 +88,7 @@ class ActionRoute:
         model, requested = scope["path_params"]["model"], parsing.query_params(scope).get("version", CHAMPION)
         if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
             self._access.admit_body(scope.get(KEY), len(body))
-        document = await self._parse_large(scope, body, model, requested) if is_large else parse_json_object(body)
+        document = await self._parse_large(body, model, requested) if is_large else parse_json_object(body)
         reject_unknown_keys(document, KEYS)
         request = parse_action_request(document, self._settings.max_batch)
         requested = pinned_version(request, model, requested)
@@ -99,10 +100,11 @@ class ActionRoute:
         await _send(send, orjson.dumps(response), self._replica)
         self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - begun)
 
-    async def _parse_large(self, scope: Scope, body: bytes, model: str, requested: str) -> dict[str, Any]:
+    async def _parse_large(self, body: bytes, model: str, requested: str) -> dict[str, Any]:
         """Parse a body in a thread, unless it is too large for the policy."""
-        _, policy = await self._models.find(model, requested, scope["headers"])
-        policy.limits.check_body(body, self._settings.max_batch)
+        with suppress(NotReady):  # without a champion, a token in the body may name the version
+            _, policy = await self._models.find(model, requested)
+            policy.limits.check_body(body, self._settings.max_batch)
         return await asyncio.to_thread(parse_json_object, body)
 
 
@@ -132,9 +134,9 @@ async def _response(
     policy: LoadedPolicy,
     mirror: MirrorFunction | None,
 ) -> dict[str, Any]:
-    quotes = body.count(b'"')
-    observations = await read_observations(request, policy, quotes, len(body))
-    state = decode_state(request, version, policy, not is_plain(request, policy, quotes))
+    plain = is_plain(request, policy, body.count(b'"'))
+    observations = await read_observations(request, policy, plain, len(body))
+    state = decode_state(request, version, policy, not plain)
     output = await execute_request(request, policy, observations, state)
     if mirror is not None:
         mirror(observations, state, None if request.explore else output.actions)

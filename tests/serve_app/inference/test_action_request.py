@@ -1,5 +1,6 @@
 """Encodings and options of action requests: base64, images, probabilities, state tokens."""
 
+import json
 import shutil
 from base64 import b64encode
 from collections.abc import Iterator
@@ -13,9 +14,10 @@ from starlette.testclient import TestClient
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.codecs.request_limits import LARGE_BODY
 from tests.support.clients.actions import BOARD, act, boards, rejected
 from tests.support.leagues.protocol_leagues import DTYPES, FRAME, every_kind
-from tests.support.leagues.served_leagues import build_everything, promote, publish
+from tests.support.leagues.served_leagues import MEMORY, build_everything, promote, publish, register
 from tests.support.pictures import png
 from tests.support.policies.graphs import counting, masked_mlp
 from tests.support.servers.replicas import QUICK, replica
@@ -246,3 +248,18 @@ def test_a_policy_without_state_accepts_no_token(read_only_client: TestClient) -
 def test_the_number_of_query_parameters_is_limited(read_only_client: TestClient) -> None:
     error = rejected(read_only_client, {"observation": BOARD}, params=[("a", "1")] * 17)
     assert (error["code"], "more than 16" in error["message"]) == ("invalid_input", True)
+
+
+def test_a_large_request_without_a_champion_is_answered_if_a_token_names_the_version(registry: Registry) -> None:
+    """Its episode began with a version by number."""
+    settings = QUICK.model_copy(update={"max_body": 2**20, "max_batch": 1024})
+    register(registry, "unpromoted", {"shared": MEMORY})
+    publish(registry, "unpromoted", {"shared": counting()}, "run")
+    with replica(registry.storage, settings) as client:
+        path, rows = "/v1/policies/unpromoted/action", 512
+        body = {"observations": [[0]] * rows}
+        begun = client.post(f"{path}?version=1", json=body)
+        assert begun.status_code == 200, begun.text
+        content = json.dumps(body | {"state": begun.json()["state"]}).encode()
+        assert len(content) > LARGE_BODY
+        assert client.post(path, content=content).status_code == 200
