@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from cli import doctor
 from tests.support.command import League
 
 
@@ -15,7 +16,8 @@ def test_all_checks_of_doctor_pass(league_process: League) -> None:
     assert result.code == 0
 
 
-def test_doctor_explains_a_broken_home(league: League, home: Path) -> None:
+def test_doctor_explains_a_broken_home(league: League, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", (doctor._home, doctor._registry))
     home.mkdir()
     (home / "league.db").write_text("no database")
     document = league("doctor", "--json").json

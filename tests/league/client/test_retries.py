@@ -77,7 +77,7 @@ def server() -> Iterator[Server]:
     server = Server()
     listener = ThreadingHTTPServer(("127.0.0.1", 0), server.handler())
     server.url = f"http://127.0.0.1:{listener.server_port}"  # type: ignore[attr-defined]
-    thread = threading.Thread(target=listener.serve_forever, daemon=True)
+    thread = threading.Thread(target=listener.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
     thread.start()
     yield server
     server.is_over.set()

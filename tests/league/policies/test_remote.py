@@ -68,7 +68,7 @@ def url(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     for collection in (Handler.responses, Handler.requests, Handler.connections):
         collection.clear()
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}"
     server.shutdown()

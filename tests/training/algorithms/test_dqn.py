@@ -51,14 +51,11 @@ def returns(_: OffPolicy, result: dict[str, Any]) -> dict[str, float]:
     return result[ENV_RUNNER_RESULTS][EPISODE_MODULE_RETURN_MEAN]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [
-        pytest.param({}, marks=pytest.mark.slow, id="plain"),
-        pytest.param({"double": False, "dueling": False}, marks=pytest.mark.slow, id="single"),
-        pytest.param(ALL_EXTENSIONS, id="all extensions"),
-        pytest.param({"target_every": 1, "target_rate": 0.02}, marks=pytest.mark.slow, id="Polyak"),
-    ],
+    [{}, {"double": False, "dueling": False}, ALL_EXTENSIONS, {"target_every": 1, "target_rate": 0.02}],
+    ids=["plain", "single", "all extensions", "Polyak"],
 )
 def test_dqn_learns(settings: dict[str, Any]) -> None:
     assert train(solvable_by_dqn("discrete", **settings), 9, returns)["shared"] > 0.9 * ROUNDS
@@ -104,6 +101,7 @@ def test_values_bootstrap_truncation_and_ignore_illegal_actions(n_step: int) -> 
     check_values(n_step)
 
 
+@pytest.mark.slow
 def test_the_check_detects_truncation_treated_as_termination(monkeypatch: pytest.MonkeyPatch) -> None:
     cut = PolicyTransitions.cut
 
@@ -118,6 +116,7 @@ def test_the_check_detects_truncation_treated_as_termination(monkeypatch: pytest
         check_values()
 
 
+@pytest.mark.slow
 def test_the_check_detects_targets_without_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "next_actions", lambda online, target, _: next_actions(online, target, None))
     with pytest.raises(AssertionError):

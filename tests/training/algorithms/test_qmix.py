@@ -75,9 +75,8 @@ def test_additive_and_independent_values_choose_the_safe_game(mixer: str) -> Non
     assert learned.error(gamma=0.99) > 1
 
 
-@pytest.mark.parametrize(
-    "mixer", ["qmix", pytest.param("vdn", marks=pytest.mark.slow), pytest.param("none", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("mixer", ["qmix", "vdn", "none"])
 def test_agents_of_a_team_with_separate_networks_learn(mixer: str) -> None:
     policies = {"a": ["player_0"], "b": ["player_1"]}
     means = train(qmix_league("discrete", {"agents": 2}, policies, mixer=mixer), 14, returns)
@@ -159,6 +158,7 @@ def test_values_bootstrap_truncation_and_ignore_illegal_actions(settings: dict[s
     check_values(**settings)
 
 
+@pytest.mark.slow
 def test_the_check_detects_truncation_treated_as_termination(monkeypatch: pytest.MonkeyPatch) -> None:
     cut = JointTransitions.cut
 
@@ -173,13 +173,18 @@ def test_the_check_detects_truncation_treated_as_termination(monkeypatch: pytest
         check_values()
 
 
+@pytest.mark.slow
 def test_the_check_detects_targets_without_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "next_actions", lambda online, target, _: next_actions(online, target, None))
     with pytest.raises(AssertionError):
         check_values()
 
 
-@pytest.mark.parametrize("settings", [{"normalize_observations": True}, MEMORY], ids=["normalised", "memory"])
+@pytest.mark.parametrize(
+    "settings",
+    [{"normalize_observations": True}, pytest.param(MEMORY, marks=pytest.mark.slow)],
+    ids=["normalised", "memory"],
+)
 def test_a_restored_algorithm_continues_identically(settings: dict[str, Any], tmp_path: Path) -> None:
     """Compares an algorithm that continues after its checkpoint with a restored one: agents, mixers, targets and
     buffer.

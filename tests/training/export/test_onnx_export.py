@@ -193,7 +193,17 @@ LEAGUES = {
 }
 
 
-@pytest.mark.parametrize("league", LEAGUES.values(), ids=LEAGUES.keys())
+COVERED_BY_OTHERS = ("multi", "box", "memory")
+"""Kinds whose parts are all in `shared encoder`, `simultaneous box memory` and `masked memory`."""
+
+
+@pytest.mark.parametrize(
+    "league",
+    [
+        pytest.param(league, id=kind, marks=[pytest.mark.slow] if kind in COVERED_BY_OTHERS else [])
+        for kind, league in LEAGUES.items()
+    ],
+)
 def test_each_kind_of_policy_equals_its_module(league: LeagueConfig, tmp_path: Path) -> None:
     interface_of_league, modules = modules_of(league)
     observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)

@@ -200,23 +200,27 @@ def test_continued_training_requires_the_same_network(trained: Trained) -> None:
     check_network(dataclasses.replace(version, manifest=manifest), tictactoe())
 
 
+RAISED = ("league faulty", "ZeroDivisionError: division by zero", "faulty.py:13", "attempt-1/error.txt")
+
+
 @pytest.mark.usefixtures("ray_session")
 @pytest.mark.parametrize(
-    ("entry_point", "messages"),
+    ("entry_point", "runners", "messages"),
     [
-        ("raising", ("league faulty", "ZeroDivisionError: division by zero", "faulty.py:13", "attempt-1/error.txt")),
-        pytest.param("unrewarding", ("faulty", "player_1", "nan"), marks=pytest.mark.slow),
+        ("raising", 0, RAISED),
+        pytest.param("raising", 1, RAISED, marks=pytest.mark.slow),
+        pytest.param("unrewarding", 1, ("faulty", "player_1", "nan"), marks=pytest.mark.slow),
     ],
 )
 def test_a_fault_of_the_environment_in_a_runner_is_one_sentence(
-    registry: Registry, entry_point: str, messages: tuple[str, ...]
+    registry: Registry, entry_point: str, runners: int, messages: tuple[str, ...]
 ) -> None:
     league = LeagueConfig.from_mapping(
         {
             "league": "faulty",
             "environment": {"entry_point": f"tests.support.environments.faulty:{entry_point}"},
             "policies": {"first": ["player_0"], "second": ["player_1"]},
-            "training": {"runners": 1, "num_envs": 2, "hidden": [8], "crashes": 1},
+            "training": {"runners": runners, "num_envs": 2, "hidden": [8], "crashes": 1},
         }
     )
     with pytest.raises(LeagueError) as raised:
