@@ -8,12 +8,24 @@ PROCESSES ?= 2
 .PHONY: setup demo test test-slow check fix bench docs generate protocol clean
 .DEFAULT_GOAL := setup
 
+# LOCKED=1 installs the files of requirements/ and no others: Linux on x86-64 only.
 setup: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml constraints.txt
+LOCK := requirements/linux-x86_64
+HASHED := $(BIN)/python -m pip install --quiet --require-hashes --no-deps
+
+$(INSTALLED): pyproject.toml constraints.txt $(wildcard requirements/*.txt)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Policy League needs Python 3.11 or newer: make PYTHON=python3.11 …")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+ifdef LOCKED
+	$(HASHED) --requirement $(LOCK)-build.txt
+	$(HASHED) --no-build-isolation --requirement $(LOCK).txt
+	$(HASHED) --requirement $(LOCK)-cpu.txt || $(HASHED) --requirement $(LOCK)-cuda.txt
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m pip check
+else
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,docs,environments]"
+endif
 	@touch $@
 
 demo: setup

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from packaging.utils import canonicalize_name
 
 from serve_app.observability.prometheus import METRICS
 from serve_app.settings import ServeSettings
@@ -232,3 +233,34 @@ def test_the_container_images_have_the_deployed_tags() -> None:
     assert PROJECT["version"] in HEAD["spec"]["containers"][0]["image"]
     assert set(re.findall(r"^FROM \S+ AS (\w+)$", dockerfile, flags=re.M)) >= {"server", "trainer"}
     assert re.search(r"^USER 1000:1000$", dockerfile, flags=re.M), "Kubernetes checks that the user is not root"
+
+
+def locked(*names: str) -> dict[str, tuple[str, list[str]]]:
+    """Package → its version and digests in these lock files."""
+    pins = {}
+    for name in names:
+        text = (ROOT / "requirements" / f"linux-x86_64{name}.txt").read_text().replace("\\\n", "")
+        for line in text.splitlines():
+            if not line.startswith("#"):
+                pin, *hashes = line.split()
+                package, _, version = pin.partition("==")
+                pins[package] = version, hashes
+    return pins
+
+
+@pytest.mark.parametrize("torch", ["-cpu", "-cuda"])
+def test_the_lock_files_have_digests_of_all_pins(torch: str) -> None:
+    found = locked("-build", "", torch)
+    pinned = (line.partition("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if line[0] != "#")
+    pins = {canonicalize_name(package): version for package, _, version in pinned}
+    assert {package: found[package][0].partition("+")[0] for package in pins} == pins
+    assert all(package.startswith(("nvidia-", "cuda-", "triton")) for package in found.keys() - pins.keys())
+    for version, hashes in found.values():
+        assert version
+        assert hashes
+        assert all(re.fullmatch("--hash=sha256:[0-9a-f]{64}", each) for each in hashes)
+
+
+def test_packages_are_built_with_the_pinned_setuptools() -> None:
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    assert required == [f"setuptools=={locked('-build')['setuptools'][0]}"]

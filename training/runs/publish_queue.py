@@ -11,6 +11,7 @@ from league.interface import Interface
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from training.export.publish import Checkpoint, publish
+from training.runs.checkpoint_digests import private_copy
 from training.runs.progress import TrainingProgress
 from training.runs.run_directory import RunDirectory
 
@@ -56,15 +57,17 @@ class PublishQueue:
 
     def _publish(self, path: Path) -> None:
         before = published_versions(self._registry, self._run)
+        copy = private_copy(path, path.with_name(f"{path.name}.copy"))
         row = publish(
-            Checkpoint(path, source=f"{self._run.id}/{path.name}", steps=int(path.name)),
+            Checkpoint(copy, source=f"{self._run.id}/{path.name}", steps=int(path.name)),
             registry=self._registry,
             config=self._run.record.config,
             interface=self._interface,
             parent=before[-1].number if before else self._run.record.parent,
             git_commit=self._run.record.git_commit,
         )
-        shutil.rmtree(path)
+        for directory in (path, copy):
+            shutil.rmtree(directory)
         self._progress.published(row)
 
 

@@ -5,7 +5,8 @@
     lock                held while a driver works on the run
     attempt-<n>/        Tune's trial and its TensorBoard files; a new attempt at each start
         stop                created to request that the trial saves and ends
-        checkpoints/<steps>/    RLlib's state, until it is published
+        checkpoints/<steps>/    RLlib's state with its digests, until it is published
+        checkpoints/start/      a verified copy of the version that the attempt started from
 """
 
 import json
@@ -77,6 +78,8 @@ def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
 RUN_FILE = "run.json"
 ATTEMPT = "attempt-"
 CHECKPOINTS = "checkpoints"
+START = "start"
+"""In the directory of checkpoints: a private, verified copy of the state that training starts from."""
 STOP_FILE = "stop"
 RESUMABLE_SETTINGS = {
     "steps",

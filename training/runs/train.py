@@ -25,13 +25,11 @@ from training.rllib_compat import NotPickled, silence_tune
 from training.runs.error_messages import training_error
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
-from training.runs.run_directory import CHECKPOINTS, STOP_FILE, RunDirectory, pin_opponents
+from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, pin_opponents
 from training.runs.run_reporter import RunReporter
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
 from training.runs.tune import Interrupted, cpu_share, fit, placement, run_config
 
-START = "start"
-"""In the directory of checkpoints: the state of a version that the attempt starts from."""
 NETWORK_SETTINGS = (
     *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
     *("dueling", "noisy", "distributional"),

@@ -28,6 +28,7 @@ from league.settings import Storage
 from training.algorithms.metrics import CHECKPOINT_TIME, gpu_use, time_each_update, totals, training_metrics
 from training.algorithms.setup import algorithm_config
 from training.rllib_compat import wait_for_runners
+from training.runs.checkpoint_digests import write_digests
 
 REPORT_SECONDS = 2.0
 """Interval between a trial's reports, in seconds."""
@@ -150,6 +151,7 @@ class Trial(tune.Trainable):
         self.algorithm.save_to_path(str(draft))
         progress = {"steps": self.steps, "seconds": self.seconds}
         (draft / PROGRESS_FILE).write_text(json.dumps(progress))
+        write_digests(draft)
         move_durably(draft, target)
         self.saved_steps = self.steps
         self._plan_checkpoint()

@@ -26,8 +26,9 @@ from league.registry.storage.rows import VersionRow
 from training.algorithms import metrics
 from training.export.publish import Checkpoint, git_commit, publish
 from training.rllib_compat import silence_tune
+from training.runs.checkpoint_digests import private_copy
 from training.runs.error_messages import training_error
-from training.runs.run_directory import CHECKPOINTS, pin_opponents
+from training.runs.run_directory import CHECKPOINTS, START, pin_opponents
 from training.runs.train import check
 from training.runs.trial import FROM_SCRATCH, MAX_THREADS, StartState, TrialPlan, read_progress
 from training.runs.tune import cpu_share, fit, placement, run_config
@@ -206,8 +207,9 @@ def _plan(sweep: SweepDirectory, number: int, registry: Registry, share: float, 
     checkpoints.mkdir(parents=True, exist_ok=True)
     start, newest = FROM_SCRATCH, sweep.checkpoint(number)
     if newest is not None:
-        steps, seconds = read_progress(newest)
-        start = StartState(newest, steps, 0, seconds)
+        state = private_copy(newest, checkpoints / START)
+        steps, seconds = read_progress(state)
+        start = StartState(state, steps, 0, seconds)
     return TrialPlan(start, checkpoints, sweep.stop_file, registry.storage, cpus=share, threads=threads)
 
 
@@ -242,10 +244,9 @@ def _best(trials: list[TrialReport], settings: SweepConfig) -> TrialReport | Non
 def _publish(sweep: SweepDirectory, number: int, interface: Interface, registry: Registry) -> VersionRow:
     checkpoint = sweep.checkpoint(number)
     assert checkpoint is not None, "a trial that spent its budget has saved"
+    copy = private_copy(checkpoint, checkpoint.with_name(f"{checkpoint.name}.copy"))
     return publish(
-        Checkpoint(
-            checkpoint, source=f"{sweep.id}/{sweep.trial(number).name}/{checkpoint.name}", steps=int(checkpoint.name)
-        ),
+        Checkpoint(copy, source=f"{sweep.id}/{sweep.trial(number).name}/{checkpoint.name}", steps=int(checkpoint.name)),
         registry=registry,
         config=sweep.league(number),
         interface=interface,

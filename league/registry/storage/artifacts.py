@@ -9,6 +9,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
+from league.digests import check_digest, copy_verified, file_sha256, files, of_files
 from league.errors import ArtifactCorrupt
 from league.files import disk_errors, flush, move_durably
 from league.registry.storage.manifest import MANIFEST, Manifest
@@ -51,7 +52,7 @@ class ArtifactStore:
         staging = self._staging(manifest.league, manifest.version)
         target = self.path(manifest.league, manifest.version)
         with disk_errors(target):
-            digests = {name: _sha256(staging / name) for name in _files(staging) if name != MANIFEST}
+            digests = of_files(staging, (name for name in files(staging) if name != MANIFEST))
             text = manifest.model_copy(update={"files": digests}).to_json()
             (staging / MANIFEST).write_text(text, encoding="utf-8")
             move_durably(staging, target)
@@ -80,7 +81,7 @@ class ArtifactStore:
             for name, digest in manifest.files.items():
                 path = directory / name
                 # Reading a pipe or a device, which a link may point to, would not end.
-                _check(_label(league, number, name), digest, _sha256(path) if path.is_file() else None)
+                check_digest(_label(league, number, name), digest, file_sha256(path) if path.is_file() else None)
         return directory
 
     def verify_names(self, league: str, number: int, sha256: str) -> Manifest:
@@ -90,11 +91,11 @@ class ArtifactStore:
         """
         directory, manifest = self.path(league, number), self.manifest(league, number, sha256)
         with disk_errors(directory):
-            present = set(_files(directory)) - {MANIFEST}
+            present = set(files(directory)) - {MANIFEST}
         for name in sorted(present - set(manifest.files)):
             raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
         for name in sorted(set(manifest.files) - present):
-            _check(_label(league, number, name), manifest.files[name], None)
+            check_digest(_label(league, number, name), manifest.files[name], None)
         return manifest
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
@@ -115,26 +116,21 @@ class ArtifactStore:
 
         What the store contains later, which others may be able to change, has no influence. Raises ArtifactCorrupt.
         """
-        league, number = manifest.league, manifest.version
-        source = self.path(league, number)
-        with disk_errors(target):
-            target.mkdir(mode=0o700)
-        for name, digest in manifest.files.items():
-            if not name.startswith(f"{folder}/"):
-                continue
-            copied = target / PurePosixPath(name).relative_to(folder)
-            with disk_errors(copied):
-                copied.parent.mkdir(parents=True, exist_ok=True)
-                is_file = (source / name).is_file()
-                if is_file:
-                    shutil.copyfile(source / name, copied)
-                _check(_label(league, number, name), digest, _sha256(copied) if is_file else None)
+        names = {
+            PurePosixPath(name).relative_to(folder).as_posix(): digest
+            for name, digest in manifest.files.items()
+            if name.startswith(f"{folder}/")
+        }
+        source = self.path(manifest.league, manifest.version) / folder
+        copy_verified(source, names, target, _label(manifest.league, manifest.version, folder))
 
     def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
         path = self.path(league, number) / name
         with disk_errors(path):
             content = path.read_bytes() if path.is_file() else None
-        _check(_label(league, number, name), digest, None if content is None else hashlib.sha256(content).hexdigest())
+        check_digest(
+            _label(league, number, name), digest, None if content is None else hashlib.sha256(content).hexdigest()
+        )
         assert content is not None
         return content
 
@@ -142,24 +138,6 @@ class ArtifactStore:
         return self.root / league / f"{STAGING}{number}"
 
 
-def _files(directory: Path) -> list[str]:
-    """Relative paths of all files in `directory`. A symbolic link counts as a file."""
-    found = [path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir()]
-    return sorted(path.relative_to(directory).as_posix() for path in found)
-
-
 def _label(league: str, number: int, name: str) -> str:
     """A file as messages name it: callers on other machines need not know where the store is."""
     return f"{league}/{number}/{name}"
-
-
-def _check(name: str, expected: str, found: str | None) -> None:
-    if found is None:
-        raise ArtifactCorrupt(f"{name} is missing or not a regular file")
-    if found != expected:
-        raise ArtifactCorrupt(f"{name} was changed: its SHA-256 is {found[:12]}…, expected {expected[:12]}…")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

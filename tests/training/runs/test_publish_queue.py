@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
+from league.errors import ArtifactCorrupt
 from training.runs import publish_queue
+from training.runs.checkpoint_digests import write_digests
 from training.runs.publish_queue import PublishQueue
 
 
@@ -36,6 +38,8 @@ def checkpoints(directory: Path, *steps: int) -> list[Path]:
     paths = [directory / str(number) for number in steps]
     for path in paths:
         path.mkdir()
+        (path / "state.pkl").write_bytes(b"weights")
+        write_digests(path)
     return paths
 
 
@@ -56,3 +60,12 @@ def test_nothing_is_published_after_a_failure(published: list[Any], tmp_path: Pa
         queue.join()
     assert [version.steps for version in published] == [512]
     assert [path.exists() for path in paths] == [False, True, True], "later checkpoints remain on disk"
+
+
+def test_a_damaged_checkpoint_is_not_published(published: list[Any], tmp_path: Path) -> None:
+    paths, queue = checkpoints(tmp_path, 512), queue_of()
+    (paths[0] / "state.pkl").write_bytes(b"weight5")
+    queue.add(paths[0])
+    with pytest.raises(ArtifactCorrupt, match=r"512/state\.pkl was changed"):
+        queue.join()
+    assert published == []
