@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -19,6 +20,8 @@ from league.stack import VERIFIED, installed
 GIGABYTE = 10**9
 MINIMUM_DISK = 2 * GIGABYTE
 """A training run stores a few hundred MB of checkpoints, and Ray spills objects to disk."""
+LOW_SHARE = 0.1
+"""Share of a disk that should be free, as in the alert LeagueDiskFull."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +108,20 @@ def _home() -> Iterator[Check]:
         str(storage.home),
         "" if writable else "set LEAGUE_HOME to a writable directory",
     )
-    free = shutil.disk_usage(existing).free
-    enough = free >= MINIMUM_DISK
-    advice = "" if enough else f"free {MINIMUM_DISK / GIGABYTE:.0f} GB, or set LEAGUE_HOME to another disk"
-    yield Check("disk", "ok" if enough else "fail", f"{free / GIGABYTE:.1f} GB free", advice)
+    yield _disk("disk", existing, "LEAGUE_HOME")
+    store = next(path for path in (storage.artifacts, *storage.artifacts.parents) if path.exists())
+    if store.stat().st_dev != existing.stat().st_dev:
+        yield _disk("disk of artefacts", store, "LEAGUE_ARTIFACTS")
+
+
+def _disk(what: str, path: Path, variable: str) -> Check:
+    disk = shutil.disk_usage(path)
+    found = f"{disk.free / GIGABYTE:.1f} GB free"
+    if disk.free < MINIMUM_DISK:
+        advice = f"free {MINIMUM_DISK / GIGABYTE:.0f} GB with `league retire`, or set {variable} to another disk"
+        return Check(what, "fail", found, advice)
+    is_low = disk.free < LOW_SHARE * (disk.used + disk.free)
+    return Check(what, "note" if is_low else "ok", found, "`league retire` removes old files" if is_low else "")
 
 
 def _registry() -> Iterator[Check]:

@@ -41,7 +41,7 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
         [
             (
                 row.number,
-                ", ".join(row.aliases),
+                ", ".join(row.aliases) if row.retired_at is None else "retired",
                 elo(document["rating"], document["interval"]),
                 document["games"],
                 row.steps,
@@ -76,6 +76,7 @@ def _document(row: "VersionRow", standing: Any) -> dict[str, Any]:
         "parent": row.parent,
         "sha256": row.sha256,
         "created_at": row.created_at,
+        "retired_at": row.retired_at,
         "note": row.note and asdict(row.note),
     }
 

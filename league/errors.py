@@ -75,7 +75,7 @@ class UnknownVersion(NotFound, code="unknown_version"):
 
 
 class VersionRetired(NotFound, code="version_retired"):
-    """A version is not served any more; episodes that are pinned to it cannot continue."""
+    """The files of a version were removed; episodes that are pinned to it cannot continue."""
 
 
 class UnknownAlias(NotFound, code="unknown_alias"):

@@ -113,9 +113,10 @@ def check_plays(ref: ScriptRef, interface: Interface) -> None:
 
 
 def eligible(registry: Registry, league: str) -> list[VersionRow]:
-    """Return the versions trained in the league's current environment. Raises UnknownLeague."""
+    """Return the versions trained in the league's current environment, except retired ones. Raises UnknownLeague."""
     now = registry.leagues.get(league).config.environment.digest()
-    return [version for version in registry.versions.all(league) if version.manifest.environment_digest == now]
+    present = (version for version in registry.versions.all(league) if version.retired_at is None)
+    return [version for version in present if version.manifest.environment_digest == now]
 
 
 def check_eligible(ref: str, registry: Registry, config: LeagueConfig) -> None:

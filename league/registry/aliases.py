@@ -142,7 +142,7 @@ def _set(
 ) -> AliasEvent:
     if verdict is not None:
         verdicts.require_open(session, verdict)
-    versions.require(session, league, version)
+    versions.require_files(session, league, version)
     last = _in_force(session, league, alias)
     _require(last, league, alias, expected)
     if last and last.version == version:

@@ -11,6 +11,7 @@ from league.registry.keys import KeyRepository
 from league.registry.leagues import LeagueRepository
 from league.registry.publishing import VersionPublisher
 from league.registry.replicas import ReplicaRepository
+from league.registry.retention import RetentionRepository
 from league.registry.runs import RunRepository
 from league.registry.snapshots import SnapshotRepository
 from league.registry.storage import exclusive_lock
@@ -35,6 +36,7 @@ class Registry:
         self.artifacts = ArtifactStore(storage.artifacts)
         self.leagues = LeagueRepository(database)
         self.versions = VersionRepository(database, self.artifacts)
+        self.retention = RetentionRepository(database, self.artifacts)
         self.publisher = VersionPublisher(database, self.artifacts)
         self.aliases = AliasRepository(database)
         self.traffic = TrafficRepository(database)

@@ -68,7 +68,7 @@ class TrafficRepository(Repository):
     def current(self, league: str) -> Traffic:
         """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
         with self._database.read() as session:
-            return _current(session, league)
+            return current_setting(session, league)
 
     def all(self) -> dict[str, Traffic]:
         """Return league → its setting in force, of the leagues that have one, by one cheap query."""
@@ -114,7 +114,7 @@ def _set(
     actor: str,
     reason: str,
 ) -> Traffic:
-    now = _current(session, league)
+    now = current_setting(session, league)
     wanted = tuple(
         before if portion is KEEP else portion for portion, before in ((canary, now.canary), (shadow, now.shadow))
     )
@@ -132,7 +132,8 @@ def _set(
     return _row(event)
 
 
-def _current(session: Session, league: str) -> Traffic:
+def current_setting(session: Session, league: str) -> Traffic:
+    """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
     leagues.require(session, league)
     query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc()).limit(1)
     event = session.scalar(query)
@@ -144,7 +145,8 @@ def _check(session: Session, league: str, portion: Portion) -> None:
         raise InvalidInput(f"a canary or shadow is compared with the {CHAMPION}: it must be another version")
     if not 0 <= portion.share <= 1:
         raise InvalidInput(f"share {portion.share:g} must be from 0 to 1")
-    versions.resolve(session, CheckpointRef(league, portion.version))
+    version = versions.resolve(session, CheckpointRef(league, portion.version))
+    versions.require_files(session, league, version.number)
 
 
 def _row(event: TrafficEventTable) -> Traffic:

@@ -7,7 +7,7 @@ from pathlib import Path
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
-from league.errors import InvalidInput, UnknownAlias, UnknownVersion
+from league.errors import InvalidInput, UnknownAlias, UnknownVersion, VersionRetired
 from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.storage.artifacts import ArtifactStore
@@ -62,10 +62,14 @@ class VersionRepository(Repository):
     def numbers(self, league: str | None = None) -> dict[str, list[int]]:
         """Return league → version numbers, ascending, of one league or of all that have versions.
 
-        Does not read manifests.
+        Retired versions are not included. Does not read manifests.
         """
         table = VersionTable
-        query = select(table.league, table.number).filter_by(state=READY).order_by(table.league, table.number)
+        query = (
+            select(table.league, table.number)
+            .filter_by(state=READY, retired_at=None)
+            .order_by(table.league, table.number)
+        )
         found: dict[str, list[int]] = {}
         with self._database.read() as session:
             for name, number in session.execute(query if league is None else query.filter_by(league=league)):
@@ -73,12 +77,17 @@ class VersionRepository(Repository):
         return found
 
     def fetch(self, league: str, number: int) -> Path:
-        """Return a local directory with the verified files of a version. Raises ArtifactCorrupt."""
-        return self._artifacts.verify(league, number, self.get(league, number).sha256)
+        """Return a local directory with the verified files of a version. Raises ArtifactCorrupt or VersionRetired."""
+        return self._artifacts.verify(league, number, self._with_files(league, number).sha256)
 
     def copy(self, league: str, number: int, folder: str, target: Path) -> Path:
-        """Copy a folder of a version to the new directory `target`, and return it. Raises ArtifactCorrupt."""
-        manifest = self._artifacts.verify_names(league, number, self.get(league, number).sha256)
+        """Copy a folder of a version to the new directory `target`, and return it.
+
+        Raises ArtifactCorrupt, or VersionRetired if the version or this folder was removed.
+        """
+        manifest = self._artifacts.verify_names(league, number, self._with_files(league, number).sha256)
+        if not (self._artifacts.path(league, number) / folder).is_dir():
+            raise VersionRetired(f"{league}@{number} has no {folder} state any more: `league retire` removed it")
         self._artifacts.copy(manifest, folder, target)
         return target
 
@@ -91,6 +100,12 @@ class VersionRepository(Repository):
             version = resolve(session, ref)
             _write_note(session, version.league, version.number, text, actor)
             return _get(session, version.league, version.number)
+
+    def _with_files(self, league: str, number: int) -> VersionRow:
+        version = self.get(league, number)
+        if version.retired_at is not None:
+            _retired(league, number)
+        return version
 
 
 def resolve(session: Session, ref: CheckpointRef) -> VersionRow:
@@ -116,6 +131,17 @@ def require(session: Session, league: str, number: int) -> None:
     """Raise UnknownLeague or UnknownVersion unless the version is ready."""
     if session.scalar(select(VersionTable.number).filter_by(league=league, number=number, state=READY)) is None:
         _unknown(session, league, number)
+
+
+def require_files(session: Session, league: str, number: int) -> None:
+    """Raise UnknownLeague, UnknownVersion or VersionRetired unless the version is ready and has its files."""
+    require(session, league, number)
+    if session.get_one(VersionTable, (league, number)).retired_at is not None:
+        _retired(league, number)
+
+
+def _retired(league: str, number: int) -> None:
+    raise VersionRetired(f"{league}@{number} was retired and its files were removed: use another version")
 
 
 def _get(session: Session, league: str, number: int) -> VersionRow:

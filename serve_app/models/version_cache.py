@@ -67,7 +67,7 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
     Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
     """
     version = registry.versions.get(league, number)
-    if registry.artifacts.is_purged(league, number):
+    if version.retired_at is not None or registry.artifacts.is_purged(league, number):
         raise VersionRetired(
             f"{version.ref} was retired and its files were removed: start a new episode with another version"
         )

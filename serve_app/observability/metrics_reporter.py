@@ -15,6 +15,7 @@ from league.registry.storage.rows import ShadowCounts
 from serve_app.models.alias_watcher import SHUTDOWN_TIMEOUT
 from serve_app.models.polling import Polling
 from serve_app.models.shadow import Shadow
+from serve_app.observability.disk_space import DiskSpace
 from serve_app.observability.metrics import Metrics, Report, Samples
 from serve_app.settings import ServeSettings
 
@@ -93,6 +94,7 @@ class MetricsReporter:
         self._polling = Polling(self.report, "reports", pace)
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="report")
         self._rates = RequestRates()
+        self._disks = DiskSpace(registry.storage)
         self._written: dict[tuple[str, int, int], ShadowCounts] = {}
 
     @asynccontextmanager
@@ -116,7 +118,7 @@ class MetricsReporter:
             if self._written.get((one.league, one.candidate, one.champion)) != one
         ]
         report = self._metrics.report()
-        report |= {RATE: self._rates.since_last(report)}
+        report |= {RATE: self._rates.since_last(report)} | self._disks.report()
         write = partial(self._registry.replicas.write_report, self._replica, report, shadowings)
         await asyncio.get_running_loop().run_in_executor(self._thread, write)
         self._written |= {(one.league, one.candidate, one.champion): one for one in shadowings}

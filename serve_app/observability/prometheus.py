@@ -55,6 +55,10 @@ METRICS = {
         "gauge", "Start time of the replica, in seconds since the epoch."
     ),
     "league_replica_resident_bytes": MetricDefinition("gauge", "Resident memory of the replica process."),
+    "league_disk_free_bytes": MetricDefinition(
+        "gauge", "Free space on the disk of the home or of the artefact store.", ("disk",)
+    ),
+    "league_disk_size_bytes": MetricDefinition("gauge", "Size of this disk.", ("disk",)),
     "league_canary_share": MetricDefinition("gauge", "Share of keys that are routed to the canary.", ("league",)),
     "league_canary_requests_total": MetricDefinition(
         "counter", "Requests answered by a canary.", ("league", "version")

@@ -173,5 +173,6 @@ def version_document(row: VersionRow) -> dict[str, Any]:
         "algorithm": row.manifest.algorithm,
         "policies": list(row.manifest.policies),
         "created_at": row.created_at.isoformat(),
+        "retired_at": row.retired_at and row.retired_at.isoformat(),
         "note": row.note and {"text": row.note.text, "actor": row.note.actor, "at": row.note.at.isoformat()},
     }

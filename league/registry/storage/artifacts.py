@@ -12,9 +12,11 @@ from pathlib import Path, PurePosixPath
 from league.digests import check_digest, copy_verified, file_sha256, files, of_files
 from league.errors import ArtifactCorrupt
 from league.files import disk_errors, flush, move_durably
-from league.registry.storage.manifest import MANIFEST, Manifest
+from league.registry.storage.manifest import MANIFEST, TRAINING, Manifest
 
 STAGING = ".publishing-"
+REMOVED = ".removed-"
+"""Prefix of a training state that is being removed."""
 
 
 class ArtifactStore:
@@ -65,6 +67,22 @@ class ArtifactStore:
             with disk_errors(directory), suppress(FileNotFoundError):
                 shutil.rmtree(directory)
 
+    def remove_training(self, league: str, number: int) -> None:
+        """Remove the training state of a version, completely or not at all for those who read it."""
+        removed = self.root / league / f"{REMOVED}{number}"
+        with disk_errors(removed), suppress(FileNotFoundError):
+            (self.path(league, number) / TRAINING).rename(removed)
+        with disk_errors(removed), suppress(FileNotFoundError):
+            shutil.rmtree(removed)
+
+    def size(self, league: str, number: int) -> int:
+        """Return the size of all files of a version, in bytes."""
+        return _size(self.path(league, number))
+
+    def training_size(self, league: str, number: int) -> int:
+        """Return the size of a version's training state, in bytes, including a removal that was interrupted."""
+        return _size(self.path(league, number) / TRAINING) + _size(self.root / league / f"{REMOVED}{number}")
+
     def is_purged(self, league: str, number: int) -> bool:
         """Return whether the directory of a version is missing but that of its league exists.
 
@@ -78,8 +96,8 @@ class ArtifactStore:
         """Return the directory of a version after verifying all its files. Raises ArtifactCorrupt."""
         directory, manifest = self.path(league, number), self.verify_names(league, number, sha256)
         with disk_errors(directory):
-            for name, digest in manifest.files.items():
-                path = directory / name
+            for name in self._expected(manifest):
+                path, digest = directory / name, manifest.files[name]
                 # Reading a pipe or a device, which a link may point to, would not end.
                 check_digest(_label(league, number, name), digest, file_sha256(path) if path.is_file() else None)
         return directory
@@ -87,14 +105,15 @@ class ArtifactStore:
     def verify_names(self, league: str, number: int, sha256: str) -> Manifest:
         """Return the manifest of a version after verifying that exactly the files that it names exist.
 
-        Their content is not read: it can be large. `read` verifies it. Raises ArtifactCorrupt.
+        The training state may be missing as a whole, after `remove_training`. The content of the files is not read:
+        it can be large. `read` verifies it. Raises ArtifactCorrupt.
         """
         directory, manifest = self.path(league, number), self.manifest(league, number, sha256)
         with disk_errors(directory):
             present = set(files(directory)) - {MANIFEST}
         for name in sorted(present - set(manifest.files)):
             raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
-        for name in sorted(set(manifest.files) - present):
+        for name in sorted(self._expected(manifest) - present):
             check_digest(_label(league, number, name), manifest.files[name], None)
         return manifest
 
@@ -124,6 +143,11 @@ class ArtifactStore:
         source = self.path(manifest.league, manifest.version) / folder
         copy_verified(source, names, target, _label(manifest.league, manifest.version, folder))
 
+    def _expected(self, manifest: Manifest) -> set[str]:
+        """Return the names of all files that must exist."""
+        has_training = (self.path(manifest.league, manifest.version) / TRAINING).exists()
+        return {name for name in manifest.files if has_training or not name.startswith(f"{TRAINING}/")}
+
     def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
         path = self.path(league, number) / name
         with disk_errors(path):
@@ -136,6 +160,12 @@ class ArtifactStore:
 
     def _staging(self, league: str, number: int) -> Path:
         return self.root / league / f"{STAGING}{number}"
+
+
+def _size(directory: Path) -> int:
+    """Return the size of all files in a directory, in bytes; 0 if it does not exist."""
+    with disk_errors(directory):
+        return sum(path.lstat().st_size for path in directory.rglob("*") if not path.is_dir())
 
 
 def _label(league: str, number: int, name: str) -> str:

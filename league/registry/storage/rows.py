@@ -56,6 +56,8 @@ class VersionRow:
     manifest: Manifest
     aliases: tuple[str, ...]
     note: Note | None
+    retired_at: datetime | None
+    """When its files were removed."""
 
     @property
     def ref(self) -> str:

@@ -100,6 +100,8 @@ class VersionTable(Base):
     """manifest.json, byte for byte; null until ready."""
     sha256: Mapped[str | None] = mapped_column(String(64))
     """Digest of manifest.json, which contains the digests of all other files."""
+    retired_at: Mapped[datetime | None] = mapped_column(Utc)
+    """From then on the version has no files."""
 
 
 class VersionNoteTable(Base):

@@ -102,7 +102,12 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
         operations = Operations(MigrationContext.configure(connection))
         for index in ("ix_matches_league_played_at", "ix_matches_league_first_second_played_at"):
             operations.drop_index(index, "matches")
-        added = {"schedules": ("kind",), "matches": ("league", "first", "second"), "acknowledgements": ("event",)}
+        added = {
+            "schedules": ("kind",),
+            "matches": ("league", "first", "second"),
+            "acknowledgements": ("event",),
+            "versions": ("retired_at",),
+        }
         for table, columns in added.items():
             for column in columns:
                 operations.drop_column(table, column)

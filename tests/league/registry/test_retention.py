@@ -1,0 +1,121 @@
+"""Retention: files that nothing needs are removed, all others stay."""
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from sqlalchemy import update
+
+from league.errors import UnknownLeague, VersionRetired
+from league.registry.registry import Registry
+from league.registry.storage.manifest import TRAINING
+from league.registry.storage.rows import Portion
+from league.registry.storage.tables import VersionTable
+from league.results.ledger import Ledger
+from league.results.records import Schedule
+from tests.support.leagues.ledger_matches import SCHEDULE
+from tests.support.leagues.registries import LEAGUE, publish
+
+MONTH = timedelta(days=30)
+
+
+@pytest.fixture
+def versions(registry: Registry) -> Registry:
+    """Six versions that are a year old."""
+    for number in range(1, 7):
+        publish(registry, f"run/{number}")
+    with registry.database.write() as session:
+        session.execute(update(VersionTable).values(reserved_at=datetime.now(UTC) - timedelta(days=365)))
+    return registry
+
+
+def schedule_of(*contestants: str) -> Schedule:
+    return replace(SCHEDULE, league=LEAGUE, contestants=contestants)
+
+
+def retire(registry: Registry, keep: int = 1) -> tuple[set[int], set[int]]:
+    removal = registry.retention.retire(LEAGUE, keep=keep, before=datetime.now(UTC) - MONTH)
+    return set(removal.versions), set(removal.training)
+
+
+def has_training(registry: Registry, number: int) -> bool:
+    return (registry.artifacts.path(LEAGUE, number) / TRAINING).exists()
+
+
+def test_needed_versions_keep_their_policies(versions: Registry, tmp_path: Path) -> None:
+    for number in (1, 2):
+        versions.aliases.set(LEAGUE, "champion", number, expected=None if number == 1 else 1, actor="me", reason="")
+    versions.traffic.set(LEAGUE, shadow=Portion(3, 1.0), actor="me", reason="")
+    Ledger(versions).open(schedule_of(f"{LEAGUE}@4", "script:random"))
+    assert retire(versions) == ({5}, {1, 3, 4})
+    assert [has_training(versions, number) for number in range(1, 7)] == [False, True, False, False, False, True]
+    for number in (1, 2, 3, 4, 6):
+        assert versions.versions.fetch(LEAGUE, number).is_dir()
+    with pytest.raises(VersionRetired, match=f"{LEAGUE}@4 has no training state any more"):
+        versions.versions.copy(LEAGUE, 4, TRAINING, tmp_path / "start")
+    assert retire(versions) == (set(), set()), "nothing is left to remove"
+
+
+def test_a_retired_version_is_listed_but_cannot_be_used(versions: Registry) -> None:
+    assert retire(versions)[0] == {1, 2, 3, 4, 5}
+    rows = versions.versions.all(LEAGUE)
+    assert [row.retired_at is not None for row in rows] == [True] * 5 + [False]
+    assert versions.versions.numbers(LEAGUE) == {LEAGUE: [6]}
+    message = f"{LEAGUE}@2 was retired"
+    with pytest.raises(VersionRetired, match=message):
+        versions.versions.fetch(LEAGUE, 2)
+    with pytest.raises(VersionRetired, match=message):
+        versions.aliases.set(LEAGUE, "champion", 2, expected=None, actor="me", reason="")
+    with pytest.raises(VersionRetired, match=message):
+        versions.traffic.set(LEAGUE, canary=Portion(2, 0.5), actor="me", reason="")
+    assert publish(versions, "run/7").number == 7
+
+
+def test_new_versions_and_those_of_open_tests_stay(versions: Registry) -> None:
+    publish(versions, "run/7")
+    versions.nightly_runs.open(LEAGUE, [2], alpha=0.05)
+    versions.verdicts.open(LEAGUE, 3, f"{LEAGUE}@4", "verdict", {})
+    assert retire(versions, keep=2) == ({1, 5}, {2, 3, 4})
+
+
+def test_a_void_verdict_and_purged_games_need_nothing(versions: Registry) -> None:
+    Ledger(versions).open(plan := schedule_of(f"{LEAGUE}@1", f"{LEAGUE}@2"))
+    versions.verdicts.open(LEAGUE, 3, f"{LEAGUE}@4", "verdict", {})
+    versions.verdicts.void("verdict", "a mistake")
+    Ledger(versions).purge([plan.id])
+    assert retire(versions, keep=2) == ({1, 2, 3, 4}, set())
+
+
+def test_young_versions_stay(registry: Registry) -> None:
+    for number in range(3):
+        publish(registry, f"run/{number}")
+    assert retire(registry) == (set(), set())
+
+
+def test_a_plan_changes_nothing(versions: Registry) -> None:
+    removal = versions.retention.plan(LEAGUE, keep=1, before=datetime.now(UTC))
+    assert set(removal.versions) == {1, 2, 3, 4, 5}
+    assert removal.size == sum(versions.artifacts.size(LEAGUE, number) for number in range(1, 6)) > 0
+    assert all(row.retired_at is None for row in versions.versions.all(LEAGUE))
+
+
+def test_an_interrupted_removal_is_completed(versions: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    versions.aliases.set(LEAGUE, "champion", 1, expected=None, actor="me", reason="")
+    versions.aliases.set(LEAGUE, "champion", 2, expected=1, actor="me", reason="")
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", fail)
+        with pytest.raises(KeyboardInterrupt):
+            retire(versions)
+    assert versions.versions.all(LEAGUE)[4].retired_at is not None
+    assert retire(versions) == ({3, 4, 5}, {1})
+    assert [path.name for path in sorted((versions.artifacts.root / LEAGUE).iterdir())] == ["1", "2", "6"]
+
+
+def test_an_unknown_league_is_reported(registry: Registry) -> None:
+    with pytest.raises(UnknownLeague):
+        registry.retention.retire("other", keep=1, before=datetime.now(UTC))
