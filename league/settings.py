@@ -39,6 +39,23 @@ class Storage:
         parts = urlsplit(self.database_url)
         return parts.password is not None or "password" in parse_qs(parts.query)
 
+    def check_no_password(self, shown_by: str) -> None:
+        """Raise ConfigError if the database's URL contains a password. shown_by: what would show it."""
+        if self.has_password:
+            raise ConfigError(
+                f"LEAGUE_DATABASE_URL contains a password, which {shown_by} would show: leave it out, and give the"
+                " cluster's nodes a password file (PGPASSFILE)"
+            )
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The three environment variables."""
+        return {
+            "LEAGUE_HOME": str(self.home),
+            "LEAGUE_DATABASE_URL": self.database_url,
+            "LEAGUE_ARTIFACTS": str(self.artifacts),
+        }
+
     def check_reach(self, machines: set[str]) -> None:
         """Raise ConfigError if several machines cannot share the storage: SQLite, or artefacts in `home`."""
         is_shared = not self.database_url.startswith("sqlite") and not self.artifacts.is_relative_to(self.home)
@@ -50,6 +67,4 @@ class Storage:
 
     def export(self) -> None:
         """Set the three variables in this process, so that Ray's workers inherit them."""
-        os.environ["LEAGUE_HOME"] = str(self.home)
-        os.environ["LEAGUE_DATABASE_URL"] = self.database_url
-        os.environ["LEAGUE_ARTIFACTS"] = str(self.artifacts)
+        os.environ |= self.environment

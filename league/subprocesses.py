@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from types import MappingProxyType
 from typing import IO
 
 POLL_INTERVAL = 0.1
@@ -22,15 +23,31 @@ class Subprocess:
     so that Ctrl-C reaches the parent only.
     """
 
-    def __init__(self, module: str, argument: str, *, output: bool = False, errors: IO[bytes] | None = None) -> None:
-        """output: connect standard output to a pipe. errors: file for standard error; None for that of this process."""
+    def __init__(
+        self,
+        module: str,
+        argument: str,
+        environment: Mapping[str, str] = MappingProxyType({}),
+        *,
+        output: bool = False,
+        errors: IO[bytes] | None = None,
+    ) -> None:
+        """Start it.
+
+        Args:
+            module: The module.
+            argument: Its argument, which all users of the machine can see: no secrets.
+            environment: Environment variables besides those of this process.
+            output: Connect standard output to a pipe.
+            errors: File for standard error; None for that of this process.
+        """
         paths = os.pathsep.join(path for path in sys.path if path)
         self._process = subprocess.Popen(
             [sys.executable, "-m", module, argument],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if output else None,
             stderr=errors,
-            env=os.environ | {"PYTHONPATH": paths},
+            env=os.environ | environment | {"PYTHONPATH": paths},
             start_new_session=True,
         )
 

@@ -131,10 +131,9 @@ def running(
         "replicas": replicas,
         "insecure": insecure,
     }
-    places = [str(storage.home), storage.database_url, str(storage.artifacts)]
-    order = json.dumps({"storage": places, "deploy": str(deploy), "arguments": arguments})
+    order = json.dumps({"deploy": str(deploy), "arguments": arguments})
     with tempfile.TemporaryFile() as log:
-        server = Subprocess("serve_app.runtime.launch", order, output=True, errors=log)
+        server = Subprocess("serve_app.runtime.launch", order, storage.environment, output=True, errors=log)
         try:
             yield _await_url(server, log, timeout)
         finally:
@@ -218,9 +217,9 @@ def _serve_on_cluster(
     """Serve on a running cluster."""
     from ray import serve
 
-    where = ("LEAGUE_HOME", "LEAGUE_DATABASE_URL", "LEAGUE_ARTIFACTS")
+    storage.check_no_password("Ray's dashboard")
     (application,) = document["applications"]
-    application["runtime_env"] = {"env_vars": {name: os.environ[name] for name in where}}
+    application["runtime_env"] = {"env_vars": storage.environment}
     with ray_session():
         join(address, namespace="serve")
         nodes = node_addresses()
@@ -322,13 +321,12 @@ def _await_url(server: Subprocess, log: IO[bytes], timeout: float) -> str:
 def main() -> None:
     """Run `serve_forever` for `running`: print the URL or an error as one line of JSON."""
     order = json.loads(sys.argv[1])
-    home, database_url, artifacts = order["storage"]
     announce = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # output of Ray goes to the log
     when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
     try:
         serve_forever(
-            Storage(Path(home), database_url, Path(artifacts)),
+            Storage.from_environment(),
             deploy=Path(order["deploy"]),
             on_ready=lambda url: print(json.dumps({"url": url}), file=announce),
             **order["arguments"],

@@ -45,11 +45,7 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
         raise ConfigError(f"--job: expected --address http://HOST:8265, the cluster's dashboard, got {address!r}")
     if host not in LOOPBACK:
         _check_reach(host, storage)
-    if storage.has_password:
-        raise ConfigError(
-            "--job: LEAGUE_DATABASE_URL contains a password, which Ray would show in its dashboard: leave it out, and"
-            " give the cluster's nodes a password file (PGPASSFILE)"
-        )
+    storage.check_no_password("Ray's dashboard")
     silence_job_submission()
     client = _client(address)
     with tempfile.TemporaryDirectory() as directory:
@@ -101,12 +97,7 @@ def _check_end(client: JobSubmissionClient, job: str) -> None:
 
 def _environment(storage: Storage) -> dict[str, str]:
     """Return the job's environment variables: the same storage, and a PATH that includes this `league`."""
-    return {
-        "LEAGUE_HOME": str(storage.home),
-        "LEAGUE_DATABASE_URL": storage.database_url,
-        "LEAGUE_ARTIFACTS": str(storage.artifacts),
-        "PATH": f"${{PATH}}:{Path(sys.executable).parent}",
-    }
+    return storage.environment | {"PATH": f"${{PATH}}:{Path(sys.executable).parent}"}
 
 
 def _check_reach(host: str, storage: Storage) -> None:

@@ -295,7 +295,7 @@ def _engine(url: str, create: bool) -> Engine:
     try:
         parsed = make_url(url)
     except ArgumentError:
-        raise ConfigError(f"LEAGUE_DATABASE_URL {url!r} is not a database URL") from None
+        raise ConfigError("LEAGUE_DATABASE_URL is not a URL: expected sqlite:////path or postgresql://…") from None
     name = parsed.get_backend_name()
     if name not in ("sqlite", "postgresql"):
         raise ConfigError(f"LEAGUE_DATABASE_URL names {name!r}: expected sqlite or postgresql")

@@ -2,11 +2,13 @@
 
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
 from league.settings import Storage
+from serve_app.runtime import launch
 from serve_app.runtime.launch import DEPLOY_YAML, running
 
 
@@ -51,3 +53,27 @@ def test_a_missing_haproxy_is_reported(storage: Storage, monkeypatch: pytest.Mon
     monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", "/nowhere/haproxy")
     with pytest.raises(NotReady, match="HAProxy is missing"), running(storage):
         pass
+
+
+def test_a_password_is_in_no_command_line(tmp_path: Path) -> None:
+    storage = Storage(tmp_path, "postgresql://league:secret@192.0.2.1/league", tmp_path / "artifacts")
+    commands = []
+
+    class Recorded(launch.Subprocess):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            commands.append(Path(f"/proc/{self.pid}/cmdline").read_text())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launch, "Subprocess", Recorded)
+        with pytest.raises(ConfigError, match="none"), running(storage, deploy=tmp_path / "none.yaml"):
+            pass
+    (command,) = commands
+    assert "serve_app.runtime.launch" in command
+    assert "secret" not in command
+
+
+def test_a_password_is_not_given_to_a_cluster(tmp_path: Path) -> None:
+    storage = Storage(tmp_path, "postgresql://league:secret@192.0.2.1/league", tmp_path / "artifacts")
+    with pytest.raises(ConfigError, match="LEAGUE_DATABASE_URL contains a password"):
+        launch._serve_on_cluster("127.0.0.1:9", storage, {}, None)

@@ -125,7 +125,7 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
     ("url", "message"),
     [
         ("mysql://host/league", "names 'mysql': expected sqlite or postgresql"),
-        ("no url at all", "is not a database URL"),
+        ("no url at all: secret", "LEAGUE_DATABASE_URL is not a URL: expected sqlite"),
         ("sqlite://", "does not name a file"),
         ("sqlite:///:memory:", "does not name a file"),
     ],
