@@ -5,6 +5,7 @@ bodies             a key limited to 10 requests/s sends the worst bodies of 4 MB
 versions           200 callers request 200 numbered versions: time from a promotion to every replica
 confirmations      `--wait` while one of three replicas is stuck, cut off, or has a wrong clock
 database           the connection of a replica to PostgreSQL drops all packets for a while (requires root)
+fuzz               generated requests to replicas with SQLite and with PostgreSQL: do the responses differ?
 locks              nightly runs whose lock connection is terminated while another run waits
 """
 
@@ -14,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.attacks.confirmations import confirmations
+from benchmarks.attacks.databases import databases
 from benchmarks.attacks.large_bodies import large_bodies
 from benchmarks.attacks.lost_database import lost_database
 from benchmarks.attacks.lost_lock import lost_locks
@@ -25,7 +27,7 @@ from serve_app.runtime.launch import running
 
 REPLICAS = 2
 ON_SERVER = ("unauthenticated", "bodies", "versions")
-CASES = (*ON_SERVER, "confirmations", "database", "locks")
+CASES = (*ON_SERVER, "confirmations", "database", "locks", "fuzz")
 
 
 def main() -> int:
@@ -44,6 +46,8 @@ def main() -> int:
         met.append(lost_database(10.0 if quick else 60.0, 1 if quick else 3))
     if "locks" in wanted:
         met.append(lost_locks(2 if quick else 20))
+    if "fuzz" in wanted:
+        met.append(databases(1_000 if quick else 10_000))
     return int(not all(met))
 
 

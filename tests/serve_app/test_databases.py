@@ -6,22 +6,22 @@ limits.
 
 import json
 from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from schemathesis.schemas import APIOperation
 from starlette.testclient import TestClient
 
-from league.settings import Storage
 from serve_app.openapi.document import document
 from serve_app.runtime.serve_bypass import is_event_stream
-from tests.support.leagues.match_results import SCHEDULE, WON, record
-from tests.support.leagues.served_leagues import build_everything
-from tests.support.servers import postgresql
-from tests.support.servers.replicas import QUICK, READ_ONLY, replica
+from tests.support.generated_requests import OPERATIONS, draw_request
+from tests.support.leagues.match_results import SCHEDULE, WON
+from tests.support.servers.replicas import QUICK
+from tests.support.servers.two_databases import is_available, outline, replicas_of_both
 
 UNUSUAL = ("a\0b", "x" * 101, "x" * 301, "x" * 5000, "-1", "0", str(2**31), str(2**63), "9" * 40, "é", "Board", "²")
 PATH = {
@@ -47,35 +47,15 @@ VALUES = ("", "a\0b", "x" * 3000, "\ud800", "😀", 0, -1, 2**31, 2**63, 10**400
 @pytest.fixture(scope="module")
 def replicas(tmp_path_factory: pytest.TempPathFactory, postgresql_socket: Path) -> Iterator[list[TestClient]]:
     """Replicas of equal leagues, one for each database, with a key for all scopes."""
-    with ExitStack() as stack:
-        clients = []
-        for database in ("sqlite", "postgresql"):
-            storage = Storage.at(tmp_path_factory.mktemp(database))
-            if database == "postgresql":
-                storage = replace(storage, database_url=postgresql.create(postgresql_socket, "databases"))
-            key = _fill(storage)
-            clients.append(stack.enter_context(replica(storage, READ_ONLY)))
-            clients[-1].headers["x-api-key"] = key
+    with replicas_of_both(tmp_path_factory.mktemp("databases"), postgresql_socket) as clients:
         yield clients
-
-
-def _fill(storage: Storage) -> str:
-    registry = build_everything(storage)
-    record(registry)
-    _, token = registry.keys.create("databases", ["act", "read", "evaluate", "promote"])
-    registry.close()
-    return token
 
 
 def answers(replicas: list[TestClient], method: str, path: str, content: bytes | None = None) -> tuple[int, str | None]:
     """The status and the code of the error, which must be equal."""
-    headers, found = {"idempotency-key": str(hash((path, content)))}, []
-    for client in replicas:
-        response = client.request(method, path, content=content, headers=headers)
-        is_error = response.status_code >= 400 and "json" in response.headers["content-type"]
-        found.append((response.status_code, response.json().get("code") if is_error else None))
+    found = outline(replicas, method, path, content, {"idempotency-key": str(hash((path, content)))})
     assert found[0] == found[1], (method, path, content)
-    return found[0]
+    return found[0][:2]
 
 
 def reads() -> list[tuple[str, list[str]]]:
@@ -121,3 +101,13 @@ def test_names_of_aliases(replicas: list[TestClient], name: str) -> None:
     body: dict[str, Any] = {"version": 2}
     status, _ = answers(replicas, "POST", f"/v1/leagues/board/aliases/{quote(name)}", json.dumps(body).encode())
     assert status == (200 if name in ("candidate", "x" * 100) else 400)
+
+
+@pytest.mark.parametrize("operation", OPERATIONS, ids=lambda each: each.label.replace("/", " "))
+@settings(max_examples=3, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_generated_requests(replicas: list[TestClient], operation: APIOperation, data: st.DataObject) -> None:
+    drawn = draw_request(data, operation)
+    sqlite, other = outline(replicas, drawn.method, drawn.url, drawn.content, drawn.headers)
+    assert sqlite == other
+    assert is_available(*sqlite[:2])

@@ -9,11 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import requests
-import schemathesis
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from schemathesis import GenerationMode
 from schemathesis.checks import CHECKS, load_all_checks
 from schemathesis.schemas import APIOperation
 from starlette.testclient import TestClient
@@ -28,11 +25,10 @@ from serve_app.inference_protocol.inference import InferResponse
 from serve_app.inference_protocol.rest_codec import read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs, signature_of
 from serve_app.models.version_cache import LoadedPolicy, load
-from serve_app.openapi.document import document
-from serve_app.runtime.serve_bypass import is_event_stream
-from tests.support.leagues.match_results import PENDING, SCHEDULE, WON, record
+from tests.support.generated_requests import OPERATIONS, draw_request
+from tests.support.leagues.match_results import record
 from tests.support.leagues.protocol_leagues import every_kind
-from tests.support.servers.replicas import QUICK, replica
+from tests.support.servers.replicas import replica
 from tests.support.waiting import until
 
 load_all_checks()
@@ -44,22 +40,7 @@ CONFORMS = CHECKS.get_by_names(
         "response_schema_conformance",
     ]
 )
-SCHEMA = schemathesis.openapi.from_dict(document(QUICK, []))
-OPERATIONS = [each.ok() for each in SCHEMA.get_all_operations() if not is_event_stream(each.ok().path)]
 SEVERAL = {"deadline": None, "suppress_health_check": list(HealthCheck)}
-OURS = ("x-api-key", "authorization", "x-request-timeout-ms")
-REAL = {
-    "model": ["board", "vector", "nested", "memory", "duo", "duo.left", "pistons", "kinds", "empty"],
-    "league": ["board", "memory", "duo", "empty"],
-    "alias": ["champion", "candidate"],
-    "version": ["1", "2", "champion"],
-    "evaluation": [1, 2, 3],
-    "verdict": [WON, PENDING],
-    "schedule": [SCHEDULE.id],
-    "position": [0, 5],
-    "game": [0, 1, 2],
-    "run": ["first"],
-}
 
 
 @pytest.fixture(scope="module")
@@ -87,31 +68,11 @@ def fuzzed(storage_to_fuzz: Storage) -> Iterator[TestClient]:
 @settings(max_examples=8, **SEVERAL)
 @given(data=st.data())
 def test_each_response_is_documented(fuzzed: TestClient, operation: APIOperation, data: st.DataObject) -> None:
-    named = data.draw(
-        st.none() | st.fixed_dictionaries({name: st.sampled_from(REAL[name]) for name in _names(operation)})
-    )
-    mode = data.draw(st.sampled_from(GenerationMode))
-    try:
-        case = data.draw(operation.as_strategy(mode, path_parameters=named))
-    except schemathesis.errors.SchemathesisError:
-        assume(False)  # an operation without parameters cannot be violated
-        raise
-    case.method = operation.method.upper()
-    prepared = requests.Request(**case.as_transport_kwargs(base_url="http://localhost")).prepare()
-    # The key is that of the client; a time limit of a millisecond causes a documented error.
-    headers = {name: value for name, value in prepared.headers.items() if name.lower() not in OURS}
-    reply = fuzzed.request(str(prepared.method), str(prepared.url), headers=headers, content=_content(prepared.body))
+    drawn = draw_request(data, operation)
+    reply = fuzzed.request(drawn.method, drawn.url, headers=drawn.headers, content=drawn.content)
     assert reply.status_code < 500 or _is_not_ready(reply), reply.text
     if reply.status_code not in (404, 405) and operation.path != "/v1/policies/{model}/stream":
-        case.validate_response(reply, checks=CONFORMS)
-
-
-def _names(operation: APIOperation) -> list[str]:
-    return [parameter.name for parameter in operation.path_parameters]
-
-
-def _content(body: Any) -> bytes | None:
-    return body.encode() if isinstance(body, str) else body
+        drawn.case.validate_response(reply, checks=CONFORMS)
 
 
 def _is_not_ready(reply: Any) -> bool:

@@ -1,0 +1,71 @@
+"""Generated requests to two replicas of equal leagues, one with SQLite and one with PostgreSQL."""
+
+import logging
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+
+from tests.support.generated_requests import OPERATIONS, draw_request
+from tests.support.servers import postgresql
+from tests.support.servers.two_databases import is_available, outline, replicas_of_both
+
+
+def databases(requests: int) -> bool:
+    """Send generated requests to both; prints differences and server errors. Returns whether there are none."""
+    programs = postgresql.programs()
+    if programs is None:
+        sys.exit("PostgreSQL is not installed")
+    logging.disable(logging.ERROR)
+    statuses: Counter[int] = Counter()
+    different: list[str] = []
+    failed: list[str] = []
+    with (
+        postgresql.server(programs) as socket,
+        tempfile.TemporaryDirectory() as scratch,
+        replicas_of_both(Path(scratch), socket) as replicas,
+    ):
+
+        def send(data: Any, operation: Any) -> None:
+            drawn = draw_request(data, operation)
+            one, other = outline(replicas, drawn.method, drawn.url, drawn.content, drawn.headers)
+            statuses[one[0]] += 1
+            call = f"{drawn.method} {drawn.url[:200]} {(drawn.content or b'')[:200]!r}"
+            if one != other:
+                different.append(f"{call}: {one[:2]} and {other[:2]}")
+            if not is_available(*one[:2]):
+                failed.append(f"{call}: {one[:2]}")
+
+        for number, operation in enumerate(OPERATIONS):
+            examples = requests // len(OPERATIONS) + (number < requests % len(OPERATIONS))
+            _generate(partial(send, operation=operation), examples, number)
+    for line in (*different[:20], *failed[:20]):
+        print(f"    {line}")
+    sent = ", ".join(f"{count:,} × {status}" for status, count in sorted(statuses.items()))
+    print(f"databases: {sum(statuses.values()):,} generated requests to SQLite and PostgreSQL ({sent})")
+    print(f"    {len(different)} differences (target 0), {len(failed)} server errors (target 0)", flush=True)
+    return not different and not failed
+
+
+def _generate(use: Callable[[Any], None], examples: int, number: int) -> None:
+    """Call `use` with sources of generated data."""
+
+    @seed(number)
+    @settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(data=st.data())
+    def generate(data: Any) -> None:
+        use(data)
+
+    generate()
