@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from evaluation.matches.lockstep_runner import play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface as interface_of

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from functools import lru_cache
 
-from evaluation.matches.lockstep_runner import Roster, play_matches
+from evaluation.matches.game_loop import Roster, play_matches
 from evaluation.matches.watchdog import Deadline
 from evaluation.schedules.builders import ANCHOR
 from league.config import LeagueConfig

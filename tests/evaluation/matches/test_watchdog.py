@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from evaluation.gating.nightly import nightly
-from evaluation.matches.lockstep_runner import play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.matches.tournament import play_schedule
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.matches.worker import MatchWorker

@@ -10,7 +10,7 @@ from examples import two_step
 from examples.traffic import crossing
 from league.environment_config import EnvironmentConfig
 from league.environments.lockstep import stepping
-from league.environments.stepping import EpisodeStart
+from league.environments.stepping import each_agent_alone
 from tests.conformance.stepping import assert_abandoning_conforms, assert_states_conform, assert_stepping_conforms
 from tests.support.environments.simultaneous import meeting, rllib_meeting
 
@@ -78,6 +78,6 @@ def test_states_equal_those_of_the_plain_loop(entry_point: str, num_envs: int) -
 
 def test_environments_without_state_return_none() -> None:
     env = stepping(EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2"), 2, states=True)
-    turn = env.start(lambda env_index: EpisodeStart(env_index, env.agents))
-    assert (turn.states, turn.last_states) == ({}, {})
+    turn = env.start(each_agent_alone(range(2), 2))
+    assert (turn.states, turn.last_states) == (None, None)
     env.close()

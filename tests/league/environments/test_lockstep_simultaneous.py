@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from league.environment_config import EnvironmentConfig
 from league.environments.lockstep import stepping
-from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
+from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
+from tests.support.environments.episodes import episodes
 from tests.support.environments.simultaneous import RLlibSimultaneous, Simultaneous
 
 HERE = "tests.support.environments.simultaneous"
@@ -21,12 +22,11 @@ def config(function: str = "meeting", **kwargs: Any) -> EnvironmentConfig:
 
 
 def zeros(turn: Turn) -> dict[Any, np.ndarray]:
-    return {group: np.zeros(len(batch.envs), np.int64) for group, batch in turn.batches.items()}
+    return {group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}
 
 
 def begin(env: BatchedEnvironment, seeds: list[int]) -> Turn:
-    queue = iter(seeds)
-    return env.start(lambda _: None if (seed := next(queue, None)) is None else EpisodeStart(seed, env.agents))
+    return env.start(each_agent_alone(seeds, len(env.agents)))
 
 
 def reports(env: BatchedEnvironment, seed: int) -> dict[str, list[tuple[float, bool, bool]]]:
@@ -34,10 +34,10 @@ def reports(env: BatchedEnvironment, seed: int) -> dict[str, list[tuple[float, b
     found: dict[str, list[tuple[float, bool, bool]]] = defaultdict(list)
     turn = begin(env, [seed])
     while True:
-        for ending in turn.endings:
+        for ending in turn.each_ending():
             found[env.agents[ending.agent]].append((ending.reward, ending.terminated, ending.truncated))
         for group, batch in turn.batches.items():
-            found[group].append((batch.rewards[0], False, False))
+            found[env.agents[group]].append((batch.rewards[0], False, False))
         if not turn.batches:
             return found
         turn = env.step(zeros(turn))
@@ -79,7 +79,7 @@ def test_episodes_do_not_depend_on_the_number_of_environments() -> None:
     while turn.batches:
         rewards += sum(sum(batch.rewards) for batch in turn.batches.values())
         turn = env.step(zeros(turn))
-        rewards += sum(ending.reward for ending in turn.endings)
+        rewards += sum(ending.reward for ending in turn.each_ending())
         finished += len(turn.finished)
     assert finished == 5
     assert rewards == sum(reward for episode in one for own in episode.values() for reward, _, _ in own)
@@ -92,11 +92,11 @@ def test_rllibs_all_flag_ends_the_remaining_agents(silent: bool, truncated: bool
     turn = begin(env, [0])
     rows: dict[str, list[float]] = defaultdict(list)
     while turn.batches:
-        (agent,) = turn.batches
-        rows[agent].append(float(turn.batches[agent].observations["observation"][0, 1]))
+        (group,) = turn.batches
+        rows[env.agents[group]].append(float(turn.batches[group].observations["observation"][0, 1]))
         turn = env.step(zeros(turn))
     assert rows == {"agent_0": [0.0, 2.0], "agent_1": [1.0]}
-    endings = {env.agents[ending.agent]: ending for ending in turn.endings}
+    endings = {env.agents[ending.agent]: ending for ending in turn.each_ending()}
     assert {agent: (e.terminated, e.truncated) for agent, e in endings.items()} == dict.fromkeys(
         env.agents, (not truncated, truncated)
     )
@@ -108,14 +108,13 @@ def test_rllibs_all_flag_ends_the_remaining_agents(silent: bool, truncated: bool
 
 def test_a_crash_affects_its_own_episode_only() -> None:
     env = stepping(config(crashes=[1]), 2, crashes=1)
-    seeds = itertools.chain([0, 1, 2], itertools.repeat(None))
-    turn = env.start(lambda _: None if (seed := next(seeds)) is None else EpisodeStart(seed, env.agents))
+    turn = begin(env, [0, 1, 2])
     crashed, finished, ended = [], [], []
     while turn.batches:
         turn = env.step(zeros(turn))
-        crashed += turn.crashed
-        finished += turn.finished
-        ended += turn.endings
+        crashed += turn.crashed.tolist()
+        finished += turn.finished.tolist()
+        ended += turn.each_ending()
     assert crashed == [1]
     assert finished == [0, 1]
     assert len(ended) == 4
@@ -146,13 +145,12 @@ def test_the_last_observation_survives_the_next_reset() -> None:
     while not turn.endings:
         turn = env.step(zeros(turn))
     assert turn.batches, "the next episode has begun"
-    assert [ending.observation["observation"].tolist() for ending in turn.endings] == [[0, 3, 5], [1, 3, 5]]
+    assert [ending.observation["observation"].tolist() for ending in turn.each_ending()] == [[0, 3, 5], [1, 3, 5]]
 
 
 def test_an_environment_that_always_crashes_reraises() -> None:
     env = stepping(config(crashes=list(range(10))), 1, crashes=2)
-    seeds = itertools.count()
-    turns = [env.start(lambda _: EpisodeStart(next(seeds), env.agents))]
+    turns = [env.start(each_agent_alone(itertools.count(), 2))]
 
     def play() -> None:
         for _ in range(20):
@@ -174,10 +172,10 @@ def test_an_illegal_action_is_rejected_before_any_step() -> None:
     env = stepping(config(), 2)
     turn = begin(env, [0, 1])
     actions = zeros(turn)
-    actions["agent_1"][1] = 3
+    actions[1][1] = 3
     with pytest.raises(IllegalAction, match="action 3 of agent_1"):
         env.step(actions)
-    assert set(env.step(zeros(turn)).batches) == {"agent_0", "agent_1"}
+    assert set(env.step(zeros(turn)).batches) == {0, 1}
 
 
 def test_an_environment_without_rendering_is_reported() -> None:
@@ -217,7 +215,7 @@ def test_an_agent_terminates_once() -> None:
     left = []
     while turn.batches:
         turn = env.step(zeros(turn))
-        left += [(env.agents[ending.agent], ending.reward) for ending in turn.endings]
+        left += [(env.agents[ending.agent], ending.reward) for ending in turn.each_ending()]
     assert sorted(left) == [("agent_0", 1.0), ("agent_1", 1.0)]
 
 
@@ -241,7 +239,7 @@ def test_an_episode_without_agents_is_over() -> None:
     finished = []
     while turn.batches:
         turn = env.step(zeros(turn))
-        finished += turn.finished
+        finished += turn.finished.tolist()
     assert finished == [0]
 
 
@@ -289,6 +287,6 @@ def test_contract_violations_are_rejected_with_the_agent(fault: str, message: st
     env = stepping(
         EnvironmentConfig(entry_point=f"{__name__}:contract_violation", kwargs={"fault": fault}), 1, crashes=3
     )
-    groups = ("all", "all") if shared else env.agents
+    groups = [0, 0] if shared else [0, 1]
     with pytest.raises(LeagueError, match=message):
-        env.step(zeros(env.start(lambda _: EpisodeStart(5, groups))))
+        env.step(zeros(env.start(episodes([5], groups))))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from evaluation.matches.lockstep_runner import Roster, play_matches
+from evaluation.matches.game_loop import Roster, play_matches
 from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface

@@ -45,7 +45,7 @@ def expected_rows(seed: int, agent: int, record: AgentRecord) -> list[tuple[obje
     rows: list[tuple[object, ...]] = []
     for row, group in enumerate(record.groups):
         is_last = row == len(record.groups) - 1
-        if isinstance(group, str) and not (is_last and record.ending is None):
+        if record.is_own(group) and not (is_last and record.ending is None):
             ends = (record.ending.terminated, record.ending.truncated) if is_last and record.ending else (False, False)
             rows.append(((agent, seed, row), following_rewards[row + 1], *ends))
     return rows

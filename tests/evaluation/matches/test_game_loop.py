@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.matches.lockstep_runner import play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.playback.replay import replay
 from evaluation.schedules.builders import round_robin
 from league.environments.lockstep import stepping

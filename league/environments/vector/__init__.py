@@ -1,0 +1,1 @@
+"""Vectorised environments: faster implementations of PettingZoo environments by array operations."""
