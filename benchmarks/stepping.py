@@ -29,7 +29,7 @@ from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
+from league.environments.implementation import stepping
 from league.environments.stepping import Batch, Indices, Starts
 from league.spaces import ACTION_MASK
 

@@ -76,9 +76,9 @@ def play_matches(
     except GameTimeout as expired:
         raise expired.error from None
     except Exception as error:
-        if isinstance(error, LeagueError) or environment.busy is None:
+        if isinstance(error, LeagueError) or not len(environment.busy):
             raise
-        raise loop.crashed(environment.busy, error) from error
+        raise loop.crashed(int(environment.busy[0]), error) from error
     blocks = loop.blocks()
     return [schedule.match(position, blocks[position]) for position in positions]
 
@@ -165,10 +165,10 @@ class _GameLoop:
             self._begin(np.concatenate([forfeited, turn.finished]))
 
     def check_deadline(self) -> None:
-        """Raise GameTimeout if the environment has worked on its current game for too long."""
-        env = self._environment.busy
-        if env is not None and self._environment.seconds()[env] > self._max_seconds:
-            raise GameTimeout(self._hung(env))
+        """Raise GameTimeout if an environment has worked on its current game for too long."""
+        busy = self._environment.busy
+        if len(slow := busy[self._environment.seconds()[busy] > self._max_seconds]):
+            raise GameTimeout(self._hung(slow))
 
     def blocks(self) -> dict[int, list[Game]]:
         """Position → its scored games, in order."""
@@ -281,8 +281,12 @@ class _GameLoop:
             f"{self._describe(env)} cannot continue: its environment raised {one_line(error, with_type=True)}"
         )
 
-    def _hung(self, env: int) -> GameHung:
-        return GameHung(f"{self._describe(env)} has not ended after {self._max_seconds:g} s of environment time")
+    def _hung(self, envs: Indices) -> GameHung:
+        """The error for games of which one hangs."""
+        others = f", or one of {len(envs) - 1} others that are stepped with it," if len(envs) > 1 else ""
+        return GameHung(
+            f"{self._describe(int(envs[0]))}{others} has not ended after {self._max_seconds:g} s of environment time"
+        )
 
     def _describe(self, env: int) -> str:
         """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)` for the last game that an environment began."""
@@ -300,7 +304,7 @@ class _GameLoop:
         if len(endless := playing[steps > self._max_moves]):
             raise GameHung(f"{self._describe(int(endless[0]))} has not ended after {self._max_moves} moves")
         if len(slow := playing[self._environment.seconds()[playing] > self._max_seconds]):
-            raise self._hung(int(slow[0]))
+            raise self._hung(slow[:1])
 
     def _settle(self, turn: Turn) -> None:
         for rows in turn.endings:

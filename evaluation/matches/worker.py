@@ -11,7 +11,7 @@ from evaluation.matches.watchdog import Deadline
 from evaluation.schedules.builders import ANCHOR
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.implementation import stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
 from league.interface import Interface

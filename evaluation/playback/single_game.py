@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config import LeagueConfig
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
 from league.errors import UnknownPolicy
 from league.interface import Interface
@@ -86,7 +86,7 @@ def first_observation(config: LeagueConfig, interface: Interface, policy: str | 
 
     Raises UnknownPolicy if no agent of that policy acts in the first step.
     """
-    with closing(stepping(config.environment, num_envs=1)) as environment:
+    with closing(stock_stepping(config.environment, num_envs=1)) as environment:
         agents = environment.agents
         turn: Turn = environment.start(each_agent_alone([seed], len(agents)))
     for agent, batch in turn.batches.items():

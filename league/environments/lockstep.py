@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environment_config import EnvironmentConfig
-from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
+from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
 from league.environments.building import action_space, build, observation_space
 from league.environments.stepping import (
     Batch,
@@ -27,8 +27,7 @@ from league.environments.stepping import (
 )
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError, one_line
-from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, inputs
-from league.spaces.arrays import tensors
+from league.spaces import Leaf, inputs
 from league.spaces.conversion import from_gymnasium
 
 logger = logging.getLogger(__name__)
@@ -39,7 +38,7 @@ Reports = dict[int, list[Report]]
 """Environment → its reports."""
 
 
-def stepping(
+def stock_stepping(
     config: EnvironmentConfig,
     num_envs: int,
     *,
@@ -47,7 +46,7 @@ def stepping(
     render_mode: str | None = None,
     states: bool = False,
 ) -> BatchedEnvironment:
-    """Create environments that are stepped in lockstep.
+    """Create copies of the stock environment that are stepped in lockstep.
 
     Args:
         config: The environment.
@@ -70,7 +69,7 @@ class Lockstep:
         envs = [make() for _ in range(num_envs)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
         spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.agents]
-        self._splits = [_splitter(space) for space in spaces]
+        self._splits = [splitter(space) for space in spaces]
         self._inputs = [inputs(space) for space in spaces]
         self._first_alike = [self._inputs.index(own) for own in self._inputs]
         self._actions = [from_gymnasium(action_space(envs[0], agent)) for agent in self.agents]
@@ -99,7 +98,7 @@ class Lockstep:
         moves: dict[int, list[tuple[int, Any]]] = defaultdict(list)
         for group, batch in self._pending.items():
             check_actions(batch, actions[group], self._actions[batch.agents[0]], self.agents)
-            rows = zip(batch.envs.tolist(), batch.agents.tolist(), _plain(actions[group]), strict=True)
+            rows = zip(batch.envs.tolist(), batch.agents.tolist(), plain_actions(actions[group]), strict=True)
             for env, agent, action in rows:
                 moves[env].append((agent, action))
         reports: Reports = {}
@@ -133,8 +132,9 @@ class Lockstep:
         self._groups[envs] = groups
 
     @property
-    def busy(self) -> int | None:
-        return self._busy
+    def busy(self) -> Indices:
+        busy = self._busy
+        return no_envs() if busy is None else _envs([busy])
 
     def seconds(self) -> NDArray[np.float64]:
         seconds, busy = self._seconds.copy(), self._busy
@@ -287,17 +287,6 @@ def _must_act(report: Report) -> bool:
     return not (report[3] or report[4])
 
 
-def _splitter(space: Space) -> Callable[[Any], Observation]:
-    """Return a function from observation to named arrays, optimised for common spaces."""
-    if not isinstance(space, DictSpace):
-        return lambda value: {OBSERVATION: value}
-    if set(space.spaces) == {OBSERVATION, ACTION_MASK}:
-        plain = not any(isinstance(part, DictSpace) for part in space.spaces.values())
-        if plain:
-            return lambda value: {OBSERVATION: value[OBSERVATION], ACTION_MASK: value[ACTION_MASK]}
-    return lambda value: tensors(space, value)
-
-
-def _plain(actions: NDArray) -> list[Any]:
+def plain_actions(actions: NDArray) -> list[Any]:
     """Discrete actions as Python integers, which environments use as list indices; other actions as arrays."""
     return actions.tolist() if actions.ndim == 1 else list(actions)

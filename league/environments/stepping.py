@@ -177,17 +177,17 @@ class BatchedEnvironment(Protocol):
         """Change the groups, (m, agents), of the agents of m environments, starting with the next Turn."""
 
     @property
-    def busy(self) -> int | None:
-        """The environment that is executing, for use in signal handlers, or that raised in the last call.
+    def busy(self) -> Indices:
+        """The environments that are executing, for use in signal handlers, or the one that raised in the last call.
 
-        If several execute together, the first of them: which one hangs cannot be told.
+        Several execute together if a vectorised environment steps them; if it hangs, one of them does.
         """
 
     def seconds(self) -> NDArray[np.float64]:
         """Return the execution time of each environment in its current episode, including the reset, (n,) in seconds.
 
-        Environments that execute together share the time of a finished call equally, and each counts the time of a
-        call in progress as its own.
+        Environments that execute together share the time of a finished call equally. Each counts all of the time of a
+        call in progress.
         """
 
     def render(self, env: int) -> NDArray:

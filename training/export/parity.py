@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Indices, Starts
 from league.errors import ParityError
 from league.interface import Interface
@@ -68,7 +68,7 @@ def collect_observations(
     observations that the policies do and do not reach. Raises ParityError if a policy does not act often enough.
     """
     rng = generator(seed, "parity")
-    batched = stepping(environment, NUM_ENVS)
+    batched = stock_stepping(environment, NUM_ENVS)
     resets = itertools.count()
     policies = interface.policy_ids
     # Group 2 i is policy i at random, group 2 i + 1 the same exploring.

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch
 from league.interface import AgentInterface, Interface
@@ -296,7 +296,7 @@ class JointTransitionsWithoutState(JointTransitions):
 
 def state_size(environment: EnvironmentConfig, interface: Interface) -> int:
     """Return s, the size of `state` in an environment. Raises ConfigError if the environment cannot be created."""
-    with closing(stepping(environment, 1, states=True)) as batched:
+    with closing(stock_stepping(environment, 1, states=True)) as batched:
         turn = batched.start(each_agent_alone([0], len(batched.agents)))
     if turn.states is not None:
         return turn.states.values.shape[1]

@@ -20,7 +20,7 @@ from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import ANCHOR, round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import GameCrashed, GameHung, LeagueError
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -103,7 +103,7 @@ def test_slow_steps_add_up_in_any_thread(tmp_path: Path) -> None:
     settings = config("breaks")
     registry = league(tmp_path, settings, 1, 2)
     schedule, raised = schedule_of(registry, "fuse@1", "fuse@2"), []
-    environment = stepping(settings.environment, 2)
+    environment = stock_stepping(settings.environment, 2)
     player = MatchWorker(settings, registry)
     roster = {ref: player.contestant(ref) for ref in schedule.contestants}
 

@@ -6,7 +6,7 @@ from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
 from league.environment_config import EnvironmentConfig
 from league.environments.building import build
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment, Starts, Turn, each_agent_alone
 from league.errors import IllegalAction
 from tests.conformance.stepping import assert_abandoning_conforms, assert_stepping_conforms
@@ -33,7 +33,7 @@ ENVIRONMENTS = {
 def test_lockstep_equals_the_plain_loop(name: str, num_envs: int) -> None:
     config = ENVIRONMENTS[name]
     assert_stepping_conforms(
-        lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
+        lambda n: stock_stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
     )
 
 
@@ -42,7 +42,7 @@ def test_lockstep_equals_the_plain_loop(name: str, num_envs: int) -> None:
 def test_an_abandoned_episode_has_no_effect_on_the_next(name: str, num_envs: int) -> None:
     config = ENVIRONMENTS[name]
     assert_abandoning_conforms(
-        lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
+        lambda n: stock_stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
     )
 
 
@@ -55,7 +55,7 @@ def play_out(env: BatchedEnvironment, turn: Turn) -> list[Turn]:
 
 
 def test_truncated_agents_are_not_terminated_and_keep_their_last_observation() -> None:
-    env = stepping(counting(lives=[2, 3], truncated=[1]), num_envs=1)
+    env = stock_stepping(counting(lives=[2, 3], truncated=[1]), num_envs=1)
     turns = play_out(env, env.start(each_agent_alone([5], 2)))
     endings = [ending for turn in turns for ending in turn.each_ending()]
     flags = {ending.agent: (ending.terminated, ending.truncated) for ending in endings}
@@ -65,7 +65,7 @@ def test_truncated_agents_are_not_terminated_and_keep_their_last_observation() -
 
 
 def test_rewards_between_turns_are_summed() -> None:
-    env = stepping(counting(lives=[3, 3]), num_envs=1)
+    env = stock_stepping(counting(lives=[3, 3]), num_envs=1)
     turns = play_out(env, env.start(each_agent_alone([0], 2)))
     rewards = [(group, batch.rewards[0]) for turn in turns for group, batch in turn.batches.items()]
     assert rewards == [(0, 0.0), (1, 10.0), (0, 2.0), (1, 20.0), (0, 2.0), (1, 20.0)]
@@ -73,7 +73,7 @@ def test_rewards_between_turns_are_summed() -> None:
 
 
 def test_each_episode_is_reset_with_its_seed() -> None:
-    env = stepping(counting(lives=[1, 1]), num_envs=2)
+    env = stock_stepping(counting(lives=[1, 1]), num_envs=2)
     seeds = iter(range(10, 16))
     seeds_by_env: dict[int, list[int]] = {0: [], 1: []}
 
@@ -95,7 +95,7 @@ def test_each_episode_is_reset_with_its_seed() -> None:
 
 
 def test_groups_can_change_within_an_episode() -> None:
-    env = stepping(counting(lives=[2, 2]), num_envs=1)
+    env = stock_stepping(counting(lives=[2, 2]), num_envs=1)
     turn = env.start(episodes([0], [7, 7]))
     assert list(turn.batches) == [7]
     env.assign(np.array([0]), np.array([[1, 2]]))
@@ -104,7 +104,7 @@ def test_groups_can_change_within_an_episode() -> None:
 
 
 def test_agents_of_a_group_share_a_batch() -> None:
-    env = stepping(ENVIRONMENTS["connect_four"], num_envs=5)
+    env = stock_stepping(ENVIRONMENTS["connect_four"], num_envs=5)
     turn = env.start(episodes(range(5), [3, 3]))
     batch = turn.batches[3]
     assert batch.envs.tolist() == [0, 1, 2, 3, 4]
@@ -114,7 +114,7 @@ def test_agents_of_a_group_share_a_batch() -> None:
 
 @pytest.mark.parametrize("action", [9, -1])
 def test_an_illegal_action_is_rejected_before_any_step(action: int) -> None:
-    env = stepping(ENVIRONMENTS["tictactoe"], num_envs=2)
+    env = stock_stepping(ENVIRONMENTS["tictactoe"], num_envs=2)
     turn = env.start(each_agent_alone([0, 0], 2))
     with pytest.raises(IllegalAction, match=rf"action {action} of player_1 is illegal"):
         env.step({0: np.array([0, action])})
@@ -129,5 +129,5 @@ def test_checking_wrappers_are_removed_and_others_kept() -> None:
     wrapped = EnvironmentConfig.model_validate(
         {"entry_point": COUNTING, "wrappers": [{"frame_stack_v1": {"stack_size": 2}}]}
     )
-    env = stepping(wrapped, num_envs=1)
+    env = stock_stepping(wrapped, num_envs=1)
     assert env.start(each_agent_alone([0], 2)).batches[0].observations["observation"].shape == (1, 6)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
 from tests.support.environments.episodes import episodes
@@ -44,7 +44,7 @@ def reports(env: BatchedEnvironment, seed: int) -> dict[str, list[tuple[float, b
 
 
 def test_termination_and_truncation_are_kept_apart() -> None:
-    found = reports(stepping(config(leaves=[3, 3, 3], truncated=[1], arrives=[0, 0, 0]), 1), seed=0)
+    found = reports(stock_stepping(config(leaves=[3, 3, 3], truncated=[1], arrives=[0, 0, 0]), 1), seed=0)
     assert [flags[-1][1:] for flags in (found["agent_0"], found["agent_1"], found["agent_2"])] == [
         (True, False),
         (False, True),
@@ -61,7 +61,7 @@ def test_agents_join_and_leave_and_each_step_is_rewarded_once(data: st.DataObjec
     leaves[0] = max(leaves)
     arrives = [0] + [data.draw(st.integers(0, leave - 1)) for leave in leaves[1:]]
     cut = sorted(data.draw(st.sets(st.integers(0, n - 1))))
-    found = reports(stepping(config(arrives=arrives, leaves=leaves, truncated=cut), 1), seed=3)
+    found = reports(stock_stepping(config(arrives=arrives, leaves=leaves, truncated=cut), 1), seed=3)
     for i, (come, leave) in enumerate(zip(arrives, leaves, strict=True)):
         own = found[f"agent_{i}"]
         assert len(own) == leave - come + 1
@@ -71,8 +71,8 @@ def test_agents_join_and_leave_and_each_step_is_rewarded_once(data: st.DataObjec
 
 
 def test_episodes_do_not_depend_on_the_number_of_environments() -> None:
-    one = [reports(stepping(config(leaves=[2, 4]), 1), seed) for seed in range(5)]
-    env = stepping(config(leaves=[2, 4]), 3)
+    one = [reports(stock_stepping(config(leaves=[2, 4]), 1), seed) for seed in range(5)]
+    env = stock_stepping(config(leaves=[2, 4]), 3)
     turn = begin(env, list(range(5)))
     finished = len(turn.finished)
     rewards = 0.0
@@ -88,7 +88,7 @@ def test_episodes_do_not_depend_on_the_number_of_environments() -> None:
 @pytest.mark.parametrize("silent", [False, True])
 @pytest.mark.parametrize("truncated", [False, True])
 def test_rllibs_all_flag_ends_the_remaining_agents(silent: bool, truncated: bool) -> None:
-    env = stepping(config("rllib_meeting", ends=3, truncated=truncated, silent=silent), 1)
+    env = stock_stepping(config("rllib_meeting", ends=3, truncated=truncated, silent=silent), 1)
     turn = begin(env, [0])
     rows: dict[str, list[float]] = defaultdict(list)
     while turn.batches:
@@ -107,7 +107,7 @@ def test_rllibs_all_flag_ends_the_remaining_agents(silent: bool, truncated: bool
 
 
 def test_a_crash_affects_its_own_episode_only() -> None:
-    env = stepping(config(crashes=[1]), 2, crashes=1)
+    env = stock_stepping(config(crashes=[1]), 2, crashes=1)
     turn = begin(env, [0, 1, 2])
     crashed, finished, ended = [], [], []
     while turn.batches:
@@ -121,7 +121,7 @@ def test_a_crash_affects_its_own_episode_only() -> None:
 
 
 def test_only_consecutive_crashes_are_limited() -> None:
-    env = stepping(config(crashes=[0, 2, 4]), 1, crashes=1)
+    env = stock_stepping(config(crashes=[0, 2, 4]), 1, crashes=1)
     turn, crashed = begin(env, list(range(6))), 0
     while turn.batches:
         turn = env.step(zeros(turn))
@@ -140,7 +140,7 @@ class ReusedArrays(Simultaneous):
 
 
 def test_the_last_observation_survives_the_next_reset() -> None:
-    env = stepping(EnvironmentConfig(entry_point=f"{__name__}:ReusedArrays", kwargs={"truncated": [0, 1]}), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point=f"{__name__}:ReusedArrays", kwargs={"truncated": [0, 1]}), 1)
     turn = begin(env, [5, 6])
     while not turn.endings:
         turn = env.step(zeros(turn))
@@ -149,7 +149,7 @@ def test_the_last_observation_survives_the_next_reset() -> None:
 
 
 def test_an_environment_that_always_crashes_reraises() -> None:
-    env = stepping(config(crashes=list(range(10))), 1, crashes=2)
+    env = stock_stepping(config(crashes=list(range(10))), 1, crashes=2)
     turns = [env.start(each_agent_alone(itertools.count(), 2))]
 
     def play() -> None:
@@ -162,14 +162,14 @@ def test_an_environment_that_always_crashes_reraises() -> None:
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_reward_that_is_not_finite_is_rejected_despite_a_crash_budget(value: float) -> None:
-    env = stepping(config(bad_reward=value), 1, crashes=3)
+    env = stock_stepping(config(bad_reward=value), 1, crashes=3)
     turn = begin(env, [12])
     with pytest.raises(InvalidReward, match=rf"agent_0 got a reward of {value} in the episode with seed 12"):
         env.step(zeros(turn))
 
 
 def test_an_illegal_action_is_rejected_before_any_step() -> None:
-    env = stepping(config(), 2)
+    env = stock_stepping(config(), 2)
     turn = begin(env, [0, 1])
     actions = zeros(turn)
     actions[1][1] = 3
@@ -179,14 +179,14 @@ def test_an_illegal_action_is_rejected_before_any_step() -> None:
 
 
 def test_an_environment_without_rendering_is_reported() -> None:
-    env = stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1)
     begin(env, [0])
     with pytest.raises(EnvironmentMismatch, match="cannot be rendered"):
         env.render(0)
 
 
 def test_an_environment_is_rendered() -> None:
-    env = stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1, render_mode="rgb_array")
+    env = stock_stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1, render_mode="rgb_array")
     begin(env, [0])
     image = env.render(0)
     assert image.dtype == np.uint8
@@ -210,7 +210,7 @@ def repeated_termination() -> RepeatedTermination:
 
 
 def test_an_agent_terminates_once() -> None:
-    env = stepping(EnvironmentConfig(entry_point=f"{__name__}:repeated_termination"), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point=f"{__name__}:repeated_termination"), 1)
     turn = begin(env, [0])
     left = []
     while turn.batches:
@@ -234,7 +234,7 @@ def no_all_flag() -> NoAllFlag:
 
 
 def test_an_episode_without_agents_is_over() -> None:
-    env = stepping(EnvironmentConfig(entry_point=f"{__name__}:no_all_flag"), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point=f"{__name__}:no_all_flag"), 1)
     turn = begin(env, [0])
     finished = []
     while turn.batches:
@@ -284,7 +284,7 @@ def contract_violation(fault: str) -> ContractViolation:
 )
 @pytest.mark.parametrize("shared", [False, True])
 def test_contract_violations_are_rejected_with_the_agent(fault: str, message: str, shared: bool) -> None:
-    env = stepping(
+    env = stock_stepping(
         EnvironmentConfig(entry_point=f"{__name__}:contract_violation", kwargs={"fault": fault}), 1, crashes=3
     )
     groups = [0, 0] if shared else [0, 1]

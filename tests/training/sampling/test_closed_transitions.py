@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 
 from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch
 from league.seeds import generator
 from league.training_config import OpponentConfig, PPOConfig
@@ -99,7 +99,7 @@ def test_each_transition_is_recorded_once_with_its_successor(
 
 def joint(league: LeagueConfig, steps: int, num_envs: int = 2) -> TransitionBlock:
     interface_of_league = interface_of(league)
-    env = stepping(league.environment, num_envs, states=True)
+    env = stock_stepping(league.environment, num_envs, states=True)
     try:
         recorder = JointTransitions(interface_of_league, env.agents, num_envs)
         play = SelfPlay(
