@@ -108,6 +108,7 @@ class DifferentialTest:
     Each call resets or steps the same copies of both, and raises Difference at the first report that is not equal.
 
     Attributes:
+        rows: What the vectorised environment reported in the last call, without empty AgentRows.
         is_over: Whether no agent of a copy must act, (num_envs,) bool. True before the first reset.
         steps: Environment steps so far.
         episodes: Episodes that were played to their end.
@@ -129,6 +130,7 @@ class DifferentialTest:
         self._masks: dict[int, NDArray] = {}
         self._earlier: deque[Callable[[], None]] = deque()
         self.is_over: NDArray[np.bool_] = np.ones(self.num_envs, dtype=bool)
+        self.rows: list[AgentRows] = []
         self.steps, self.episodes = 0, 0
         self.vector_seconds, self.stock_seconds = 0.0, 0.0
 
@@ -154,6 +156,10 @@ class DifferentialTest:
             (agent, self._masks[agent][env] if agent in self._masks else None)
             for agent in np.flatnonzero(self._must_act[env]).tolist()
         ]
+
+    def action_space(self, agent: int) -> Space:
+        """Return the action space of an agent."""
+        return self._agents[agent].action
 
     def random_actions(self, env_ids: NDArray[np.int64], rng: np.random.Generator) -> NDArray:
         """Draw legal actions for all agents of some copies that must act, in the order of VectorEnv.step."""
@@ -214,7 +220,7 @@ class DifferentialTest:
         return next(agent.observation for agent in self._agents if agent.block == block)
 
     def _check_reports(self, expected: list[AgentRows], reported: Sequence[AgentRows]) -> None:
-        found = [rows for rows in reported if len(rows.envs)]
+        self.rows = found = [rows for rows in reported if len(rows.envs)]
         if len(found) != len(expected):
             raise Difference(f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space")
         where = RowNames([agent.name for agent in self._agents], self._seeds.copy(), self._steps.copy())
