@@ -120,13 +120,10 @@ class DifferentialTest:
         self._vector, self.num_envs = vector, vector.num_envs
         stock = [build(config) for _ in range(self.num_envs)]
         self._agents = _agents(stock[0])
-        names = tuple(agent.name for agent in self._agents)
-        if tuple(vector.possible_agents) != names:
-            raise Difference(f"possible_agents is {tuple(vector.possible_agents)}, in the stock environment {names}")
         splits = [_splitter(agent.observation) for agent in self._agents]
         self._stock = [adapter_for(env, splits) for env in stock]
         self._seeds, self._steps = np.zeros((2, self.num_envs), dtype=np.int64)
-        self._must_act = np.zeros((self.num_envs, len(names)), dtype=bool)
+        self._must_act = np.zeros((self.num_envs, len(self._agents)), dtype=bool)
         self._masks: dict[int, NDArray] = {}
         self._earlier: deque[Callable[[], None]] = deque()
         self.is_over: NDArray[np.bool_] = np.ones(self.num_envs, dtype=bool)
@@ -220,10 +217,13 @@ class DifferentialTest:
         return next(agent.observation for agent in self._agents if agent.block == block)
 
     def _check_reports(self, expected: list[AgentRows], reported: Sequence[AgentRows]) -> None:
+        names = tuple(agent.name for agent in self._agents)
+        if (agents := tuple(self._vector.possible_agents)) != names:
+            raise Difference(f"possible_agents is {agents}, in the stock environment {names}")
         self.rows = found = [rows for rows in reported if len(rows.envs)]
         if len(found) != len(expected):
             raise Difference(f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space")
-        where = RowNames([agent.name for agent in self._agents], self._seeds.copy(), self._steps.copy())
+        where = RowNames(names, self._seeds.copy(), self._steps.copy())
         for stock, vector in zip(expected, found, strict=True):
             check_rows(stock, vector, where)
         self._earlier.append(lambda: self._check_unchanged(expected, found, where))

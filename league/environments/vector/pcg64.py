@@ -37,7 +37,8 @@ def outputs(seeds: NDArray[np.int64], count: int) -> NDArray[np.uint64]:
 
 def uniform(outputs: NDArray[np.uint64], low: float, high: float) -> NDArray[np.float64]:
     """Return what `Generator.uniform(low, high)` makes of 64-bit outputs."""
-    return low + (high - low) * ((outputs >> 11) * 2.0**-53)
+    fractions = (outputs >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return low + (high - low) * fractions
 
 
 def integers(halves: NDArray[np.uint64], high: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -65,19 +66,19 @@ def _seed_sequence(seeds: NDArray[np.int64]) -> NDArray[np.uint64]:
         first = 4 + 3 * source
         pool[others] = _mixed(pool[others], _hashed(pool[source], constants[first : first + 4]))
     words = _hashed(np.concatenate([pool, pool]), _powers(0x8B51F9DD, 0x58F38DED, 9)).astype(np.uint64)
-    return words[0::2] | (words[1::2] << 32)
+    return words[0::2] | (words[1::2] << np.uint64(32))
 
 
 def _hashed(values: NDArray[np.uint32], constants: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """SeedSequence's `hashmix`. Each value uses a constant and the next one."""
     values = (values ^ constants[:-1]) * constants[1:]
-    return values ^ (values >> 16)
+    return values ^ (values >> np.uint32(16))
 
 
 def _mixed(x: NDArray[np.uint32], y: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """SeedSequence's `mix`."""
     mixed = x * np.uint32(0xCA01F9DD) - y * np.uint32(0x4973F715)
-    return mixed ^ (mixed >> 16)
+    return mixed ^ (mixed >> np.uint32(16))
 
 
 @cache
