@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from league.environment_config import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for
 from league.environments.building import action_space, build, observation_space
-from league.environments.vector.differences import Difference, RowNames, check_column, check_rows
+from league.environments.vector.differences import EnvironmentsDiffer, RowNames, check_column, check_rows
 from league.environments.vector.random_actions import random_actions
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import ACTION_MASK, Space, inputs
@@ -39,7 +39,8 @@ class Comparison:
         steps: Environment steps that were compared, resets not included.
         episodes: Episodes that were played to their end.
         difference: The first difference, in one line. None if all reports are equal.
-        vector_rate: Environment steps per second of the vectorised environment, including resets.
+        vector_rate: Environment steps per second of the vectorised environment, including resets. Many calls have few
+            copies, so that it is lower than in training.
         stock_rate: The same of the stock environment, including the adapter.
     """
 
@@ -66,7 +67,7 @@ def compare(config: EnvironmentConfig, vector: VectorEnv, steps: int, seed: int)
             if test.steps >= steps:
                 break
         test.finish()
-    except Difference as found:
+    except EnvironmentsDiffer as found:
         difference = str(found)
     finally:
         test.close()
@@ -105,7 +106,8 @@ class _Agent(NamedTuple):
 class DifferentialTest:
     """A vectorised environment and as many copies of its stock environment.
 
-    Each call resets or steps the same copies of both, and raises Difference at the first report that is not equal.
+    Each call resets or steps the same copies of both. It raises EnvironmentsDiffer at the first report that is not
+    equal.
 
     Attributes:
         rows: What the vectorised environment reported in the last call, without empty AgentRows.
@@ -219,10 +221,12 @@ class DifferentialTest:
     def _check_reports(self, expected: list[AgentRows], reported: Sequence[AgentRows]) -> None:
         names = tuple(agent.name for agent in self._agents)
         if (agents := tuple(self._vector.possible_agents)) != names:
-            raise Difference(f"possible_agents is {agents}, in the stock environment {names}")
+            raise EnvironmentsDiffer(f"possible_agents is {agents}, in the stock environment {names}")
         self.rows = found = [rows for rows in reported if len(rows.envs)]
         if len(found) != len(expected):
-            raise Difference(f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space")
+            raise EnvironmentsDiffer(
+                f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space"
+            )
         where = RowNames(names, self._seeds.copy(), self._steps.copy())
         for stock, vector in zip(expected, found, strict=True):
             check_rows(stock, vector, where)
@@ -235,19 +239,19 @@ class DifferentialTest:
         try:
             for stock, vector in zip(expected, found, strict=True):
                 check_rows(stock, vector, where)
-        except Difference as difference:
-            raise Difference(f"{difference} (changed after it was reported)") from None
+        except EnvironmentsDiffer as difference:
+            raise EnvironmentsDiffer(f"{difference} (changed after it was reported)") from None
 
     def _check_states(self, env_ids: NDArray[np.int64]) -> None:
         states, vector = [self._stock[env].state() for env in env_ids], self._vector.state(env_ids.copy())
         if states[0] is None:
             if vector is not None:
-                raise Difference("the environment has a state, the stock environment has none")
+                raise EnvironmentsDiffer("the environment has a state, the stock environment has none")
             return
         stock = np.array([np.asarray(state, dtype=np.float32).ravel() for state in states])
         where = RowNames([agent.name for agent in self._agents], self._seeds, self._steps)
         if vector is None:
-            raise Difference("the environment has no state, but the stock environment has one")
+            raise EnvironmentsDiffer("the environment has no state, but the stock environment has one")
         check_column("state", stock, vector, lambda row: where.text(int(env_ids[row])))
 
 

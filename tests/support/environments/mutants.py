@@ -17,9 +17,6 @@ class Mutation:
     old: str
     new: str
 
-    def __str__(self) -> str:
-        return f"{self.module.rpartition('.')[2]}: {self.old.strip()} → {self.new.strip()}"
-
 
 @contextlib.contextmanager
 def mutated(mutation: Mutation, modules: Sequence[str]) -> Iterator[ModuleType]:
