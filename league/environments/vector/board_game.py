@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +38,12 @@ class BoardGame(VectorEnv):
             TurnRows(env_ids, np.zeros(rows, dtype=np.int64), np.zeros(rows), np.zeros(rows, dtype=bool))
         )
 
-    def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
         moves = self._moves[env_ids]
         mover = moves & 1
         self._moves[env_ids] = moves + 1
         player = 2 * env_ids + mover
-        cell, won = self._place(env_ids, player, actions)
+        cell, won = self._place(env_ids, player, np.asarray(actions, dtype=np.int64))
         # 2 · copy + player ^ 1 is the opponent's row.
         self._planes[player, 2 * cell] = 1
         self._planes[player ^ 1, 2 * cell + 1] = 1

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from league.environments.vector.vector_env import AgentRows
 
 
-class Difference(Exception):
+class EnvironmentsDiffer(Exception):
     """A vectorised environment reported something else than the stock environment. The message is one line."""
 
 
@@ -27,11 +27,11 @@ class RowNames:
 
 
 def check_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> None:
-    """Raise Difference unless all columns are equal."""
+    """Raise EnvironmentsDiffer unless all columns are equal."""
     if not (np.array_equal(stock.envs, vector.envs) and np.array_equal(stock.agents, vector.agents)):
         raise _other_rows(stock, vector, where)
     if vector.observations.keys() != stock.observations.keys():
-        raise Difference(
+        raise EnvironmentsDiffer(
             f"observations are {', '.join(vector.observations)}, in the stock environment"
             f" {', '.join(stock.observations)}"
         )
@@ -45,19 +45,19 @@ def check_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> None:
         check_column(column, values, vector.observations[column], name)
 
 
-def _other_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> Difference:
+def _other_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> EnvironmentsDiffer:
     """The first row of another copy or agent."""
     expected, found = (list(zip(rows.envs.tolist(), rows.agents.tolist(), strict=True)) for rows in (stock, vector))
     row = next((row for row, pair in enumerate(expected) if found[row : row + 1] != [pair]), len(expected))
     has = f"of copy {found[row][0]}, agent {found[row][1]}" if row < len(found) else "missing"
     should = f"of {where.text(*expected[row])}" if row < len(expected) else "missing"
-    return Difference(f"row {row} is {has}, in the stock environment {should}")
+    return EnvironmentsDiffer(f"row {row} is {has}, in the stock environment {should}")
 
 
 def check_column(column: str, stock: NDArray, vector: NDArray, name: Callable[[int], str]) -> None:
-    """Raise Difference unless two arrays (k, …) have the same dtype, shape and bits."""
+    """Raise EnvironmentsDiffer unless two arrays (k, …) have the same dtype, shape and bits."""
     if (vector.dtype, vector.shape) != (stock.dtype, stock.shape):
-        raise Difference(
+        raise EnvironmentsDiffer(
             f"{name(0)}: {column} is {vector.dtype}{list(vector.shape)}, in the stock environment"
             f" {stock.dtype}{list(stock.shape)}"
         )
@@ -66,7 +66,7 @@ def check_column(column: str, stock: NDArray, vector: NDArray, name: Callable[[i
     differs = (_bits(stock) != _bits(vector)).any(axis=-1)
     row, *index = np.argwhere(differs)[0].tolist()
     found, expected = (array[(row, *index)].item() for array in (vector, stock))
-    raise Difference(f"{name(row)}: {column}{index or ''} is {found!r}, in the stock environment {expected!r}")
+    raise EnvironmentsDiffer(f"{name(row)}: {column}{index or ''} is {found!r}, in the stock environment {expected!r}")
 
 
 def _bits(array: NDArray) -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from league.environment_config import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for
 from league.environments.building import action_space, build, observation_space
-from league.environments.vector.differences import Difference, RowNames, check_column, check_rows
+from league.environments.vector.differences import EnvironmentsDiffer, RowNames, check_column, check_rows
 from league.environments.vector.random_actions import random_actions
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import ACTION_MASK, Space, inputs
@@ -39,7 +39,8 @@ class Comparison:
         steps: Environment steps that were compared, resets not included.
         episodes: Episodes that were played to their end.
         difference: The first difference, in one line. None if all reports are equal.
-        vector_rate: Environment steps per second of the vectorised environment, including resets.
+        vector_rate: Environment steps per second of the vectorised environment, including resets. Many calls have few
+            copies, so that it is lower than in training.
         stock_rate: The same of the stock environment, including the adapter.
     """
 
@@ -66,7 +67,7 @@ def compare(config: EnvironmentConfig, vector: VectorEnv, steps: int, seed: int)
             if test.steps >= steps:
                 break
         test.finish()
-    except Difference as found:
+    except EnvironmentsDiffer as found:
         difference = str(found)
     finally:
         test.close()
@@ -105,9 +106,11 @@ class _Agent(NamedTuple):
 class DifferentialTest:
     """A vectorised environment and as many copies of its stock environment.
 
-    Each call resets or steps the same copies of both, and raises Difference at the first report that is not equal.
+    Each call resets or steps the same copies of both. It raises EnvironmentsDiffer at the first report that is not
+    equal.
 
     Attributes:
+        rows: What the vectorised environment reported in the last call, without empty AgentRows.
         is_over: Whether no agent of a copy must act, (num_envs,) bool. True before the first reset.
         steps: Environment steps so far.
         episodes: Episodes that were played to their end.
@@ -119,16 +122,14 @@ class DifferentialTest:
         self._vector, self.num_envs = vector, vector.num_envs
         stock = [build(config) for _ in range(self.num_envs)]
         self._agents = _agents(stock[0])
-        names = tuple(agent.name for agent in self._agents)
-        if tuple(vector.possible_agents) != names:
-            raise Difference(f"possible_agents is {tuple(vector.possible_agents)}, in the stock environment {names}")
         splits = [_splitter(agent.observation) for agent in self._agents]
         self._stock = [adapter_for(env, splits) for env in stock]
         self._seeds, self._steps = np.zeros((2, self.num_envs), dtype=np.int64)
-        self._must_act = np.zeros((self.num_envs, len(names)), dtype=bool)
+        self._must_act = np.zeros((self.num_envs, len(self._agents)), dtype=bool)
         self._masks: dict[int, NDArray] = {}
         self._earlier: deque[Callable[[], None]] = deque()
         self.is_over: NDArray[np.bool_] = np.ones(self.num_envs, dtype=bool)
+        self.rows: list[AgentRows] = []
         self.steps, self.episodes = 0, 0
         self.vector_seconds, self.stock_seconds = 0.0, 0.0
 
@@ -154,6 +155,10 @@ class DifferentialTest:
             (agent, self._masks[agent][env] if agent in self._masks else None)
             for agent in np.flatnonzero(self._must_act[env]).tolist()
         ]
+
+    def action_space(self, agent: int) -> Space:
+        """Return the action space of an agent."""
+        return self._agents[agent].action
 
     def random_actions(self, env_ids: NDArray[np.int64], rng: np.random.Generator) -> NDArray:
         """Draw legal actions for all agents of some copies that must act, in the order of VectorEnv.step."""
@@ -214,10 +219,15 @@ class DifferentialTest:
         return next(agent.observation for agent in self._agents if agent.block == block)
 
     def _check_reports(self, expected: list[AgentRows], reported: Sequence[AgentRows]) -> None:
-        found = [rows for rows in reported if len(rows.envs)]
+        names = tuple(agent.name for agent in self._agents)
+        if (agents := tuple(self._vector.possible_agents)) != names:
+            raise EnvironmentsDiffer(f"possible_agents is {agents}, in the stock environment {names}")
+        self.rows = found = [rows for rows in reported if len(rows.envs)]
         if len(found) != len(expected):
-            raise Difference(f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space")
-        where = RowNames([agent.name for agent in self._agents], self._seeds.copy(), self._steps.copy())
+            raise EnvironmentsDiffer(
+                f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space"
+            )
+        where = RowNames(names, self._seeds.copy(), self._steps.copy())
         for stock, vector in zip(expected, found, strict=True):
             check_rows(stock, vector, where)
         self._earlier.append(lambda: self._check_unchanged(expected, found, where))
@@ -229,19 +239,19 @@ class DifferentialTest:
         try:
             for stock, vector in zip(expected, found, strict=True):
                 check_rows(stock, vector, where)
-        except Difference as difference:
-            raise Difference(f"{difference} (changed after it was reported)") from None
+        except EnvironmentsDiffer as difference:
+            raise EnvironmentsDiffer(f"{difference} (changed after it was reported)") from None
 
     def _check_states(self, env_ids: NDArray[np.int64]) -> None:
         states, vector = [self._stock[env].state() for env in env_ids], self._vector.state(env_ids.copy())
         if states[0] is None:
             if vector is not None:
-                raise Difference("the environment has a state, the stock environment has none")
+                raise EnvironmentsDiffer("the environment has a state, the stock environment has none")
             return
         stock = np.array([np.asarray(state, dtype=np.float32).ravel() for state in states])
         where = RowNames([agent.name for agent in self._agents], self._seeds, self._steps)
         if vector is None:
-            raise Difference("the environment has no state, but the stock environment has one")
+            raise EnvironmentsDiffer("the environment has no state, but the stock environment has one")
         check_column("state", stock, vector, lambda row: where.text(int(env_ids[row])))
 
 

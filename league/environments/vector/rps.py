@@ -38,8 +38,9 @@ class RockPaperScissors(VectorEnv):
         cycles = self._cycles[env_ids] + 1
         self._cycles[env_ids] = cycles
         opponents = pairs[:, ::-1]
-        wins = (pairs != opponents) & ((pairs > opponents) == ((pairs + opponents) % 2 == 1))
-        rewards = wins.astype(np.float64) - wins[:, ::-1]
+        higher_wins = (pairs + opponents) % 2 == 1
+        wins = (pairs > opponents) == higher_wins
+        rewards = np.where(pairs == opponents, 0.0, np.where(wins, 1.0, -1.0))
         return (_rows(env_ids, opponents.ravel(), rewards.ravel(), cycles >= self._max_cycles),)
 
 
