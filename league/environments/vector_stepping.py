@@ -80,7 +80,9 @@ class VectorStepping:
         crashed = no_envs()
         if self._pending:
             rows, crashed = self._step(_sorted_actions(self._pending, actions))
-        finished = self._finished(rows)
+        finished = np.flatnonzero(self._plays & ~self._acts(rows))
+        if len(crashed):
+            finished = np.setdiff1d(finished, crashed)
         self._crashes[finished] = 0
         turn = Turn(finished=finished, crashed=crashed, last_states=self._states(finished))
         turn.endings = [_rows(block, ended) for block in rows if len(ended := np.flatnonzero(_has_ended(block)))]
@@ -148,10 +150,10 @@ class VectorStepping:
             except Exception as error:
                 self._crash(envs, error)
                 self._renew(np.flatnonzero(self._plays))
-        if len(over := np.setdiff1d(envs, _acting(rows))):
+        self._plays[envs] = self._acts(rows)[envs]
+        if len(over := envs[~self._plays[envs]]):
             seed = self._episodes.seed(int(over[0]))
             raise EnvironmentMismatch(f"the episode with seed {seed} ends at its reset, without an action")
-        self._plays[envs] = True
         self._check_rewards(rows)
         return rows
 
@@ -216,13 +218,12 @@ class VectorStepping:
         self._vector = self._make(self.num_envs)
         self._episodes.in_vector(self._vector, envs)
 
-    def _finished(self, rows: Sequence[AgentRows]) -> Indices:
-        """Return the environments that have reported, and in which no agent must act."""
-        reported, acts = np.zeros(self.num_envs, dtype=bool), np.zeros(self.num_envs, dtype=bool)
+    def _acts(self, rows: Sequence[AgentRows]) -> NDArray[np.bool_]:
+        """Return in which environments an agent must act, (n,)."""
+        acts = np.zeros(self.num_envs, dtype=bool)
         for block in rows:
-            reported[block.envs] = True
-        acts[_acting(rows)] = True
-        return np.flatnonzero(reported & ~acts)
+            acts[block.envs[~_has_ended(block)]] = True
+        return acts
 
     def _check_rewards(self, rows: Sequence[AgentRows]) -> None:
         for block in rows:
@@ -255,9 +256,11 @@ class VectorStepping:
             name: _concatenated([block.observations[name] for block in blocks]) for name in blocks[0].observations
         }
         every_row = Batch(envs, agents, observations, rewards)
-        if len(blocks) == 1 and len(acting) == len(envs) and (groups == groups[0]).all():
-            return {int(groups[0]): every_row}
-        return {group: every_row.rows(acting[groups == group]) for group in np.unique(groups).tolist()}
+        present = np.flatnonzero(np.bincount(groups)).tolist()
+        if len(present) > 1:
+            return {group: every_row.rows(acting[groups == group]) for group in present}
+        is_unchanged = len(blocks) == 1 and len(acting) == len(envs)
+        return {group: every_row if is_unchanged else every_row.rows(acting) for group in present}
 
     def _states(self, envs: Indices) -> States | None:
         if not self._gives_states or not len(envs):
@@ -268,11 +271,6 @@ class VectorStepping:
 
 def _has_ended(rows: AgentRows) -> NDArray[np.bool_]:
     return rows.terminations | rows.truncations
-
-
-def _acting(blocks: Sequence[AgentRows]) -> Indices:
-    """Return the environment of each agent that must act."""
-    return np.concatenate([no_envs(), *(block.envs[~_has_ended(block)] for block in blocks)])
 
 
 def _rows(rows: AgentRows, chosen: Indices) -> AgentRows:
@@ -296,6 +294,9 @@ def _concatenated(columns: Sequence[NDArray]) -> NDArray:
 
 def _sorted_actions(batches: Mapping[int, Batch], actions: Mapping[int, NDArray]) -> StepActions:
     """Return the actions of all groups, sorted by environment, then by agent."""
+    if len(batches) == 1:
+        ((group, batch),) = batches.items()
+        return StepActions(batch.envs, batch.agents, actions[group])
     envs = _concatenated([batch.envs for batch in batches.values()])
     agents = _concatenated([batch.agents for batch in batches.values()])
     joined = _concatenated([actions[group] for group in batches])

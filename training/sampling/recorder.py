@@ -266,7 +266,7 @@ class EpisodeRecorder:
                 builder.discard(turn.crashed)
         for rows in turn.endings:
             policies = self._policy_of[rows.agents]
-            for policy in np.unique(policies).tolist():
+            for policy in np.flatnonzero(np.bincount(policies)).tolist():
                 self._builders[policy].end(rows, np.flatnonzero(policies == policy))
         for group, batch in turn.batches.items():
             if group < len(self._builders):
