@@ -1,6 +1,7 @@
 """Chooses between the stock environment in lockstep and a vectorised environment, which is faster and equal to it."""
 
 import importlib
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +14,8 @@ from league.environments.vector.vector_env import UnsupportedArguments, VectorEn
 from league.environments.vector_stepping import VectorStepping
 from league.errors import ConfigError
 from league.stack import VERIFIED, installed
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,9 @@ def implementation(config: EnvironmentConfig) -> Implementation:
 
 def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False) -> BatchedEnvironment:
     """Create environments that are stepped together, vectorised if possible. See `stock_stepping`."""
-    vector = implementation(config).vector
+    chosen = implementation(config)
+    logger.info("%s: %s", config.entry_point, chosen.reason)
+    vector = chosen.vector
     if vector is None:
         return stock_stepping(config, num_envs, crashes=crashes, states=states)
     make: Callable[[int], VectorEnv] = partial(vector, **config.kwargs)

@@ -44,7 +44,7 @@ class PPO(NoResultsDirectory, ppo.PPO):
     def training_step(self) -> None:
         """Sample a batch, update the learning policies, and send changed weights to the runners."""
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
-            chunks, results = self._sample()
+            chunks, results = self.sample_train_batch()
             self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
         with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
             learned = self.learner_group.update(
@@ -64,7 +64,7 @@ class PPO(NoResultsDirectory, ppo.PPO):
         """Drop all open episodes, and derive all further randomness from the seed and `steps`."""
         reset_episodes(self, steps)
 
-    def _sample(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
+    def sample_train_batch(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
         """Sample a train batch from all runners; return the chunks and the runners' metrics."""
         chunks: list[EpisodeChunks] = []
         results: list[dict[str, Any]] = []
