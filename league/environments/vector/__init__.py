@@ -1,0 +1,1 @@
+"""Vectorised environments: many copies stepped by array operations."""
