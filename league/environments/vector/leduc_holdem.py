@@ -19,7 +19,9 @@ class LeducHoldem(VectorEnv):
 
     def __init__(self, num_envs: int, **arguments: Any) -> None:
         if arguments:
-            raise UnsupportedArguments(f"leduc_holdem_v4 is vectorised without arguments, not with {sorted(arguments)}")
+            raise UnsupportedArguments(
+                f"leduc_holdem_v4 is vectorised without arguments, not with {', '.join(sorted(arguments))}"
+            )
         self.num_envs = num_envs
         self._tables = tables()
         self._situations = np.zeros(num_envs, dtype=np.int64)
@@ -35,8 +37,9 @@ class LeducHoldem(VectorEnv):
     def _rows(self, env_ids: NDArray[np.int64]) -> Sequence[AgentRows]:
         tables = self._tables
         rows = tables.rows[self._situations[env_ids]]
-        copies, agents = np.nonzero(rows >= 0)
-        rows = rows[copies, agents]
+        has_row = rows >= 0
+        copies, _ = np.nonzero(has_row)
+        rows = rows[has_row]
         return (
             AgentRows(
                 envs=env_ids[copies],

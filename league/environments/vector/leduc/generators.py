@@ -20,7 +20,7 @@ class Generators:
         self._used = np.zeros(len(seeds), dtype=np.int64)
 
     def integers(self, highest: int) -> NDArray[np.int64]:
-        """Draw an integer from 0 to `highest` from each generator, (m,).
+        """Draw an integer from 0 to `highest` (at least 1) from each generator, (m,).
 
         RandomState takes the lowest bits of its outputs, and skips outputs that are too high.
         """
