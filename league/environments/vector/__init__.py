@@ -1,1 +1,1 @@
-"""Vectorised environments: many copies stepped by array operations."""
+"""Vectorised environments: faster implementations of PettingZoo environments, equal to them bit by bit."""

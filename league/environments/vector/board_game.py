@@ -1,0 +1,82 @@
+"""Board games in which two players place pieces alternately until one completes a line or the board is full."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+
+
+class BoardGame(VectorEnv):
+    """The part that such games share: turns, observations, masks, endings and rewards.
+
+    An observation has two planes, the agent's own pieces and those of the opponent, (rows, columns, 2) int8. Both
+    observations of a copy are kept, and a move changes one number in each. The winner gets 1 and the loser -1.
+    """
+
+    def __init__(self, num_envs: int, shape: tuple[int, int], num_actions: int) -> None:
+        self.num_envs = num_envs
+        self._shape, self._cells = (*shape, 2), shape[0] * shape[1]
+        # Two rows for each copy, one for each player: 2 · copy + player.
+        self._planes = np.zeros((num_envs * 2, self._cells * 2), dtype=np.int8)
+        self._masks = np.ones((num_envs, num_actions), dtype=np.int8)
+        self._moves = np.zeros(num_envs, dtype=np.int64)
+
+    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
+        del seeds  # nothing is random
+        self._planes[2 * env_ids] = 0
+        self._planes[2 * env_ids + 1] = 0
+        self._masks[env_ids] = 1
+        self._moves[env_ids] = 0
+        self._clear(env_ids)
+        none = np.zeros(len(env_ids), dtype=bool)
+        return (self._rows(env_ids, np.zeros(len(env_ids), dtype=np.int64), np.zeros(len(env_ids)), none),)
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
+        moves = self._moves[env_ids]
+        mover = moves & 1
+        cell, won = self._place(env_ids, mover, actions)
+        planes = self._planes.reshape(-1)
+        own = (2 * env_ids + mover) * (2 * self._cells) + 2 * cell
+        planes[own] = 1
+        # The opponent's row is the next one of the first player, and the previous one of the second.
+        planes[own + (1 - 2 * mover) * (2 * self._cells) + 1] = 1
+        self._moves[env_ids] = moves + 1
+        over = won | (moves == self._cells - 1)
+        # At the end, both players have a row: first the one whose turn it would be.
+        copies = np.repeat(np.arange(len(env_ids)), 1 + over)
+        second = np.zeros(len(copies), dtype=bool)
+        second[1:] = copies[1:] == copies[:-1]
+        won, over = won[copies], over[copies]
+        agents = np.where(second, mover[copies], 1 - mover[copies])
+        rewards = np.where(won, np.where(second, 1.0, -1.0), 0.0)
+        return (self._rows(env_ids[copies], agents, rewards, over),)
+
+    @abstractmethod
+    def _place(
+        self, env_ids: NDArray[np.int64], mover: NDArray[np.int64], actions: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Place a piece of the player `mover` in each copy, and update the masks.
+
+        Returns:
+            The cells, (m,), row by row from the top left of the observation, and whether the mover has won, (m,).
+        """
+
+    @abstractmethod
+    def _clear(self, env_ids: NDArray[np.int64]) -> None:
+        """Remove all pieces."""
+
+    def _rows(
+        self,
+        envs: NDArray[np.int64],
+        agents: NDArray[np.int64],
+        rewards: NDArray[np.float64],
+        terminations: NDArray[np.bool_],
+    ) -> AgentRows:
+        observations = {
+            "observation": self._planes.take(2 * envs + agents, axis=0).reshape(-1, *self._shape),
+            "action_mask": self._masks.take(envs, axis=0),
+        }
+        return AgentRows(envs, agents, observations, rewards, terminations, np.zeros(len(envs), dtype=bool))
