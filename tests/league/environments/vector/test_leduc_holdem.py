@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from league.environment_config import EnvironmentConfig
 from league.environments.vector import leduc_holdem
+from league.environments.vector.equality import Comparison, DifferentialTest, compare
 from league.environments.vector.leduc import deals, rules
 from league.environments.vector.leduc.deals import deal
 from league.environments.vector.leduc.generators import Generators
 from league.environments.vector.leduc.rules import CALL, CHECK, FOLD, RAISE, Situation
 from league.environments.vector.leduc.tables import tables
 from league.environments.vector.leduc_holdem import LeducHoldem
-from league.environments.vector.vector_env import UnsupportedArguments
+from league.environments.vector.vector_env import AgentRows, UnsupportedArguments
 from league.spaces import ACTION_MASK, OBSERVATION
-from tests.support.environments.stock_copies import ComparedEnv
 
 LEDUC = EnvironmentConfig(entry_point="pettingzoo.classic.leduc_holdem_v4")
 JACK, QUEEN, KING = range(3)
@@ -50,8 +50,14 @@ LINES = [*FOLDS_1, *(first + second for first in ROUND_1 for second in ROUND_2)]
 MOST_CHIPS = [RAISE, RAISE, CALL, RAISE, RAISE, CALL]
 
 
-def compared(num_envs: int) -> ComparedEnv:
-    return ComparedEnv(LEDUC, leduc_holdem.LeducHoldem(num_envs))
+def play(seed: int, actions: list[int]) -> AgentRows:
+    """Play legal actions in one copy. Returns the last reports."""
+    env, copy = LeducHoldem(1), np.array([0])
+    (rows,) = env.reset(copy, np.array([seed]))
+    for action in actions:
+        assert rows.observations[ACTION_MASK][0, action], f"action {action} is illegal"
+        (rows,) = env.step(copy, np.array([action]))
+    return rows
 
 
 def seed_of(small_blind: int, first: int, second: int, public: int) -> int:
@@ -63,59 +69,66 @@ def seed_of(small_blind: int, first: int, second: int, public: int) -> int:
 def test_all_lines_with_all_deals() -> None:
     cards = [cards for cards in product(range(3), repeat=3) if len(set(cards)) > 1]
     seeds = np.array([seed_of(small_blind, *each) for small_blind in (0, 1) for each in cards])
-    env = compared(len(seeds))
+    copies = np.arange(len(seeds))
+    test = DifferentialTest(LEDUC, LeducHoldem(len(seeds)))
     for actions in LINES:
-        assert env.play(seeds, actions).terminations.all()
+        test.reset(copies, seeds)
+        for action in actions:
+            assert all(legal_actions(test, copy)[action] for copy in copies)
+            test.step(copies, np.full(len(seeds), action))
+        assert test.is_over.all()
+    test.finish()
+
+
+def legal_actions(test: DifferentialTest, copy: int) -> NDArray:
+    ((_, mask),) = test.legal(copy)
+    assert mask is not None
+    return mask
 
 
 IDLE, RESET, STEP = range(3)
-INSTRUCTIONS = st.lists(
-    st.lists(st.tuples(st.sampled_from([IDLE, RESET, STEP, STEP, STEP]), st.integers(0, 2**31 - 1)), min_size=5),
-    max_size=12,
-)
+INSTRUCTIONS = st.tuples(st.sampled_from([IDLE, RESET, STEP, STEP, STEP]), st.integers(0, 2**31 - 1))
+"""What a copy does in a call. The number is the seed or chooses the action."""
 
 
 @settings(max_examples=60)
-@given(st.integers(1, 5), INSTRUCTIONS)
+@given(st.integers(1, 5), st.lists(st.lists(INSTRUCTIONS, min_size=5, max_size=5), max_size=12))
 def test_any_sequence_of_calls(num_envs: int, calls: list[list[tuple[int, int]]]) -> None:
-    env = compared(num_envs)
-    env.reset(np.arange(num_envs), np.arange(num_envs))
+    test = DifferentialTest(LEDUC, LeducHoldem(num_envs))
+    test.reset(np.arange(num_envs), np.arange(num_envs))
     for call in calls:
         numbers = np.array([number for _, number in call])
-        resets = np.array([copy for copy in range(num_envs) if call[copy][0] == RESET])
-        steps = np.array([copy for copy in range(num_envs) if call[copy][0] == STEP and env.masks[copy].any()])
-        if len(resets):
-            env.reset(resets, numbers[resets])
-        if len(steps):
-            env.step(steps, np.array([legal_action(env.masks[copy], numbers[copy]) for copy in steps]))
-
-
-def legal_action(mask: NDArray, number: int) -> int:
-    legal = np.flatnonzero(mask)
-    return int(legal[number % len(legal)])
+        kinds = np.array([kind for kind, _ in call[:num_envs]])
+        starting = np.flatnonzero(kinds == RESET)
+        test.reset(starting, numbers[starting])
+        stepped = np.flatnonzero((kinds == STEP) & ~test.is_over)
+        legal = [np.flatnonzero(legal_actions(test, copy)) for copy in stepped]
+        actions = [of_copy[numbers[copy] % len(of_copy)] for copy, of_copy in zip(stepped, legal, strict=True)]
+        test.step(stepped, np.array(actions))
+    test.finish()
 
 
 @pytest.mark.parametrize("small_blind", [0, 1])
 def test_the_player_with_the_small_blind_starts(small_blind: int) -> None:
-    rows = compared(1).play(np.array([seed_of(small_blind, KING, QUEEN, JACK)]), [])
+    rows = play(seed_of(small_blind, KING, QUEEN, JACK), [])
     assert rows.agents.tolist() == [small_blind]
     assert np.flatnonzero(rows.observations[OBSERVATION][0]).tolist() == [[KING, QUEEN][small_blind], 6 + 1, 21 + 2]
 
 
 def test_each_round_allows_two_raises() -> None:
-    env, seeds = compared(1), np.array([seed_of(0, KING, QUEEN, JACK)])
+    seed = seed_of(0, KING, QUEEN, JACK)
     capped = [CALL, FOLD]
     for actions in (MOST_CHIPS[:2], MOST_CHIPS[:5]):
-        rows = env.play(seeds, actions)
+        rows = play(seed, actions)
         assert np.flatnonzero(rows.observations[ACTION_MASK][0]).tolist() == capped
-    assert env.play(seeds, MOST_CHIPS).rewards.tolist() == [7, -7]
+    assert play(seed, MOST_CHIPS).rewards.tolist() == [7, -7]
 
 
 @pytest.mark.parametrize(
     ("actions", "reward"), [([FOLD], -0.5), ([CALL, FOLD], 1), ([CALL, CHECK, RAISE, FOLD], 1), ([RAISE, FOLD], 1)]
 )
 def test_a_player_who_folds_loses_the_chips(actions: list[int], reward: float) -> None:
-    rows = compared(1).play(np.array([seed_of(0, JACK, KING, KING)]), actions)
+    rows = play(seed_of(0, JACK, KING, KING), actions)
     assert rows.rewards.tolist() == [reward, -reward]
     assert rows.agents.tolist() == [0, 1]
     assert not rows.observations[ACTION_MASK].any()
@@ -133,15 +146,15 @@ def test_a_player_who_folds_loses_the_chips(actions: list[int], reward: float) -
 )
 def test_a_showdown(cards: tuple[int, int, int], reward: float) -> None:
     for small_blind in (0, 1):
-        rows = compared(1).play(np.array([seed_of(small_blind, *cards)]), MOST_CHIPS)
+        rows = play(seed_of(small_blind, *cards), MOST_CHIPS)
         assert rows.rewards.tolist() == [reward, -reward]
         assert not np.signbit(rows.rewards[rows.rewards == 0]).any()
 
 
 def test_the_public_card_is_hidden_in_the_first_round() -> None:
-    env, seeds = compared(1), np.array([seed_of(0, KING, QUEEN, JACK)])
+    seed = seed_of(0, KING, QUEEN, JACK)
     for actions, public in (([CALL], []), ([RAISE, FOLD], []), ([CALL, CHECK], [JACK]), ([CALL, CHECK, FOLD], [JACK])):
-        rows = env.play(seeds, actions)
+        rows = play(seed, actions)
         for features in rows.observations[OBSERVATION]:
             assert np.flatnonzero(features[3:6]).tolist() == public
 
@@ -152,29 +165,20 @@ def test_arguments_are_not_supported(name: str) -> None:
         LeducHoldem(1, **{name: 2})
 
 
-def play_randomly(num_envs: int, steps: int) -> None:
-    """Play random legal actions in random subsets of the copies, which are sometimes reset in mid-episode."""
-    env, rng = compared(num_envs), np.random.default_rng(0)
-    env.reset(np.arange(num_envs), rng.integers(2**31, size=num_envs))
-    taken = 0
-    while taken < steps:
-        live = env.masks.any(axis=1)
-        acting = np.flatnonzero(live & (rng.random(num_envs) < 0.9))
-        if len(acting):
-            env.step(acting, (rng.random((len(acting), 4)) * env.masks[acting]).argmax(axis=1))
-        taken += len(acting)
-        starting = np.flatnonzero(~env.masks.any(axis=1) | (rng.random(num_envs) < 0.01))
-        if len(starting):
-            env.reset(starting, rng.integers(2**31, size=len(starting)))
+def random_play(num_envs: int, steps: int) -> Comparison:
+    return compare(LEDUC, leduc_holdem.LeducHoldem(num_envs), steps, seed=0)
 
 
 def test_random_play() -> None:
-    play_randomly(num_envs=16, steps=2000)
+    assert random_play(num_envs=16, steps=3000).difference is None
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_million_steps() -> None:
-    play_randomly(num_envs=64, steps=10**6)
+    comparison = random_play(num_envs=64, steps=10**6)
+    assert comparison.difference is None
+    assert comparison.steps >= 10**6
 
 
 def in_tables(**change: Callable[[NDArray], NDArray]) -> tuple[Any, str, Any]:
@@ -290,5 +294,4 @@ def uncached(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_found(name: str, uncached: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*FAULTS[name])
-    with pytest.raises(AssertionError):
-        play_randomly(num_envs=16, steps=2000)
+    assert random_play(num_envs=16, steps=3000).difference is not None
