@@ -37,31 +37,37 @@ class BoardGame(VectorEnv):
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
         moves = self._moves[env_ids]
         mover = moves & 1
-        cell, won = self._place(env_ids, mover, actions)
-        planes = self._planes.reshape(-1)
-        own = (2 * env_ids + mover) * (2 * self._cells) + 2 * cell
-        planes[own] = 1
-        # The opponent's row is the next one of the first player, and the previous one of the second.
-        planes[own + (1 - 2 * mover) * (2 * self._cells) + 1] = 1
         self._moves[env_ids] = moves + 1
+        player = 2 * env_ids + mover
+        cell, won = self._place(env_ids, player, actions)
+        # 2 · copy + player ^ 1 is the opponent's row.
+        self._planes[player, 2 * cell] = 1
+        self._planes[player ^ 1, 2 * cell + 1] = 1
         over = won | (moves == self._cells - 1)
-        # At the end, both players have a row: first the one whose turn it would be.
-        copies = np.repeat(np.arange(len(env_ids)), 1 + over)
-        second = np.zeros(len(copies), dtype=bool)
-        second[1:] = copies[1:] == copies[:-1]
-        won, over = won[copies], over[copies]
-        agents = np.where(second, mover[copies], 1 - mover[copies])
-        rewards = np.where(won, np.where(second, 1.0, -1.0), 0.0)
-        return (self._rows(env_ids[copies], agents, rewards, over),)
+        # At the end both players have a row: first the one whose turn it would be.
+        envs, agents = np.repeat(env_ids, 1 + over), np.repeat(mover ^ 1, 1 + over)
+        rewards, terminations = np.zeros(len(envs)), np.zeros(len(envs), dtype=bool)
+        ended = np.flatnonzero(over)
+        last = ended + np.arange(1, len(ended) + 1)
+        agents[last] ^= 1
+        rewards[last[won[ended]]] = 1
+        rewards[last[won[ended]] - 1] = -1
+        terminations[last] = terminations[last - 1] = True
+        return (self._rows(envs, agents, rewards, terminations),)
 
     @abstractmethod
     def _place(
-        self, env_ids: NDArray[np.int64], mover: NDArray[np.int64], actions: NDArray[np.int64]
+        self, env_ids: NDArray[np.int64], players: NDArray[np.int64], actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Place a piece of the player `mover` in each copy, and update the masks.
+        """Place a piece in each copy, and update the masks.
+
+        Args:
+            env_ids: Copies, (m,).
+            players: 2 · copy + player, (m,).
+            actions: (m,).
 
         Returns:
-            The cells, (m,), row by row from the top left of the observation, and whether the mover has won, (m,).
+            The cells, (m,), row by row from the top left of the observation, and whether the player has won, (m,).
         """
 
     @abstractmethod

@@ -29,15 +29,14 @@ class ConnectFour(BoardGame):
         self._heights = np.zeros(num_envs * COLUMNS, dtype=np.int64)
 
     def _place(
-        self, env_ids: NDArray[np.int64], mover: NDArray[np.int64], actions: NDArray[np.int64]
+        self, env_ids: NDArray[np.int64], players: NDArray[np.int64], actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         column = env_ids * COLUMNS + actions
         height = self._heights[column]
         self._heights[column] = height + 1
         self._masks.reshape(-1)[column] = height < ROWS - 1
-        board = 2 * env_ids + mover
-        pieces = self._boards[board] | np.left_shift(np.uint64(1), (actions * STRIDE + height).astype(np.uint64))
-        self._boards[board] = pieces
+        pieces = self._boards[players] | np.left_shift(np.uint64(1), (actions * STRIDE + height).astype(np.uint64))
+        self._boards[players] = pieces
         return (ROWS - 1 - height) * COLUMNS + actions, has_four(pieces)
 
     def _clear(self, env_ids: NDArray[np.int64]) -> None:

@@ -25,12 +25,11 @@ class TicTacToe(BoardGame):
         self._boards = np.zeros(num_envs * 2, dtype=np.int64)
 
     def _place(
-        self, env_ids: NDArray[np.int64], mover: NDArray[np.int64], actions: NDArray[np.int64]
+        self, env_ids: NDArray[np.int64], players: NDArray[np.int64], actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         self._masks.reshape(-1)[env_ids * 9 + actions] = 0
-        board = 2 * env_ids + mover
-        pieces = self._boards[board] | (1 << actions)
-        self._boards[board] = pieces
+        pieces = self._boards[players] | (1 << actions)
+        self._boards[players] = pieces
         return actions, IS_WIN[pieces]
 
     def _clear(self, env_ids: NDArray[np.int64]) -> None:
