@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from league.environments.vector.alternation import TurnRows, rows_after_move
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 
 
@@ -31,8 +32,10 @@ class BoardGame(VectorEnv):
         self._masks[env_ids] = 1
         self._moves[env_ids] = 0
         self._clear(env_ids)
-        none = np.zeros(len(env_ids), dtype=bool)
-        return (self._rows(env_ids, np.zeros(len(env_ids), dtype=np.int64), np.zeros(len(env_ids)), none),)
+        rows = len(env_ids)
+        return self._reports(
+            TurnRows(env_ids, np.zeros(rows, dtype=np.int64), np.zeros(rows), np.zeros(rows, dtype=bool))
+        )
 
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
         moves = self._moves[env_ids]
@@ -44,16 +47,7 @@ class BoardGame(VectorEnv):
         self._planes[player, 2 * cell] = 1
         self._planes[player ^ 1, 2 * cell + 1] = 1
         over = won | (moves == self._cells - 1)
-        # At the end both players have a row: first the one whose turn it would be.
-        envs, agents = np.repeat(env_ids, 1 + over), np.repeat(mover ^ 1, 1 + over)
-        rewards, terminations = np.zeros(len(envs)), np.zeros(len(envs), dtype=bool)
-        ended = np.flatnonzero(over)
-        last = ended + np.arange(1, len(ended) + 1)
-        agents[last] ^= 1
-        rewards[last[won[ended]]] = 1
-        rewards[last[won[ended]] - 1] = -1
-        terminations[last] = terminations[last - 1] = True
-        return (self._rows(envs, agents, rewards, terminations),)
+        return self._reports(rows_after_move(env_ids, mover, over, won))
 
     @abstractmethod
     def _place(
@@ -74,15 +68,9 @@ class BoardGame(VectorEnv):
     def _clear(self, env_ids: NDArray[np.int64]) -> None:
         """Remove all pieces."""
 
-    def _rows(
-        self,
-        envs: NDArray[np.int64],
-        agents: NDArray[np.int64],
-        rewards: NDArray[np.float64],
-        terminations: NDArray[np.bool_],
-    ) -> AgentRows:
+    def _reports(self, rows: TurnRows) -> tuple[AgentRows]:
         observations = {
-            "observation": self._planes.take(2 * envs + agents, axis=0).reshape(-1, *self._shape),
-            "action_mask": self._masks.take(envs, axis=0),
+            "observation": self._planes.take(2 * rows.envs + rows.agents, axis=0).reshape(-1, *self._shape),
+            "action_mask": self._masks.take(rows.envs, axis=0),
         }
-        return AgentRows(envs, agents, observations, rewards, terminations, np.zeros(len(envs), dtype=bool))
+        return (AgentRows(rows.envs, rows.agents, observations, *rows[2:], np.zeros(len(rows.envs), dtype=bool)),)

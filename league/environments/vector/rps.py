@@ -19,8 +19,8 @@ class RockPaperScissors(VectorEnv):
     def __init__(self, num_envs: int, *, num_actions: int = 3, max_cycles: int = 15, **kwargs: object) -> None:
         if kwargs:
             raise UnsupportedArguments(f"rock paper scissors is not vectorised with {', '.join(kwargs)}")
-        if type(num_actions) is not int or num_actions < 3 or num_actions % 2 == 0:
-            raise UnsupportedArguments(f"num_actions is {num_actions}, expected an odd number from 3")
+        if not (isinstance(num_actions, int) and num_actions >= 3 and num_actions % 2 and isinstance(max_cycles, int)):
+            raise UnsupportedArguments(f"rock paper scissors has no num_actions {num_actions}, max_cycles {max_cycles}")
         self.num_envs = num_envs
         self._num_actions, self._max_cycles = num_actions, max_cycles
         self._cycles = np.zeros(num_envs, dtype=np.int64)
