@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import pytest
@@ -251,6 +252,19 @@ def error_codes(node: Any) -> Iterator[str]:
         node = list(node.values())
     for child in node if isinstance(node, list) else ():
         yield from error_codes(child)
+
+
+def test_the_code_of_the_tutorial_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = DOCS / "vectorised-environments.md"
+    example = (ROOT / "examples/kuhn_poker_vector.py").read_text()
+    names: dict[str, object] = {}
+    for block in fenced(page, "python"):
+        if indent(block, "    ") not in example:  # not a method of the example
+            exec(compile(block, str(page), "exec"), names)
+    printed = capsys.readouterr().out
+    shown = fenced(page, "text")
+    assert shown
+    assert [text for text in shown if text not in printed] == []
 
 
 RETIRED = (
