@@ -87,9 +87,8 @@ def connect_four(quick: bool) -> bool:
 
 def against_rllib(entry_point: str, quick: bool, best: float, default: float) -> bool:
     """One runner compared with RLlib's, for several numbers of environments."""
-    runners: dict[Hashable, EnvRunner] = {
-        ("ours", num_envs): ours(entry_point, num_envs) for num_envs in (*NUM_ENVS, *MANY_ENVS)
-    }
+    sizes = (*NUM_ENVS, *MANY_ENVS)
+    runners: dict[Hashable, EnvRunner] = {("ours", num_envs): ours(entry_point, num_envs) for num_envs in sizes}
     runners |= {("RLlib", num_envs): rllib(entry_point, num_envs) for num_envs in NUM_ENVS}
     for runner in runners.values():
         runner.sample(num_timesteps=500)

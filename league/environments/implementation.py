@@ -32,6 +32,9 @@ VECTORISED = {
     "pettingzoo.classic.connect_four_v3": Verified(f"{VECTOR}.connect_four:ConnectFour", "aec", ("pettingzoo",)),
     "pettingzoo.classic.tictactoe_v3": Verified(f"{VECTOR}.tictactoe:TicTacToe", "aec", ("pettingzoo",)),
     "pettingzoo.classic.rps_v2": Verified(f"{VECTOR}.rps:RockPaperScissors", "parallel", ("pettingzoo",)),
+    "pettingzoo.classic.leduc_holdem_v4": Verified(
+        f"{VECTOR}.leduc_holdem:LeducHoldem", "aec", ("pettingzoo", "rlcard")
+    ),
     "mpe2.simple_spread_v3": Verified(f"{VECTOR}.mpe.simple_spread:SimpleSpread", "parallel", ("mpe2",)),
     "mpe2.simple_adversary_v3": Verified(f"{VECTOR}.mpe.simple_adversary:SimpleAdversary", "parallel", ("mpe2",)),
     "mpe2.simple_tag_v3": Verified(f"{VECTOR}.mpe.simple_tag:SimpleTag", "parallel", ("mpe2",)),

@@ -32,6 +32,7 @@ def copied(name: str, **kwargs: Any) -> EnvironmentConfig:
 ENVIRONMENTS = {
     "connect four": EnvironmentConfig(entry_point="pettingzoo.classic.connect_four_v3"),
     "tic-tac-toe": EnvironmentConfig(entry_point="pettingzoo.classic.tictactoe_v3"),
+    "Leduc hold'em": EnvironmentConfig(entry_point="pettingzoo.classic.leduc_holdem_v4"),
     "rock, paper, scissors": EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2", kwargs={"max_cycles": 4}),
     "spread": EnvironmentConfig(entry_point="mpe2.simple_spread_v3", kwargs={"max_cycles": 5}),
     "two kinds of agents": EnvironmentConfig(entry_point="mpe2.simple_adversary_v3", kwargs={"max_cycles": 5}),
