@@ -32,17 +32,18 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv, PettingZooEnv
-from ray.rllib.execution.rollout_ops import synchronous_parallel_sample
 from ray.tune.registry import register_env
 
 from league.config import LeagueConfig
 from league.environments.building import interface
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.ppo import PPO, algorithm_config
 from training.modules.actor_critic import ActorCritic
 from training.runs.trial import build_algorithm
 from training.sampling.env_runner import LockstepEnvRunner
 
 NUM_ENVS = (1, 4, 8, 16, 32, 64)
+MANY_ENVS = (256, 1024)
+"""Only for our runner."""
 HIDDEN = (256, 256)
 SPREAD, FOUR, LEDUC = (
     "mpe2.simple_spread_v3",
@@ -86,19 +87,21 @@ def connect_four(quick: bool) -> bool:
 
 def against_rllib(entry_point: str, quick: bool, best: float, default: float) -> bool:
     """One runner compared with RLlib's, for several numbers of environments."""
-    runners: dict[Hashable, EnvRunner] = {("ours", num_envs): ours(entry_point, num_envs) for num_envs in NUM_ENVS}
+    sizes = (*NUM_ENVS, *MANY_ENVS)
+    runners: dict[Hashable, EnvRunner] = {("ours", num_envs): ours(entry_point, num_envs) for num_envs in sizes}
     runners |= {("RLlib", num_envs): rllib(entry_point, num_envs) for num_envs in NUM_ENVS}
     for runner in runners.values():
         runner.sample(num_timesteps=500)
     seconds = 0.5 if quick else 2.0
-    rates = in_rounds(
+    rates: dict[tuple[str, int], float] = in_rounds(
         {key: lambda runner=runner: sampling_rate(runner, entry_point, seconds) for key, runner in runners.items()},
         rounds=2 if quick else 5,
     )
     print(f"{'num_envs':>8} {'ours':>12} {'RLlib':>12}   environment steps/s in one runner")
-    for num_envs in NUM_ENVS:
-        print(f"{num_envs:>8} {rates['ours', num_envs]:>12,.0f} {rates['RLlib', num_envs]:>12,.0f}")
-    top = {name: max(rates[name, num_envs] for num_envs in NUM_ENVS) for name in ("ours", "RLlib")}
+    for num_envs in sizes:
+        theirs = f"{rates['RLlib', num_envs]:>12,.0f}" if num_envs in NUM_ENVS else ""
+        print(f"{num_envs:>8} {rates['ours', num_envs]:>12,.0f} {theirs}")
+    top = {name: max(rate for (whose, _), rate in rates.items() if whose == name) for name in ("ours", "RLlib")}
     met = [
         report("ours against RLlib's best", top["ours"] / top["RLlib"], best),
         report("ours against RLlib's default (1 environment)", top["ours"] / rates["RLlib", 1], default),
@@ -156,10 +159,7 @@ def runners(quick: bool) -> bool:
         for count in (1, 2)
     }
     rates = in_rounds(
-        {
-            count: lambda algorithm=algorithm: gathering_rate(algorithm, batch)
-            for count, algorithm in algorithms.items()
-        },
+        {count: lambda algorithm=algorithm: gathering_rate(algorithm) for count, algorithm in algorithms.items()},
         rounds=5 if quick else 15,
     )
     for algorithm in algorithms.values():
@@ -232,11 +232,13 @@ def in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int) -> Any:
 
 def sampling_rate(runner: EnvRunner, entry_point: str, seconds: float) -> float:
     """Environment steps per second, including episodes for a learner. RLlib counts steps, our runner counts actions."""
-    share = AGENTS[entry_point] if isinstance(runner, LockstepEnvRunner) else 1
+    is_ours = isinstance(runner, LockstepEnvRunner)
+    sample, share = (runner.sample_chunks, AGENTS[entry_point]) if is_ours else (runner.sample, 1)
+    size = max(1024, 16 * runner.config.num_envs_per_env_runner)
     steps, began = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
-        runner.sample(num_timesteps=1024 * share)
-        steps += 1024
+        sample(num_timesteps=size * share)
+        steps += size
     return steps / elapsed
 
 
@@ -276,13 +278,11 @@ def iteration_rate(algorithm: Algorithm) -> float:
     return STEPS / (time.perf_counter() - began)
 
 
-def gathering_rate(algorithm: Algorithm, batch: int) -> float:
+def gathering_rate(algorithm: PPO) -> float:
     """Actions per second until a batch has arrived from all runners."""
     began = time.perf_counter()
-    episodes = synchronous_parallel_sample(
-        worker_set=algorithm.env_runner_group, max_env_steps=batch, _uses_new_env_runners=True
-    )
-    return sum(len(episode) for episode in episodes) / (time.perf_counter() - began)
+    chunks, _ = algorithm.sample_train_batch()
+    return sum(int(own.lengths.sum()) for own in chunks) / (time.perf_counter() - began)
 
 
 def report(what: str, ratio: float, target: float) -> bool:

@@ -8,7 +8,6 @@ core; the two alternate within a round, and a rate is the median over the rounds
 """
 
 import argparse
-import itertools
 import logging
 import os
 import random
@@ -30,8 +29,8 @@ from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
-from league.environments.stepping import Batch, EpisodeStart
+from league.environments.implementation import stepping
+from league.environments.stepping import Batch, Indices, Starts
 from league.spaces import ACTION_MASK
 
 RENDERED = {"render_mode": "rgb_array"}
@@ -92,8 +91,12 @@ def rate(steps: Iterator[None], seconds: float) -> float:
 
 def lockstep(config: EnvironmentConfig, num_envs: int) -> Iterator[None]:
     """All environments, one step in each at a time."""
-    env, seeds, rng = stepping(config, num_envs), itertools.count(), np.random.default_rng(0)
-    turn = env.start(lambda _: EpisodeStart(next(seeds), ("all",) * len(env.agents)))
+    env, rng = stepping(config, num_envs), np.random.default_rng(0)
+
+    def next_episodes(envs: Indices) -> Starts:
+        return Starts(envs, rng.integers(2**31, size=len(envs)), np.zeros((len(envs), len(env.agents)), np.int64))
+
+    turn = env.start(next_episodes)
     space = DRAWS[config.entry_point]
     while True:
         turn = env.step({group: space(batch, rng) for group, batch in turn.batches.items()})
@@ -139,12 +142,10 @@ def stock_pistonball() -> Iterator[None]:
 
 
 DRAWS: dict[str, Callable[[Batch, np.random.Generator], Any]] = {
-    "mpe2.simple_spread_v3": lambda batch, rng: rng.integers(5, size=len(batch.envs)),
+    "mpe2.simple_spread_v3": lambda batch, rng: rng.integers(5, size=len(batch)),
     "pettingzoo.classic.connect_four_v3": masked,
     "pettingzoo.classic.leduc_holdem_v4": masked,
-    "pettingzoo.butterfly.pistonball_v6": lambda batch, rng: rng.uniform(-1, 1, (len(batch.envs), 1)).astype(
-        np.float32
-    ),
+    "pettingzoo.butterfly.pistonball_v6": lambda batch, rng: rng.uniform(-1, 1, (len(batch), 1)).astype(np.float32),
 }
 CASES = {
     "simple_spread": Case(

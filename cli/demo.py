@@ -76,7 +76,7 @@ def _evaluate(config: "LeagueConfig") -> None:
 
 def _play(config: "LeagueConfig", url: str) -> None:
     from evaluation.playback.single_game import play_game
-    from league.environments.lockstep import stepping
+    from league.environments.lockstep import stock_stepping
     from league.policies.remote import RemotePolicy
     from league.policies.scripted import script
     from league.refs import ScriptRef
@@ -86,7 +86,7 @@ def _play(config: "LeagueConfig", url: str) -> None:
     first, second = interface.agents
     spaces = interface.agents[second]
     opponent = script(ScriptRef.parse(OPPONENT).name, spaces.observation, spaces.action)
-    environment = stepping(config.environment, num_envs=1)
+    environment = stock_stepping(config.environment, num_envs=1)
     with closing(environment), RemotePolicy(url, config.league) as champion:
         steps = list(play_game(environment, {first: champion, second: opponent}, seed=config.training.seed))
     moves = [move for step in steps for move in step.moves]

@@ -66,6 +66,7 @@ def check_env(
                 f"{league.environment.entry_point}: {found.api}, {found.agents} agents, {state}, episodes of"
                 f" {min(found.lengths)} to {max(found.lengths)} steps, {found.steps_per_second:,.0f} steps per second"
             )
+            say(found.implementation)
         if found.findings:
             table(("severity", "finding"), ((finding.severity, str(finding)) for finding in found.findings))
         if found.passed:

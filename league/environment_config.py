@@ -43,7 +43,13 @@ class EnvironmentConfig(Part):
     kwargs: JSON = Field(default={})
     """Keyword arguments of the environment's constructor."""
     wrappers: tuple[WrapperConfig, ...] = ()
+    vector: str | None = None
+    """A faster implementation of the environment, `package.module:Class`, a subclass of
+    league.environments.vector.vector_env.VectorEnv. Some environments of PettingZoo and MPE2 have one by default."""
 
     def digest(self) -> str:
-        """Return the SHA-256 of the environment. Results of environments with different digests are never combined."""
-        return digest(self.model_dump(mode="json"))
+        """Return the SHA-256 of the environment. Results of environments with different digests are never combined.
+
+        `vector` is no part of it, because it changes the speed only.
+        """
+        return digest(self.model_dump(mode="json", exclude={"vector"}))

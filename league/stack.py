@@ -9,6 +9,7 @@ VERIFIED = {
     "pettingzoo": "1.27.0",
     "supersuit": "3.11.0",
     "mpe2": "1.1.1",
+    "rlcard": "1.2.0",
     "gymnasium": "1.2.2",
     "numpy": "2.4.6",
     "onnx": "1.23.2",

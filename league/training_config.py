@@ -72,8 +72,9 @@ class TrainingSettings(Part):
     """Wall-clock minutes between published versions; the earlier of the two triggers applies."""
     runners: int = Field(default=1, ge=0)
     """Number of sampling processes (env runners); 0 samples in the learner's process."""
-    num_envs: int = Field(default=32, ge=1)
-    """Environments stepped in parallel in each runner."""
+    num_envs: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    """Environments stepped in parallel in each runner. auto: 32; with PPO and a vectorised environment up to 512, as
+    long as each agent gets 16 steps of each environment per batch."""
     lr: float = Field(default=3e-4, gt=0)
     """Learning rate of Adam."""
     gamma: float = Field(default=0.99, ge=0, le=1)

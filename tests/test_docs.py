@@ -253,6 +253,20 @@ def error_codes(node: Any) -> Iterator[str]:
         yield from error_codes(child)
 
 
+def test_the_code_of_the_tutorial_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = DOCS / "vectorised-environments.md"
+    example = "".join((ROOT / "examples/kuhn_poker_vector.py").read_text().split())
+    names: dict[str, object] = {}
+    for block in fenced(page, "python"):
+        # Methods of the example have another indentation and other line breaks on the page.
+        if "".join(block.split()) not in example:
+            exec(compile(block, str(page), "exec"), names)
+    printed = capsys.readouterr().out
+    shown = fenced(page, "text")
+    assert shown
+    assert [text for text in shown if text not in printed] == []
+
+
 RETIRED = (
     r"\bstudio",
     r"\bkeeper\b",

@@ -24,7 +24,6 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
-from ray.rllib.execution.rollout_ops import synchronous_parallel_sample
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.tune.experiment import Trial
 from ray.tune.logger.tensorboardx import TBXLoggerCallback
@@ -63,14 +62,6 @@ class ChunkColumn(InfiniteLookbackBuffer):
             self._space = self._space_struct = None
         else:
             InfiniteLookbackBuffer.space.fset(self, value)
-
-
-def column_data(column: InfiniteLookbackBuffer) -> Any:
-    """Return the arrays of an episode's column without copying.
-
-    Reads the undocumented attribute `data`: the documented getters of SingleAgentEpisode copy.
-    """
-    return column.data
 
 
 # Components of checkpoints
@@ -172,21 +163,6 @@ class ExplicitConfig(AlgorithmConfig):
 def local_learner(algorithm: Algorithm) -> Any:
     """Return the learner in the algorithm's process (`num_learners=0`). Reads the private `LearnerGroup._learner`."""
     return algorithm.learner_group._learner
-
-
-def sample_episodes(algorithm: Algorithm) -> tuple[list[SingleAgentEpisode], list[dict[str, Any]]]:
-    """Sample a train batch from all runners; return the episode chunks and the runners' metrics.
-
-    Calls the experimental `synchronous_parallel_sample` with its private arguments, as RLlib's own PPO does.
-    """
-    episodes, results = synchronous_parallel_sample(
-        worker_set=algorithm.env_runner_group,
-        max_env_steps=algorithm.config.total_train_batch_size,
-        sample_timeout_s=algorithm.config.sample_timeout_s,
-        _uses_new_env_runners=True,
-        _return_metrics=True,
-    )
-    return episodes, results
 
 
 def wait_for_runners(algorithm: Algorithm) -> None:

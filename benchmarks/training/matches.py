@@ -5,11 +5,11 @@ from pathlib import Path
 
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from evaluation.matches.lockstep_runner import play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
-from league.environments.lockstep import stepping
+from league.environments.implementation import stepping
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy

@@ -1,10 +1,9 @@
 """The ablation of `benchmarks.learning`: the last observation of a truncated agent has no value, as in RLlib."""
 
-import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from training.learners.train_batch import Chunks
+from training.sampling.episode_chunks import EpisodeChunks
 
 
 def as_rllib(algorithm: Algorithm) -> None:
@@ -14,6 +13,6 @@ def as_rllib(algorithm: Algorithm) -> None:
     algorithm.learner_group._learner.bootstraps = unless_done
 
 
-def unless_done(chunks: Chunks) -> NDArray:
+def unless_done(chunks: EpisodeChunks) -> NDArray:
     """Whether the episode of each chunk continues."""
-    return np.array([not chunk.is_done for chunk in chunks])
+    return ~(chunks.terminated | chunks.truncated)

@@ -18,7 +18,7 @@ import numpy as np
 from evaluation.gating.verdicts import gate_result, report_of
 from evaluation.playback.replay import replay
 from evaluation.results import Document
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import InvalidInput, LedgerConflict, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.storage.rows import VerdictRow
@@ -109,7 +109,7 @@ def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], repla
     if not wanted:
         return 0
     league = registry.leagues.get(row.league)
-    with closing(stepping(league.config.environment, 1)) as environment:
+    with closing(stock_stepping(league.config.environment, 1)) as environment:
         for number in np.linspace(0, len(games) - 1, wanted).astype(int):
             match, index = games[number]
             for _ in replay(environment, league.config, league.interface, match, index):

@@ -38,7 +38,7 @@ class PolicyOutput:
     """
 
     actions: NDArray
-    states: list[State] | None
+    states: State | None
     faults: dict[int, PolicyFault] = field(default_factory=dict)
 
 
@@ -89,28 +89,23 @@ def _call_batch(
     policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
 ) -> PolicyOutput:
     """Call the policy and check the form of its output. Raises whatever the policy raises."""
-    rows = len(batch.envs)
     given = policy.act(batch.observations, state=state, rng=generators)
-    _check_form(given, rows, space)
-    if given.state is None:
-        return PolicyOutput(given.actions, None)
-    return PolicyOutput(
-        given.actions, [{name: array[row] for name, array in given.state.items()} for row in range(rows)]
-    )
+    _check_form(given, len(batch), space)
+    return PolicyOutput(given.actions, given.state)
 
 
 def _call_rows(
     policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
 ) -> PolicyOutput:
-    rows = len(batch.envs)
+    rows = len(batch)
     given: dict[int, NDArray] = {}
-    states: list[State] = [{} for _ in range(rows)]
+    states: State = {}
     faults: dict[int, PolicyFault] = {}
     for row in range(rows):
         own = None if state is None else {name: array[[row]] for name, array in state.items()}
         draws = None if generators is None else [generators[row]]
         try:
-            answer = _call_batch(policy, batch.rows([row]), space, own, draws)
+            answer = _call_batch(policy, batch.rows(np.array([row])), space, own, draws)
         except MemoryError:
             raise
         except _Malformed as error:
@@ -119,12 +114,13 @@ def _call_rows(
             faults[row] = PolicyFault("crashed", one_line(error, with_type=True))
         else:
             given[row] = answer.actions[0]
-            states[row] = answer.states[0] if answer.states else {}
+            for name, own_state in (answer.states or {}).items():
+                states.setdefault(name, np.zeros((rows, *own_state.shape[1:]), own_state.dtype))[row] = own_state[0]
     # The policy's own dtype, as for a whole batch, because actions are recorded in it.
     actions = np.zeros((rows, *space.shape), np.result_type(*given.values()) if given else space.dtype)
     for row, action in given.items():
         actions[row] = action
-    return PolicyOutput(actions, states if any(states) else None, faults)
+    return PolicyOutput(actions, states or None, faults)
 
 
 def _check_form(given: Actions, rows: int, space: Leaf) -> None:

@@ -6,12 +6,12 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from functools import lru_cache
 
-from evaluation.matches.lockstep_runner import Roster, play_matches
+from evaluation.matches.game_loop import Roster, play_matches
 from evaluation.matches.watchdog import Deadline
 from evaluation.schedules.builders import ANCHOR
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.implementation import stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
 from league.interface import Interface

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.matches.game_loop import agent_sides
 from evaluation.matches.game_state import contestant_returns
-from evaluation.matches.lockstep_runner import agent_sides
 from evaluation.matches.policy_calls import PolicyFault, action_fault
 from evaluation.matches.worker import baselines
 from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config import LeagueConfig
-from league.environments.lockstep import stepping
-from league.environments.stepping import Batch, BatchedEnvironment, Ending, EpisodeStart, Turn
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
 from league.errors import UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
@@ -55,22 +55,21 @@ def play_game(environment: BatchedEnvironment, players: Mapping[str, Policy], se
     The environment stays as the game left it, so that each step can be rendered. The caller closes it.
     """
     agents = environment.agents
-    episodes = iter([EpisodeStart(seed, agents)])
-    policies = {agent: _AgentPolicy(agent, players[agent], seed) for agent in agents}
+    policies = [_AgentPolicy(agent, players[agent], seed) for agent in agents]
     returns = dict.fromkeys(agents, 0.0)
-    turn, step = environment.start(lambda _: next(episodes, None)), 0
-    yield GameStep(step, (), tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
+    turn, step = environment.start(each_agent_alone([seed], len(agents))), 0
+    yield GameStep(step, (), (), dict(returns), not turn.batches, _acting(turn, agents))
     while turn.batches:
-        batches = sorted(turn.batches.items(), key=_place)
-        answers = {agent: policies[agent].act(batch) for agent, batch in batches}
+        answers = {agent: policies[agent].act(batch) for agent, batch in turn.batches.items()}
         turn = environment.step({agent: actions for agent, (actions, _) in answers.items()})
         step += 1
         for agent, batch in turn.batches.items():
-            returns[agent] += batch.rewards[0]
-        for ending in turn.endings:
+            returns[agents[agent]] += float(batch.rewards[0])
+        endings = tuple(turn.each_ending())
+        for ending in endings:
             returns[agents[ending.agent]] += ending.reward
         moves = tuple(move for _, move in answers.values())
-        yield GameStep(step, moves, tuple(turn.endings), dict(returns), not turn.batches, tuple(turn.batches))
+        yield GameStep(step, moves, endings, dict(returns), not turn.batches, _acting(turn, agents))
 
 
 def policy_output(
@@ -87,13 +86,13 @@ def first_observation(config: LeagueConfig, interface: Interface, policy: str | 
 
     Raises UnknownPolicy if no agent of that policy acts in the first step.
     """
-    with closing(stepping(config.environment, num_envs=1)) as environment:
-        episodes = iter([EpisodeStart(seed, environment.agents)])
-        turn: Turn = environment.start(lambda _: next(episodes, None))
-    for agent, batch in sorted(turn.batches.items(), key=_place):
-        if policy in (None, interface.policies[agent]):
-            return _value(interface.agents[agent].observation, batch)
-    beginning = ", ".join(sorted({repr(interface.policies[agent]) for agent in turn.batches}))
+    with closing(stock_stepping(config.environment, num_envs=1)) as environment:
+        agents = environment.agents
+        turn: Turn = environment.start(each_agent_alone([seed], len(agents)))
+    for agent, batch in turn.batches.items():
+        if policy in (None, interface.policies[agents[agent]]):
+            return _value(interface.agents[agents[agent]].observation, batch)
+    beginning = ", ".join(sorted({repr(interface.policies[agent]) for agent in _acting(turn, agents)}))
     raise UnknownPolicy(f"{policy!r} does not act first in {config.league} ({beginning} does): pass an observation")
 
 
@@ -114,8 +113,8 @@ class _AgentPolicy:
         return given.actions, move
 
 
-def _place(item: tuple[str, Batch]) -> int:
-    return item[1].agents[0]
+def _acting(turn: Turn, agents: Sequence[str]) -> tuple[str, ...]:
+    return tuple(agents[agent] for agent in turn.batches)
 
 
 def _value(space: Space, batch: Batch) -> Any:

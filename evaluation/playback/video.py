@@ -25,7 +25,7 @@ from evaluation.playback.captions import Caption, Captions, Line
 from evaluation.playback.replay import GameSource
 from league.environment_config import EnvironmentConfig
 from league.environments.building import build
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import ConfigError, EnvironmentMismatch
 from league.files import disk_errors, replacing
 
@@ -218,7 +218,7 @@ def write_video(
     if out.suffix.lower() not in FORMATS:
         raise ConfigError(f"--out {out}: expected a name that ends in {' or '.join(FORMATS)}")
     _require(source, "rgb_array")
-    environment = stepping(source.config.environment, 1, render_mode="rgb_array")
+    environment = stock_stepping(source.config.environment, 1, render_mode="rgb_array")
     captions, frames, turns, last = Captions(source.title, source.interface, source.controllers), None, True, None
     with closing(environment), tempfile.TemporaryFile() as spool:
         with AppendingTiffWriter(spool) as writer:
@@ -246,7 +246,7 @@ def show_window(source: GameSource, fps: float | None = None, listener: CaptionL
             "--watch needs a display, but DISPLAY and WAYLAND_DISPLAY are not set: use --out game.gif"
         )
     _require(source, "human")
-    environment = stepping(source.config.environment, 1, render_mode="human")
+    environment = stock_stepping(source.config.environment, 1, render_mode="human")
     captions, last = Captions(source.title, source.interface, source.controllers), None
     with closing(environment):
         for last in source.play(environment):

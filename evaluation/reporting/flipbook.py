@@ -11,7 +11,7 @@ from evaluation.playback.captions import Caption, Captions, Line
 from evaluation.playback.replay import recorded_game
 from evaluation.playback.video import data_uri, render_modes
 from evaluation.results import Document
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import one_line
 from league.registry.registry import Registry
@@ -62,7 +62,7 @@ def flipbooks(registry: Registry, league: str, upsets: Sequence[Upset], pictures
     try:
         config = registry.leagues.get(league).config.environment
         draws = pictures and "rgb_array" in render_modes(config)
-        environment = stepping(config, 1, render_mode="rgb_array" if draws else None)
+        environment = stock_stepping(config, 1, render_mode="rgb_array" if draws else None)
     except Exception as error:  # third-party code can raise anything; the rest of the report stays valid
         return tuple(_faulty(upset, error) for upset in upsets)
     room = MOST_BYTES // len(upsets) if draws else 0

@@ -29,7 +29,7 @@ from evaluation.playback.recorded_steps import recorded_steps
 from evaluation.playback.replay import recorded_game
 from evaluation.playback.video import render_modes, write_video
 from evaluation.results import Document
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import GameCrashed, GameHung, LeagueError, one_line, to_document
 from league.registry.registry import Registry
@@ -81,7 +81,8 @@ class GameWorker:
                 self._matches, self._environment = MatchWorker(config, self._registry), None
             if self._environment is None:
                 self._renders = "rgb_array" in render_modes(config.environment)
-                self._environment = stepping(config.environment, 1, render_mode="rgb_array" if self._renders else None)
+                render_mode = "rgb_array" if self._renders else None
+                self._environment = stock_stepping(config.environment, 1, render_mode=render_mode)
         except Exception as error:  # never a fault of the caller
             raise GameCrashed(f"the environment of {self._league} cannot be created: {one_line(error)}") from error
         return self._matches

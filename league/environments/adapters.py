@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 
 from league.errors import EnvironmentMismatch
+from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Space
+from league.spaces.arrays import tensors
 
 Observation = dict[str, NDArray]
 """ONNX input name → array without a batch axis."""
@@ -43,6 +45,17 @@ def adapter_for(env: Any, splits: Sequence[Split]) -> EnvAdapter:
     if isinstance(env, AECEnv):
         return AECAdapter(env, splits)
     return ParallelAdapter(env, splits) if isinstance(env, ParallelEnv) else MultiAgentAdapter(env, splits)
+
+
+def splitter(space: Space) -> Split:
+    """Return a function from observation to named arrays, optimised for common spaces."""
+    if not isinstance(space, DictSpace):
+        return lambda value: {OBSERVATION: value}
+    if set(space.spaces) == {OBSERVATION, ACTION_MASK}:
+        plain = not any(isinstance(part, DictSpace) for part in space.spaces.values())
+        if plain:
+            return lambda value: {OBSERVATION: value[OBSERVATION], ACTION_MASK: value[ACTION_MASK]}
+    return lambda value: tensors(space, value)
 
 
 class _Adapter:

@@ -22,6 +22,7 @@ from pettingzoo.test import api_test, parallel_api_test
 from league.config import LeagueConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import action_space, build, describe, observation_space
+from league.environments.implementation import implementation
 from league.errors import IllegalMask, LeagueError, one_line
 from league.interface import Interface
 from league.seeds import derive
@@ -89,6 +90,8 @@ class Examination:
     steps_per_second: float = 0.0
     state_size: int | None = None
     """Size of the global state; None without one."""
+    implementation: str = ""
+    """How copies of the environment are stepped, and why."""
 
     @property
     def passed(self) -> bool:
@@ -109,6 +112,7 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int = 2000, seed: in
     """Play episodes of at most `steps` steps, each twice. Never raises exceptions of the environment."""
     found = Examination()
     try:
+        found.implementation = implementation(config.environment).reason
         env = build(config.environment)
         interface = describe(env, config)
     except LeagueError as error:

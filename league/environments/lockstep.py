@@ -3,7 +3,8 @@
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from time import perf_counter
 from typing import Any, TypeVar
@@ -12,22 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environment_config import EnvironmentConfig
-from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
+from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
 from league.environments.building import action_space, build, observation_space
-from league.environments.stepping import Batch, BatchedEnvironment, Ending, Group, NextEpisode, Turn, check_actions
+from league.environments.stepping import (
+    Batch,
+    BatchedEnvironment,
+    Indices,
+    NextEpisodes,
+    States,
+    Turn,
+    check_actions,
+    no_envs,
+)
+from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError, one_line
-from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, inputs
-from league.spaces.arrays import tensors
+from league.spaces import Leaf, inputs
 from league.spaces.conversion import from_gymnasium
 
 logger = logging.getLogger(__name__)
 
 Given = TypeVar("Given")
 
-Rows = dict[Group, tuple[list[int], list[int], list[Observation], list[float]]]
+Reports = dict[int, list[Report]]
+"""Environment → its reports."""
 
 
-def stepping(
+def stock_stepping(
     config: EnvironmentConfig,
     num_envs: int,
     *,
@@ -35,7 +46,7 @@ def stepping(
     render_mode: str | None = None,
     states: bool = False,
 ) -> BatchedEnvironment:
-    """Create environments that are stepped in lockstep.
+    """Create copies of the stock environment that are stepped in lockstep.
 
     Args:
         config: The environment.
@@ -58,75 +69,78 @@ class Lockstep:
         envs = [make() for _ in range(num_envs)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
         spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.agents]
-        self._splits = [_splitter(space) for space in spaces]
+        self._splits = [splitter(space) for space in spaces]
         self._inputs = [inputs(space) for space in spaces]
+        self._first_alike = [self._inputs.index(own) for own in self._inputs]
         self._actions = [from_gymnasium(action_space(envs[0], agent)) for agent in self.agents]
         self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
-        self._seeds = [0] * num_envs
+        self._seeds = np.zeros(num_envs, np.int64)
         self._crashes = [0] * num_envs
-        self._groups: list[Sequence[Group]] = [()] * num_envs
-        self._pending: dict[Group, Batch] = {}
-        self._abandoned: set[int] = set()
-        self._seconds = [0.0] * num_envs
+        self._groups = np.zeros((num_envs, len(self.agents)), np.int64)
+        self._pending: dict[int, Batch] = {}
+        self._abandoned = no_envs()
+        self._seconds = np.zeros(num_envs)
         self._busy: int | None = None
         self._since = 0.0
-        self._next_episode: NextEpisode = lambda _: None
+        self._next_episodes: NextEpisodes
 
     @property
     def num_envs(self) -> int:
         return len(self._envs)
 
-    def start(self, next_episode: NextEpisode) -> Turn:
-        self._next_episode = next_episode
-        self._abandoned.clear()
+    def start(self, next_episodes: NextEpisodes) -> Turn:
+        self._next_episodes = next_episodes
+        self._abandoned = no_envs()
         self._busy = None
-        turn = Turn()
-        rows: Rows = {}
-        for env in range(self.num_envs):
-            self._restart(env, turn, rows)
-        return self._yield(turn, rows)
+        return self._continue(Turn(), {}, np.arange(self.num_envs))
 
-    def step(self, actions: Mapping[Group, NDArray]) -> Turn:
-        moves: dict[int, list[tuple[int, Any]]] = {}
+    def step(self, actions: Mapping[int, NDArray]) -> Turn:
+        moves: dict[int, list[tuple[int, Any]]] = defaultdict(list)
         for group, batch in self._pending.items():
             check_actions(batch, actions[group], self._actions[batch.agents[0]], self.agents)
-            for env, agent, action in zip(batch.envs, batch.agents, _plain(actions[group]), strict=True):
-                moves.setdefault(env, []).append((agent, action))
-        turn = Turn()
-        rows: Rows = {}
-        abandoned, self._abandoned = self._abandoned, set()
-        for env in sorted(moves.keys() | abandoned):
-            if env in abandoned:
-                self._restart(env, turn, rows)
-                continue
+            rows = zip(batch.envs.tolist(), batch.agents.tolist(), plain_actions(actions[group]), strict=True)
+            for env, agent, action in rows:
+                moves[env].append((agent, action))
+        reports: Reports = {}
+        crashed: list[int] = []
+        for env in sorted(moves):
             # The order of actions must not depend on the grouping of agents.
             acting = sorted(moves[env], key=itemgetter(0))
             try:
-                reports = self._timed(env, self._envs[env].step, acting)
+                reports[env] = self._timed(env, self._envs[env].step, acting)
             except LeagueError:
                 raise
             except Exception as error:
                 self._crash(env, error)
-                turn.crashed.append(env)
-                self._restart(env, turn, rows)
+                crashed.append(env)
             else:
-                self._sort_reports(env, reports, turn, rows)
-        return self._yield(turn, rows)
+                self._check_rewards(env, reports[env])
+        finished = [env for env, own in reports.items() if not any(map(_must_act, own))]
+        for env in finished:
+            self._crashes[env] = 0
+        turn = Turn(finished=_envs(finished), crashed=_envs(crashed), last_states=self._states(finished))
+        free = np.union1d(_envs([*finished, *crashed]), self._abandoned)
+        self._abandoned = no_envs()
+        return self._continue(turn, reports, free)
 
-    def abandon(self, envs: Collection[int]) -> None:
-        self._abandoned.update(envs)
+    def abandon(self, envs: Indices) -> None:
+        self._abandoned = np.union1d(self._abandoned, envs)
         kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
-        self._pending = {group: batch for group, batch in kept.items() if batch.envs}
+        self._pending = {group: batch for group, batch in kept.items() if len(batch)}
 
-    def assign(self, env: int, groups: Sequence[Group]) -> None:
-        self._groups[env] = groups
+    def assign(self, envs: Indices, groups: Indices) -> None:
+        self._groups[envs] = groups
 
     @property
-    def busy(self) -> int | None:
-        return self._busy
+    def busy(self) -> Indices:
+        busy = self._busy
+        return no_envs() if busy is None else _envs([busy])
 
-    def seconds(self, env: int) -> float:
-        return self._seconds[env] + (perf_counter() - self._since if self._busy == env else 0.0)
+    def seconds(self) -> NDArray[np.float64]:
+        seconds, busy = self._seconds.copy(), self._busy
+        if busy is not None:
+            seconds[busy] += perf_counter() - self._since
+        return seconds
 
     def render(self, env: int) -> NDArray:
         picture = self._envs[env].render()
@@ -146,54 +160,45 @@ class Lockstep:
         self._seconds[env] += perf_counter() - self._since
         return reports
 
-    def _restart(self, env: int, turn: Turn, rows: Rows) -> None:
-        episode = self._next_episode(env)
-        if episode is None:
-            return
-        self._groups[env] = episode.groups
-        self._seconds[env] = 0.0
-        # Some environments store the seed as a signed 32-bit integer.
-        self._seeds[env] = episode.seed % 2**31
+    def _continue(self, turn: Turn, reports: Reports, free: Indices) -> Turn:
+        """Start the next episodes of free environments, and report what has ended and who must act."""
+        endings = [(env, report) for env, own in reports.items() for report in own if not _must_act(report)]
+        acting = {env: [report for report in own if _must_act(report)] for env, own in reports.items()}
+        if len(free):
+            starts = self._next_episodes(free)
+            self._groups[starts.envs] = starts.groups
+            self._seconds[starts.envs] = 0.0
+            # Some environments store the seed as a signed 32-bit integer.
+            self._seeds[starts.envs] = starts.seeds % 2**31
+            acting |= {env: self._reset(env) for env in starts.envs.tolist()}
+        rows = [(env, report) for env in sorted(acting) for report in acting[env]]
+        turn.states = self._states(sorted(env for env, own in acting.items() if own))
+        turn.endings = self._endings(endings)
+        turn.batches = self._pending = self._batches(rows)
+        return turn
+
+    def _reset(self, env: int) -> list[Report]:
         while True:
             try:
-                reports = self._timed(env, self._envs[env].reset, self._seeds[env])
+                reports = self._timed(env, self._envs[env].reset, int(self._seeds[env]))
                 break
             except LeagueError:
                 raise
             except Exception as error:
                 self._crash(env, error)
-        if not any(_must_act(report) for report in reports):
+        reports = [report for report in reports if _must_act(report)]
+        if not reports:
             raise EnvironmentMismatch(f"the episode with seed {self._seeds[env]} ends at its reset, without an action")
-        self._sort_reports(env, reports, turn, rows)
+        self._check_rewards(env, reports)
+        return reports
 
-    def _sort_reports(self, env: int, reports: Sequence[Report], turn: Turn, rows: Rows) -> None:
-        """Sort reports into batches and endings, and start the next episode if this one is over."""
-        is_over = True
-        for agent, observation, reward, terminated, truncated in reports:
+    def _check_rewards(self, env: int, reports: Sequence[Report]) -> None:
+        for agent, _, reward, _, _ in reports:
             if not math.isfinite(reward):
                 raise InvalidReward(
                     f"agent {self.agents[agent]} got a reward of {reward} in the episode with seed {self._seeds[env]},"
                     " expected a finite number"
                 )
-            if terminated or truncated:
-                turn.endings.append(Ending(env, agent, observation, reward, terminated, truncated))
-                continue
-            is_over = False
-            group = self._groups[env][agent]
-            if group not in rows:
-                rows[group] = ([], [], [], [])
-            envs, agents, observations, rewards = rows[group]
-            envs.append(env)
-            agents.append(agent)
-            observations.append(observation)
-            rewards.append(reward)
-        if self._gives_states and (state := self._envs[env].state()) is not None:
-            known = turn.last_states if is_over else turn.states
-            known[env] = np.array(state, dtype=np.float32).ravel()
-        if is_over:
-            turn.finished.append(env)
-            self._crashes[env] = 0
-            self._restart(env, turn, rows)
 
     def _crash(self, env: int, error: Exception) -> None:
         """Recreate an environment, or raise the error after too many crashes."""
@@ -212,11 +217,45 @@ class Lockstep:
             self._envs[env].close()
         self._envs[env] = adapter_for(self._make(), self._splits)
 
-    def _yield(self, turn: Turn, rows: Rows) -> Turn:
-        for group, (envs, agents, observations, rewards) in rows.items():
-            turn.batches[group] = Batch(envs, agents, self._stacked(agents, observations), rewards)
-        self._pending = turn.batches
-        return turn
+    def _batches(self, rows: Sequence[tuple[int, Report]]) -> dict[int, Batch]:
+        if not rows:
+            return {}
+        envs, agents = _envs([env for env, _ in rows]), _envs([report[0] for _, report in rows])
+        groups = self._groups[envs, agents]
+        batches = {}
+        for group in np.unique(groups).tolist():
+            of_group = np.flatnonzero(groups == group)
+            own = [rows[i][1] for i in of_group.tolist()]
+            stacked = self._stacked([report[0] for report in own], [report[1] for report in own])
+            rewards = np.array([report[2] for report in own], dtype=np.float64)
+            batches[group] = Batch(envs[of_group], agents[of_group], stacked, rewards)
+        return batches
+
+    def _endings(self, rows: Sequence[tuple[int, Report]]) -> list[AgentRows]:
+        """Return one block for each observation space."""
+        blocks: dict[int, list[tuple[int, Report]]] = defaultdict(list)
+        for row in rows:
+            blocks[self._first_alike[row[1][0]]].append(row)
+        return [self._block(blocks[first]) for first in sorted(blocks)]
+
+    def _block(self, rows: Sequence[tuple[int, Report]]) -> AgentRows:
+        agents, observations, rewards, terminations, truncations = zip(*(report for _, report in rows), strict=True)
+        return AgentRows(
+            _envs([env for env, _ in rows]),
+            _envs(agents),
+            self._stacked(agents, observations),
+            np.array(rewards, dtype=np.float64),
+            np.array(terminations, dtype=bool),
+            np.array(truncations, dtype=bool),
+        )
+
+    def _states(self, envs: Sequence[int]) -> States | None:
+        if not self._gives_states or not envs:
+            return None
+        values = [self._envs[env].state() for env in envs]
+        if any(value is None for value in values):
+            return None
+        return States(_envs(envs), np.array([np.ravel(value) for value in values], dtype=np.float32))
 
     def _stacked(self, agents: Sequence[int], observations: Sequence[Observation]) -> dict[str, NDArray]:
         stacked = {}
@@ -240,21 +279,14 @@ class Lockstep:
         )
 
 
+def _envs(numbers: Sequence[int]) -> Indices:
+    return np.array(numbers, dtype=np.int64)
+
+
 def _must_act(report: Report) -> bool:
     return not (report[3] or report[4])
 
 
-def _splitter(space: Space) -> Callable[[Any], Observation]:
-    """Return a function from observation to named arrays, optimised for common spaces."""
-    if not isinstance(space, DictSpace):
-        return lambda value: {OBSERVATION: value}
-    if set(space.spaces) == {OBSERVATION, ACTION_MASK}:
-        plain = not any(isinstance(part, DictSpace) for part in space.spaces.values())
-        if plain:
-            return lambda value: {OBSERVATION: value[OBSERVATION], ACTION_MASK: value[ACTION_MASK]}
-    return lambda value: tensors(space, value)
-
-
-def _plain(actions: NDArray) -> list[Any]:
+def plain_actions(actions: NDArray) -> list[Any]:
     """Discrete actions as Python integers, which environments use as list indices; other actions as arrays."""
     return actions.tolist() if actions.ndim == 1 else list(actions)

@@ -1,63 +1,88 @@
 """Interface of batched environments, which step many environments per call, and validation of actions.
 
-A step returns one batch per group with the observations of all agents that must act, across all environments. Callers
-define the groups: policy ids in training, policies of contestants in matches. In a turn-based game the rows of an agent
-are its own turns, and rewards are summed since the agent's previous row.
+A step returns one batch per group with the observations of all agents that must act, across all environments. Groups
+are numbers that callers define: policies in training, policies of contestants in matches. In a turn-based game the rows
+of an agent are its own turns, and rewards are summed since the agent's previous row.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from league.environments.vector.vector_env import AgentRows
 from league.errors import IllegalAction
 from league.spaces import ACTION_MASK, Box, Discrete, MultiBinary, MultiDiscrete, Space
 
-Group = Any
-"""Any hashable value."""
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeStart:
-    """An episode to play: the seed of the reset, and the group of each agent in the order of `agents`."""
-
-    seed: int
-    groups: Sequence[Group]
-
-
-NextEpisode = Callable[[int], EpisodeStart | None]
-"""Index of an environment → its next episode; None leaves the environment idle."""
-
-
-@dataclass(slots=True)
-class Batch:
-    """The k agents of a group that must act.
+class Starts:
+    """Episodes to start.
 
     Attributes:
-        envs: Index of the environment of each row.
-        agents: Index of the agent of each row.
-        observations: ONNX input name → array (k, …) in the environment's dtype.
-        rewards: Sum of the rewards since the agent's previous row; 0.0 in its first.
+        envs: Environments, (m,), ascending.
+        seeds: Seeds of the resets, (m,) int64.
+        groups: Group of each agent, (m, agents).
     """
 
-    envs: list[int]
-    agents: list[int]
+    envs: Indices
+    seeds: Indices
+    groups: Indices
+
+
+NextEpisodes = Callable[[Indices], Starts]
+"""Environments without an episode, ascending → the episodes that start in some of them; the others stay idle."""
+
+
+def each_agent_alone(seeds: Iterable[int], agents: int) -> NextEpisodes:
+    """Return the episodes with these seeds, in order, for whichever environments are free.
+
+    The group of an agent is its index.
+    """
+    coming = iter(seeds)
+
+    def next_episodes(envs: Indices) -> Starts:
+        taken = np.fromiter(islice(coming, len(envs)), np.int64)
+        return Starts(envs[: len(taken)], taken, np.tile(np.arange(agents), (len(taken), 1)))
+
+    return next_episodes
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """The k agents of a group that must act, sorted by environment.
+
+    Attributes:
+        envs: Index of the environment of each row, (k,).
+        agents: Index of the agent of each row, (k,).
+        observations: ONNX input name → array (k, …) in the environment's dtype.
+        rewards: Sum of the rewards since the agent's previous row, (k,); 0 in its first.
+    """
+
+    envs: Indices
+    agents: Indices
     observations: dict[str, NDArray]
-    rewards: list[float]
+    rewards: NDArray[np.float64]
 
-    def without(self, envs: Collection[int]) -> list[int]:
+    def __len__(self) -> int:
+        return len(self.envs)
+
+    def without(self, envs: Indices) -> Indices:
         """Return the rows of all other environments."""
-        return [row for row, env in enumerate(self.envs) if env not in envs]
+        return np.flatnonzero(~np.isin(self.envs, envs))
 
-    def rows(self, rows: Sequence[int]) -> "Batch":
+    def rows(self, rows: NDArray) -> "Batch":
         """Return a batch of some rows."""
         return Batch(
-            [self.envs[row] for row in rows],
-            [self.agents[row] for row in rows],
+            self.envs[rows],
+            self.agents[rows],
             {name: array[rows] for name, array in self.observations.items()},
-            [self.rewards[row] for row in rows],
+            self.rewards[rows],
         )
 
 
@@ -76,27 +101,51 @@ class Ending:
     truncated: bool
 
 
+@dataclass(frozen=True, slots=True)
+class States:
+    """Global states, flat: values[i] is that of environment envs[i]; (m,) and (m, size) float32."""
+
+    envs: Indices
+    values: NDArray[np.float32]
+
+
+def no_envs() -> Indices:
+    """Return an empty list of environments."""
+    return np.zeros(0, np.int64)
+
+
 @dataclass(slots=True)
 class Turn:
     """Result of a step: agents that left, environments whose episodes ended, and the agents that must act next.
 
-    Endings belong to the previous episodes; batches may contain the first rows of the next ones.
+    Endings belong to the previous episodes; batches may contain the first rows of the next ones. Lists of environments
+    are ascending.
     """
 
-    batches: dict[Group, Batch] = field(default_factory=dict)
-    endings: list[Ending] = field(default_factory=list)
-    finished: list[int] = field(default_factory=list)
-    crashed: list[int] = field(default_factory=list)
+    batches: dict[int, Batch] = field(default_factory=dict)
+    """Group → its rows, by ascending group."""
+    endings: Sequence[AgentRows] = ()
+    """The last reports of agents, in one block for each observation space. Each row has one or both flags."""
+    finished: Indices = field(default_factory=no_envs)
+    crashed: Indices = field(default_factory=no_envs)
     """Environments that raised an exception and were recreated. Their episodes have no endings and are not in
     `finished`; earlier reports of them must be discarded. The next episodes have already started."""
-    states: dict[int, NDArray] = field(default_factory=dict)
-    """Environment → its current global state, flat float32, if requested and available."""
-    last_states: dict[int, NDArray] = field(default_factory=dict)
-    """Finished environment → the global state at the end of its episode."""
+    states: States | None = None
+    """The current global state of each environment with an episode, if requested and available."""
+    last_states: States | None = None
+    """The global states of finished environments at the end of their episodes."""
+
+    def each_ending(self) -> Iterator[Ending]:
+        """Yield the rows of `endings`, for callers with few environments."""
+        for rows in self.endings:
+            for i, (env, agent) in enumerate(zip(rows.envs.tolist(), rows.agents.tolist(), strict=True)):
+                observation = {name: array[i] for name, array in rows.observations.items()}
+                flags = bool(rows.terminations[i]), bool(rows.truncations[i])
+                yield Ending(env, agent, observation, float(rows.rewards[i]), *flags)
 
 
 class BatchedEnvironment(Protocol):
-    """n environments in lockstep. After the end of an episode, the next one starts in the same call."""
+    """n environments, stepped together. After the end of an episode, the next one starts in the same call."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -106,32 +155,40 @@ class BatchedEnvironment(Protocol):
     def num_envs(self) -> int:
         """Number of environments."""
 
-    def start(self, next_episode: NextEpisode) -> Turn:
-        """Reset all environments. `next_episode` is called for each of them, and after each episode."""
+    def start(self, next_episodes: NextEpisodes) -> Turn:
+        """Reset all environments. `next_episodes` is called for all of them, and in each step after which some have
+        no episode."""
 
-    def step(self, actions: Mapping[Group, NDArray]) -> Turn:
+    def step(self, actions: Mapping[int, NDArray]) -> Turn:
         """Step all environments. actions[group][i] belongs to row i of the group's batch in the last Turn.
 
         A Turn without batches means that all environments are idle. Raises IllegalAction before any environment is
         stepped.
         """
 
-    def abandon(self, envs: Collection[int]) -> None:
+    def abandon(self, envs: Indices) -> None:
         """Abort the episodes of some environments.
 
         The next `step` expects actions for the other rows only, and starts their next episodes. As after a crash, the
         aborted episodes have no endings and are not in `finished`.
         """
 
-    def assign(self, env: int, groups: Sequence[Group]) -> None:
-        """Change the groups of an environment's agents, starting with the next Turn."""
+    def assign(self, envs: Indices, groups: Indices) -> None:
+        """Change the groups, (m, agents), of the agents of m environments, starting with the next Turn."""
 
     @property
-    def busy(self) -> int | None:
-        """The environment that is executing, for use in signal handlers, or that raised in the last call."""
+    def busy(self) -> Indices:
+        """The environments that are executing, for use in signal handlers, or the one that raised in the last call.
 
-    def seconds(self, env: int) -> float:
-        """Return the execution time of an environment in its current episode, including the reset, in seconds."""
+        Several execute together if a vectorised environment steps them; if it hangs, one of them does.
+        """
+
+    def seconds(self) -> NDArray[np.float64]:
+        """Return the execution time of each environment in its current episode, including the reset, (n,) in seconds.
+
+        Environments that execute together share the time of a finished call equally. Each counts all of the time of a
+        call in progress.
+        """
 
     def render(self, env: int) -> NDArray:
         """Render an environment, (height, width, 3) uint8. Raises EnvironmentMismatch if it cannot be rendered."""
@@ -146,7 +203,7 @@ ROUNDING = 1e-5
 
 def check_actions(batch: Batch, actions: NDArray, space: Space, agents: Sequence[str]) -> None:
     """Raise IllegalAction unless all actions (k, …) are in `space` and allowed by the masks."""
-    rows = len(batch.envs)
+    rows = len(batch)
     if len(actions) != rows:
         raise IllegalAction(f"{len(actions)} actions for {rows} agents")
     if isinstance(space, Discrete | Box | MultiDiscrete | MultiBinary) and actions.shape[1:] != space.shape:

@@ -14,7 +14,7 @@ import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
 
 from league.environments.building import action_space, observation_space
-from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
+from league.environments.stepping import BatchedEnvironment, Starts, States, Turn
 from league.seeds import generator
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import tensors
@@ -126,48 +126,54 @@ def lockstep(
     queue = list(seeds)
     reports: dict[int, Reports] = {seed: defaultdict(list) for seed in seeds}
     playing: dict[int, int] = {}
-    starting: dict[int, int | None] = {}
+    starting: dict[int, int] = {}
 
-    def next_episode(env: int) -> EpisodeStart | None:
-        starting[env] = queue.pop(0) if queue else None
-        seed = starting[env]
-        return None if seed is None else EpisodeStart(seed, batched.agents)
+    def next_episodes(envs: np.ndarray) -> Starts:
+        return _started(envs, queue, starting, len(batched.agents))
 
-    turn = batched.start(next_episode)
+    turn = batched.start(next_episodes)
     taken = 0
     while True:
         _read_endings(turn, batched, playing, reports)
-        playing.update({env: seed for env, seed in starting.items() if seed is not None})
+        playing.update(starting)
         starting.clear()
         if not turn.batches or taken == steps:
             return reports
-        acting = {env for batch in turn.batches.values() for env in batch.envs}
+        acting = {env for batch in turn.batches.values() for env in batch.envs.tolist()}
         abandoned = [env for env in acting if left.get(playing[env]) == 0]
         left |= {seed: left[seed] - 1 for seed in map(playing.get, acting) if seed in left}
         if abandoned:
-            batched.abandon(abandoned)
+            batched.abandon(np.array(abandoned))
         actions = {}
         for group, batch in turn.batches.items():
             chosen = []
-            for row, (env, index) in enumerate(zip(batch.envs, batch.agents, strict=True)):
+            assert batch.envs.tolist() == sorted(batch.envs.tolist())
+            for row, (env, index) in enumerate(zip(batch.envs.tolist(), batch.agents.tolist(), strict=True)):
                 if env in abandoned:
                     continue
                 agent = batched.agents[index]
-                assert group == agent, "a row is in the batch of another group"
+                assert group == index, "a row is in the batch of another group"
                 arrays = {name: array[row] for name, array in batch.observations.items()}
                 own = reports[playing[env]][agent]
                 chosen.append(draw(spaces[agent], playing[env], index, len(own), arrays.get(ACTION_MASK)))
-                own.append((agent, arrays, batch.rewards[row], False, False))
+                own.append((agent, arrays, float(batch.rewards[row]), False, False))
             if chosen:
                 actions[group] = np.array(chosen)
         turn = batched.step(actions)
         taken += 1
 
 
+def _started(envs: np.ndarray, queue: list[int], starting: dict[int, int], agents: int) -> Starts:
+    """The episodes at the head of a queue of seeds, noted in `starting`; each agent is a group."""
+    seeds = [queue.pop(0) for _ in envs if queue]
+    starting.update(zip(envs.tolist(), seeds, strict=False))
+    return Starts(envs[: len(seeds)], np.array(seeds, np.int64), np.tile(np.arange(agents), (len(seeds), 1)))
+
+
 def _read_endings(
     turn: Turn, batched: BatchedEnvironment, playing: dict[int, int], reports: dict[int, Reports]
 ) -> None:
-    for ending in turn.endings:
+    for ending in turn.each_ending():
         agent = batched.agents[ending.agent]
         last = (agent, ending.observation, ending.reward, ending.terminated, ending.truncated)
         reports[playing[ending.env]][agent].append(last)
@@ -219,20 +225,17 @@ def assert_states_conform(
     starting: dict[int, int] = {}
     found: dict[int, list[np.ndarray]] = defaultdict(list)
 
-    def next_episode(env: int) -> EpisodeStart | None:
-        if not queue:
-            return None
-        starting[env] = queue.pop(0)
-        return EpisodeStart(starting[env], batched.agents)
+    def next_episodes(envs: np.ndarray) -> Starts:
+        return _started(envs, queue, starting, len(batched.agents))
 
-    turn = batched.start(next_episode)
+    turn = batched.start(next_episodes)
     while True:
-        for env, state in turn.last_states.items():
+        for env, state in states_of(turn.last_states).items():
             found[playing[env]].append(state)
-        assert set(turn.last_states) == set(turn.finished)
+        assert set(states_of(turn.last_states)) == set(turn.finished.tolist())
         playing.update(starting)
         starting.clear()
-        for env, state in turn.states.items():
+        for env, state in states_of(turn.states).items():
             found[playing[env]].append(state)
         if not turn.batches:
             break
@@ -240,8 +243,8 @@ def assert_states_conform(
             {
                 agent: np.array(
                     [
-                        draw(spaces[agent], playing[env], index, len(found[playing[env]]) - 1, None)
-                        for env, index in zip(batch.envs, batch.agents, strict=True)
+                        draw(spaces[batched.agents[agent]], playing[env], index, len(found[playing[env]]) - 1, None)
+                        for env, index in zip(batch.envs.tolist(), batch.agents.tolist(), strict=True)
                     ]
                 )
                 for agent, batch in turn.batches.items()
@@ -252,6 +255,11 @@ def assert_states_conform(
         assert len(found[seed]) == len(expected)
         for own, theirs in zip(found[seed], expected, strict=True):
             np.testing.assert_array_equal(own, np.asarray(theirs, dtype=np.float32).ravel())
+
+
+def states_of(states: States | None) -> dict[int, np.ndarray]:
+    """Environment → its state."""
+    return {} if states is None else dict(zip(states.envs.tolist(), states.values, strict=True))
 
 
 def plain_states(env: Any, spaces: Mapping[str, gymnasium.Space], seed: int) -> list[Any]:

@@ -15,7 +15,7 @@ from evaluation.playback.replay import recorded_game
 from evaluation.schedules.tournament_plan import Budget
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, InvalidInput
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -211,7 +211,7 @@ def test_teammates_affect_the_game(team: Registry) -> None:
 def test_each_cross_play_game_can_be_replayed(team: Registry) -> None:
     evaluate("spread", registry=team, schedule="cross_play", blocks=3)
     config = team.leagues.get("spread").config
-    environment = stepping(config.environment, 1)
+    environment = stock_stepping(config.environment, 1)
     matches = in_ledger(team, "spread")
     for match in matches:
         for index, game in enumerate(match.games):

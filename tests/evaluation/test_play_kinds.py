@@ -8,7 +8,7 @@ import pytest
 from evaluation.playback.replay import replay
 from evaluation.playback.single_game import play_game
 from evaluation.schedules.builders import game_plans
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import GameHung
 from league.results.records import Scoring, dump_games, load_games
 from league.results.scoring import admit
@@ -30,7 +30,7 @@ def test_games_do_not_depend_on_the_number_of_environments(kind: Kind) -> None:
 @kinds
 def test_recorded_games_are_accepted_stored_and_replayed_exactly(kind: Kind) -> None:
     schedule = kind.schedule(CONTESTANTS)
-    environment = stepping(kind.config.environment, 1)
+    environment = stock_stepping(kind.config.environment, 1)
     for match in kind.play(schedule):
         admit(match, schedule)
         stored = replace(match, games=load_games(dump_games(match.games)))
@@ -44,7 +44,7 @@ def test_recorded_games_are_accepted_stored_and_replayed_exactly(kind: Kind) -> 
 def test_a_match_equals_the_shown_game(kind: Kind) -> None:
     """A shown game calls the policy of each agent separately, and carries its state itself."""
     schedule = kind.schedule(["kind@1", "kind@2"], plies=0)
-    environment = stepping(kind.config.environment, 1)
+    environment = stock_stepping(kind.config.environment, 1)
     side = {agent: i for i, agents in enumerate(kind.interface.sides.values()) for agent in agents}
     for match in kind.play(schedule):
         for game, seating in zip(match.games, game_plans(schedule, match.position), strict=True):

@@ -17,14 +17,12 @@ from ray.dashboard.modules import dashboard_sdk
 from ray.dashboard.modules.job import job_head, sdk
 from ray.exceptions import RayTaskError
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.learner.learner_group import LearnerGroup
 from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
-from ray.rllib.execution.rollout_ops import synchronous_parallel_sample
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.tune import tune
 from ray.tune.execution import tune_controller
@@ -129,7 +127,6 @@ def test_only_rllib_compat_overrides_private_methods_of_ray() -> None:
 INTERNALS: list[tuple[str, Any, str]] = [
     ("EpisodeChunk", SingleAgentEpisode.__init__, "self.validate()"),
     ("ChunkColumn", InfiniteLookbackBuffer, "self._space_struct = get_base_struct_from_space(value)"),
-    ("column_data", InfiniteLookbackBuffer.__init__, "self.data = data"),
     (
         "includes_component",
         Checkpointable._check_component,
@@ -144,8 +141,6 @@ INTERNALS: list[tuple[str, Any, str]] = [
     ("ExplicitConfig", AlgorithmConfig.rl_module_spec.fget, "self.get_default_rl_module_spec()"),
     ("ExplicitConfig", AlgorithmConfig.get_default_rl_module_spec, "raise NotImplementedError"),
     ("local_learner", LearnerGroup.__init__, "self._learner = learner_class("),
-    ("sample_episodes", PPO.training_step, "synchronous_parallel_sample("),
-    ("sample_episodes", synchronous_parallel_sample, "_return_metrics: bool"),
     ("remote_traceback", RayTaskError.__init__, "self.traceback_str = traceback_str"),
     ("TensorBoardWriter", TBXLoggerCallback.__init__, "self._trial_writer"),
     ("TensorBoardWriter", TBXLoggerCallback.__init__, "self._summary_writer_cls = SummaryWriter"),
@@ -193,4 +188,4 @@ def test_a_chunks_column_has_no_space_and_is_not_copied() -> None:
     column = rllib_compat.ChunkColumn(data)
     assert column.space is None
     assert column.space_struct is None
-    assert rllib_compat.column_data(column) is data
+    assert column.data is data

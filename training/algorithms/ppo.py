@@ -9,6 +9,7 @@ estimates (Schulman et al., 2016, arXiv 1506.02438).
 """
 
 from collections.abc import Collection
+from typing import Any
 
 from ray.rllib.algorithms import ppo
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule, MultiRLModuleSpec
@@ -17,6 +18,7 @@ from ray.rllib.utils.metrics import (
     ENV_RUNNER_SAMPLING_TIMER,
     LEARNER_RESULTS,
     LEARNER_UPDATE_TIMER,
+    NUM_ENV_STEPS_SAMPLED,
     SYNCH_WORKER_WEIGHTS_TIMER,
     TIMERS,
 )
@@ -31,8 +33,9 @@ from training.algorithms import setup
 from training.algorithms.setup import configure, reset_episodes, rl_module_specs
 from training.learners.ppo import PPOLearner, hyperparameters
 from training.modules.actor_critic import ActorCritic, SharedEncoder
-from training.rllib_compat import NoResultsDirectory, sample_episodes
+from training.rllib_compat import NoResultsDirectory
 from training.sampling.env_runner import LEAGUE, LockstepEnvRunner
+from training.sampling.episode_chunks import EpisodeChunks
 
 
 class PPO(NoResultsDirectory, ppo.PPO):
@@ -41,11 +44,11 @@ class PPO(NoResultsDirectory, ppo.PPO):
     def training_step(self) -> None:
         """Sample a batch, update the learning policies, and send changed weights to the runners."""
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
-            episodes, results = sample_episodes(self)
+            chunks, results = self.sample_train_batch()
             self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
         with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
             learned = self.learner_group.update(
-                episodes=episodes,
+                episodes=chunks,
                 policies=self._learning(),
                 num_epochs=self.config.num_epochs,
                 minibatch_size=self.config.minibatch_size,
@@ -61,9 +64,30 @@ class PPO(NoResultsDirectory, ppo.PPO):
         """Drop all open episodes, and derive all further randomness from the seed and `steps`."""
         reset_episodes(self, steps)
 
+    def sample_train_batch(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
+        """Sample a train batch from all runners; return the chunks and the runners' metrics."""
+        chunks: list[EpisodeChunks] = []
+        results: list[dict[str, Any]] = []
+        # With remote runners, the local one only holds weights.
+        is_local = self.env_runner_group.num_remote_env_runners() == 0
+        while sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results) < self.config.total_train_batch_size:
+            sampled = self.env_runner_group.foreach_env_runner(
+                _sample_chunks, local_env_runner=is_local, timeout_seconds=self.config.sample_timeout_s
+            )
+            if not sampled:
+                break
+            for own, metrics in sampled:
+                chunks += own
+                results.append(metrics)
+        return chunks, results
+
     def _learning(self) -> Collection[str]:
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         return setup.learning_policies(settings, tuple(self.config.policies), self.iteration)
+
+
+def _sample_chunks(runner: LockstepEnvRunner) -> tuple[list[EpisodeChunks], dict[str, Any]]:
+    return runner.sample_chunks(), runner.get_metrics()
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> ppo.PPOConfig:

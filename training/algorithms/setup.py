@@ -14,6 +14,7 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.env_runner import EnvRunner
 
 from league.config import LeagueConfig
+from league.environments.implementation import implementation
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
@@ -96,7 +97,7 @@ def configure(
     config.env_runners(
         env_runner_cls=runner,
         num_env_runners=settings.runners,
-        num_envs_per_env_runner=settings.num_envs,
+        num_envs_per_env_runner=num_envs(league, len(interface.agents)),
         num_gpus_per_env_runner=settings.runner_gpus,
         # The runners have no connector state that could be merged.
         merge_env_runner_states=False,
@@ -112,6 +113,24 @@ def configure(
     config.fault_tolerance(restart_failed_env_runners=False, ignore_env_runner_failures=False)
     config.debugging(seed=settings.seed, log_level="ERROR")
     config.reporting(min_time_s_per_iteration=0)
+
+
+STOCK_ENVS, MOST_ENVS = 32, 512
+"""Parallel environments of a runner, if their number is chosen automatically."""
+STEPS_PER_BATCH = 16
+"""Minimum number of steps of an agent in each environment per batch: advantages of shorter chunks are mostly guesses of
+the value function."""
+
+
+def num_envs(league: LeagueConfig, agents: int) -> int:
+    """Return the number of parallel environments of a runner."""
+    settings = league.training
+    if settings.num_envs != "auto":
+        return settings.num_envs
+    if not isinstance(settings, PPOConfig) or implementation(league.environment).vector is None:
+        return STOCK_ENVS
+    fitting = settings.train_batch_size // (max(settings.runners, 1) * agents * STEPS_PER_BATCH)
+    return min(max(fitting, STOCK_ENVS), MOST_ENVS)
 
 
 def rl_module_specs(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
-from league.environments.stepping import EpisodeStart
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import Indices, Starts
 from league.errors import ParityError
 from league.interface import Interface
 from league.policies.actions import to_environment
@@ -58,14 +58,6 @@ class ObservedBatch:
         return len(next(iter(self.observations.values())))
 
 
-@dataclass(frozen=True, slots=True)
-class _Group:
-    """Agents of one policy that sample from its distributions, or play at random."""
-
-    policy: str
-    explores: bool
-
-
 @one_thread()
 def collect_observations(
     environment: EnvironmentConfig, interface: Interface, modules: Mapping[str, PolicyModule], seed: int
@@ -76,31 +68,42 @@ def collect_observations(
     observations that the policies do and do not reach. Raises ParityError if a policy does not act often enough.
     """
     rng = generator(seed, "parity")
-    batched = stepping(environment, NUM_ENVS)
+    batched = stock_stepping(environment, NUM_ENVS)
     resets = itertools.count()
-    groups = [[_Group(interface.policies[agent], explores) for agent in batched.agents] for explores in (False, True)]
-    recurrent_states = {policy: RecurrentStates(module.get_initial_state()) for policy, module in modules.items()}
+    policies = interface.policy_ids
+    # Group 2 i is policy i at random, group 2 i + 1 the same exploring.
+    groups = 2 * np.array([policies.index(interface.policies[agent]) for agent in batched.agents])
+    recurrent_states = {
+        policy: RecurrentStates(module.get_initial_state(), NUM_ENVS, len(batched.agents))
+        for policy, module in modules.items()
+    }
     distributions = {policy: distribution(interface.of_policy(policy).action) for policy in modules}
     met: dict[str, list[ObservedBatch]] = defaultdict(list)
     began = time.monotonic()
+
+    def next_episodes(envs: Indices) -> Starts:
+        seeds = [derive(seed, "parity", next(resets)) % SEEDS for _ in envs]
+        return Starts(envs, np.array(seeds), groups + envs[:, np.newaxis] % 2)
+
     try:
-        turn = batched.start(lambda env: EpisodeStart(derive(seed, "parity", next(resets)) % SEEDS, groups[env % 2]))
+        turn = batched.start(next_episodes)
         while not _is_enough(met, interface, time.monotonic() - began):
-            for env, states in itertools.product(turn.finished, recurrent_states.values()):
-                states.forget(env)
+            for states in recurrent_states.values():
+                states.forget(turn.finished)
             actions = {}
             for group, batch in turn.batches.items():
-                states = recurrent_states[group.policy]
+                policy, explores = policies[group // 2], group % 2
+                states = recurrent_states[policy]
                 situation = ObservedBatch(batch.observations, states.get(batch))
-                met[group.policy].append(situation)
-                dist_inputs, state = module_outputs(modules[group.policy], situation)
+                met[policy].append(situation)
+                dist_inputs, state = module_outputs(modules[policy], situation)
                 states.update(batch, state)
-                drawn = distributions[group.policy]
-                if group.explores:
+                drawn = distributions[policy]
+                if explores:
                     raw, _ = drawn.sample(dist_inputs, rng)
                 else:
                     raw, _ = drawn.uniform(batch.observations.get(ACTION_MASK), len(situation), rng)
-                actions[group] = to_environment(raw, interface.of_policy(group.policy).action)
+                actions[group] = to_environment(raw, interface.of_policy(policy).action)
             turn = batched.step(actions)
     finally:
         batched.close()

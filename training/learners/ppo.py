@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import torch
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ALL_MODULES, NUM_MODULE_STEPS_TRAINED
 from torch import Tensor
 
@@ -28,6 +27,7 @@ from training.modules.actor_critic import SharedEncoder
 from training.modules.distributions import TorchDistribution
 from training.rllib_compat import FixedPoliciesLearner, TrainingData
 from training.sampling.env_runner import LEAGUE
+from training.sampling.episode_chunks import EpisodeChunks
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,10 +163,10 @@ class PPOLearner(FixedPoliciesLearner):
         minibatch_size: int | None = None,
         **_: Any,
     ) -> dict[str, Any]:
-        """Update the policies on sampled episodes.
+        """Update the policies on sampled chunks.
 
         Args:
-            training_data: Contains the episode chunks of a sample.
+            training_data: Contains the EpisodeChunks of a sample in place of episodes.
             policies: The policies to update; by default all.
             num_epochs: Passes over the data.
             minibatch_size: Steps per minibatch of the policy with the most steps.
@@ -187,11 +187,11 @@ class PPOLearner(FixedPoliciesLearner):
         # RLlib reports NaN for policies that were logged earlier but not in this update.
         return {policy: metrics[policy] for policy in batches}
 
-    def _batches(self, episodes: Iterable[SingleAgentEpisode], policies: Collection[str]) -> dict[str, TrainBatch]:
+    def _batches(self, sampled: Iterable[EpisodeChunks], policies: Collection[str]) -> dict[str, TrainBatch]:
         chunks = defaultdict(list)
-        for episode in episodes:
-            if len(episode) and episode.module_id in policies:
-                chunks[episode.module_id].append(episode)
+        for own in sampled:
+            if own.policy in policies:
+                chunks[own.policy].append(own)
         recurrence = self.settings.recurrence
         return {
             policy: train_batch(

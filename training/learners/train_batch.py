@@ -1,7 +1,7 @@
 """Builds train batches from episode chunks: GAE advantages, value targets, sequences, shuffled minibatches.
 
-RLlib's default learner pipeline handles each time step as a Python object. Here, the chunks of a policy are
-concatenated, and their observations, T + 1 per chunk of T steps, are valued in a few passes. The last observation of a
+RLlib's default learner pipeline handles each time step as a Python object. Here, the chunks of a policy are columns,
+and their observations, T + 1 per chunk of T steps, are valued in a few passes. The last observation of a
 chunk is the bootstrap: 0 if the agent terminated, its value if the agent was truncated or the chunk was cut.
 """
 
@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from torch import Tensor
 
 from training.modules.actor_critic import ActorCritic
-from training.rllib_compat import column_data
+from training.sampling.episode_chunks import EpisodeChunks
 
 
 def generalized_advantages(
@@ -61,9 +60,8 @@ def generalized_advantages(
     return advantages
 
 
-Chunks = Sequence[SingleAgentEpisode]
-Bootstraps = Callable[[Chunks], NDArray]
-"""Chunks → (c,) bool: whether the value of each chunk's last observation counts."""
+Bootstraps = Callable[[EpisodeChunks], NDArray]
+"""c chunks → (c,) bool: whether the value of each chunk's last observation counts."""
 
 VALUE_PASS_ROWS = 2048
 """Rows per forward pass: more than a few thousand images as floats would exhaust memory."""
@@ -142,57 +140,57 @@ class Minibatch:
     targets: Tensor
 
 
-def bootstrap_unless_terminated(chunks: Chunks) -> NDArray:
+def bootstrap_unless_terminated(chunks: EpisodeChunks) -> NDArray:
     """Bootstrap truncated and cut chunks: only terminal states have no future return."""
-    return np.array([not chunk.is_terminated for chunk in chunks])
+    return ~chunks.terminated
 
 
 def train_batch(
     module: ActorCritic,
-    chunks: Chunks,
+    samples: Sequence[EpisodeChunks],
     *,
     gamma: float,
     lambda_: float,
     sequence: int | None = None,
     bootstraps: Bootstraps = bootstrap_unless_terminated,
 ) -> TrainBatch:
-    """Build the batch of non-empty `chunks` on the module's device, after updating its observation statistics.
+    """Build a batch on the module's device, after updating its observation statistics.
 
     Args:
         module: The policy's module.
-        chunks: Non-empty episode chunks of the policy.
+        samples: The policy's chunks, of one or more runners.
         gamma: Discount factor.
         lambda_: λ of the advantages.
         sequence: Maximum length of the sequences for a recurrent module.
         bootstraps: Selects the chunks whose last observation is bootstrapped from.
     """
     device = next(module.parameters()).device
-    lengths = np.array([len(chunk) for chunk in chunks])
-    acted = np.delete(np.arange(lengths.sum() + len(chunks)), np.cumsum(lengths + 1) - 1)
-    observations = {
-        name: torch.from_numpy(np.concatenate([column_data(chunk.observations)[name] for chunk in chunks])).to(device)
-        for name in column_data(chunks[0].observations)
-    }
-    module.encoder.update_statistics(observations)
-    state = {key: torch.from_numpy(column).to(device) for key, column in _states(chunks).items()}
-    values, bootstrap = _values(module, observations, acted, lengths, state)
-    next_values = np.append(values[1:], 0.0)
-    next_values[np.cumsum(lengths) - 1] = bootstrap * bootstraps(chunks)
-    rewards = np.concatenate([column_data(chunk.rewards) for chunk in chunks])
-    lasts = np.zeros(len(acted), dtype=bool)
-    lasts[np.cumsum(lengths) - 1] = True
-    advantages = generalized_advantages(rewards, values, next_values, lasts, gamma, lambda_)
-    targets = advantages + values
+    lengths = np.concatenate([chunks.lengths for chunks in samples])
+    acted = np.delete(np.arange(lengths.sum() + len(lengths)), np.cumsum(lengths + 1) - 1)
 
     def column(values: NDArray) -> Tensor:
         return torch.from_numpy(values).to(device)
 
+    observations = {
+        name: column(np.concatenate([chunks.observations[name] for chunks in samples]))
+        for name in samples[0].observations
+    }
+    module.encoder.update_statistics(observations)
+    state = {key: column(np.concatenate([chunks.state[key] for chunks in samples])) for key in samples[0].state}
+    values, bootstrap = _values(module, observations, acted, lengths, state)
+    next_values = np.append(values[1:], 0.0)
+    next_values[np.cumsum(lengths) - 1] = bootstrap * np.concatenate([bootstraps(chunks) for chunks in samples])
+    rewards = np.concatenate([chunks.rewards for chunks in samples])
+    lasts = np.zeros(len(acted), dtype=bool)
+    lasts[np.cumsum(lengths) - 1] = True
+    advantages = generalized_advantages(rewards, values, next_values, lasts, gamma, lambda_)
+    targets = advantages + values
     return TrainBatch(
         observations=observations,
         acted=column(acted),
-        actions=column(np.concatenate([column_data(chunk.actions) for chunk in chunks])),
-        dist_inputs=column(_outputs(chunks, Columns.ACTION_DIST_INPUTS)),
-        log_p=column(_outputs(chunks, Columns.ACTION_LOGP)),
+        actions=column(np.concatenate([chunks.actions for chunks in samples])),
+        dist_inputs=column(np.concatenate([chunks.dist_inputs for chunks in samples])),
+        log_p=column(np.concatenate([chunks.log_p for chunks in samples])),
         advantages=column(_standardized(advantages).astype(np.float32)),
         targets=column(targets.astype(np.float32)),
         sequences=_sequences(lengths, sequence, state) if sequence is not None and state else None,
@@ -235,14 +233,6 @@ def _value_pass(
     return np.concatenate(values), {key: torch.cat([after[key] for after in states]) for key in state}
 
 
-def _states(chunks: Chunks) -> dict[str, NDArray]:
-    """Return key → (n, width), the recurrent state before each step; empty if not recurrent."""
-    if Columns.STATE_IN not in chunks[0].extra_model_outputs:
-        return {}
-    columns = [column_data(chunk.extra_model_outputs[Columns.STATE_IN]) for chunk in chunks]
-    return {key: np.concatenate([column[key] for column in columns]) for key in columns[0]}
-
-
 def _sequences(lengths: NDArray, sequence: int, state: dict[str, Tensor]) -> Sequences:
     """Split each chunk into sequences of `sequence` steps and a remainder."""
     firsts = np.cumsum(lengths) - lengths
@@ -251,10 +241,6 @@ def _sequences(lengths: NDArray, sequence: int, state: dict[str, Tensor]) -> Seq
     begun = {key: value[starts] for key, value in state.items()}
     device = next(iter(begun.values())).device
     return Sequences(torch.from_numpy(starts).to(device), torch.from_numpy(stops - starts).to(device), begun)
-
-
-def _outputs(chunks: Chunks, column: str) -> NDArray:
-    return np.concatenate([column_data(chunk.extra_model_outputs[column]) for chunk in chunks])
 
 
 def _standardized(values: NDArray) -> NDArray:

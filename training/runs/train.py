@@ -10,6 +10,7 @@ from rich.console import Console
 
 from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
+from league.environments.implementation import implementation
 from league.errors import ConfigError, InterfaceChanged
 from league.interface import Interface
 from league.ray_cluster import UNLIMITED, LocalRay, connected
@@ -90,6 +91,7 @@ def train(
         run = interrupted or RunDirectory.begin(registry.storage, config, number, git_commit(config_path), pins)
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
         with run.locked(), progress, RunReporter(registry, run) as reporter:
+            progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
             _train_and_publish(run, registry, interface, progress, reporter)

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
-from league.environments.stepping import EpisodeStart, Turn
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch
 from league.interface import AgentInterface, Interface
 from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, inputs
@@ -71,8 +71,8 @@ class PolicyTransitions:
         self._num_envs, self._initial = num_envs, initial
         self._policies = interface.policy_ids
         by_agent = [interface.policies[agent] for agent in agents]
-        self._policy_of = by_agent
-        self._number = [by_agent[:i].count(policy) for i, policy in enumerate(by_agent)]
+        self._policy_of = np.array([self._policies.index(policy) for policy in by_agent])
+        self._number = np.array([by_agent[:i].count(policy) for i, policy in enumerate(by_agent)])
         self._sizes = {policy: by_agent.count(policy) for policy in self._policies}
         self._stream_offset = 0
         self._closed: dict[str, list[TransitionBlock]] = {policy: [] for policy in self._policies}
@@ -121,41 +121,36 @@ class PolicyTransitions:
 
     def close(self, turn: Turn) -> dict[str, TransitionBlock]:
         """Return the transitions that a turn completes, and store its rows as the latest observations."""
-        for env in turn.crashed:
-            for policy, n in self._sizes.items():
-                left = slice(env * n, (env + 1) * n)
-                self._open[policy].is_open[left] = False
-                self._open[policy].is_first[left] = True
+        for policy, n in self._sizes.items():
+            left = (turn.crashed[:, np.newaxis] * n + np.arange(n)).ravel()
+            self._open[policy].is_open[left] = False
+            self._open[policy].is_first[left] = True
         closed: dict[str, list[TransitionBlock]] = {policy: [] for policy in self._policies}
         self._close_endings(turn, closed)
         for own in self._open.values():
             own.places = own.places[:0]
         for group, batch in turn.batches.items():
-            if not isinstance(group, str):
+            if group >= len(self._policies):
                 continue
-            numbers = np.array([self._number[agent] for agent in batch.agents], dtype=np.int64)
-            places = np.array(batch.envs, dtype=np.int64) * self._sizes[group] + numbers
-            rewards, unended = np.array(batch.rewards, dtype=np.float32), np.zeros(len(places), dtype=bool)
-            self._close(group, places, batch.observations, rewards, unended, unended, closed)
-            self._observe(group, places, batch.observations)
+            policy = self._policies[group]
+            places = batch.envs * self._sizes[policy] + self._number[batch.agents]
+            rewards, unended = batch.rewards.astype(np.float32), np.zeros(len(places), dtype=bool)
+            self._close(policy, places, batch.observations, rewards, unended, unended, closed)
+            self._observe(policy, places, batch.observations)
         return {policy: concatenate(blocks) for policy, blocks in closed.items() if blocks}
 
     def _close_endings(self, turn: Turn, closed: dict[str, list[TransitionBlock]]) -> None:
-        for policy in self._policies:
-            endings = [ending for ending in turn.endings if self._policy_of[ending.agent] == policy]
-            if not endings:
-                continue
-            n = self._sizes[policy]
-            places = np.array([ending.env * n + self._number[ending.agent] for ending in endings], dtype=np.int64)
-            observations = {
-                name: np.stack([ending.observation[name] for ending in endings]) for name in endings[0].observation
-            }
-            rewards = np.array([ending.reward for ending in endings], dtype=np.float32)
-            terminated = np.array([ending.terminated for ending in endings], dtype=bool)
-            truncated = np.array([ending.truncated for ending in endings], dtype=bool) & ~terminated
-            self._close(policy, places, observations, rewards, terminated, truncated, closed)
-            self._open[policy].is_open[places] = False
-            self._open[policy].is_first[places] = True
+        for rows in turn.endings:
+            policies = self._policy_of[rows.agents]
+            for number in np.unique(policies).tolist():
+                policy, own = self._policies[number], np.flatnonzero(policies == number)
+                places = rows.envs[own] * self._sizes[policy] + self._number[rows.agents[own]]
+                observations = {name: array[own] for name, array in rows.observations.items()}
+                rewards, terminated = rows.rewards[own].astype(np.float32), rows.terminations[own]
+                truncated = rows.truncations[own] & ~terminated
+                self._close(policy, places, observations, rewards, terminated, truncated, closed)
+                self._open[policy].is_open[places] = False
+                self._open[policy].is_first[places] = True
 
     def _close(
         self,
@@ -178,7 +173,7 @@ class PolicyTransitions:
         rows |= {ACTIONS: own.actions[places], REWARDS: rewards[chosen]}
         rows |= {TERMINATED: terminated[chosen], TRUNCATED: truncated[chosen]}
         rows |= {
-            f"{NEXT}{OBSERVATIONS}/{name}": np.asarray(observations[name])[chosen].astype(seen.dtype, copy=False)
+            f"{NEXT}{OBSERVATIONS}/{name}": observations[name][chosen].astype(seen.dtype, copy=False)
             for name, seen in own.observations.items()
         }
         streams = self._stream_offset * self._sizes[policy] + places
@@ -279,14 +274,18 @@ class JointTransitions:
     def _with_states(self, envs: NDArray, rows: Rows, turn: Turn) -> Rows:
         if self._states is None:
             return {STATE: _flat_state(rows, OBSERVATIONS), NEXT + STATE: _flat_state(rows, NEXT + OBSERVATIONS)}
-        after = np.stack([(turn.last_states if env in turn.last_states else turn.states)[env] for env in envs.tolist()])
-        return {STATE: self._states[envs], NEXT + STATE: after}
+        after = self._states.copy()
+        for states in (turn.states, turn.last_states):
+            if states is not None:
+                after[states.envs] = states.values
+        return {STATE: self._states[envs], NEXT + STATE: after[envs]}
 
     def _keep_states(self, turn: Turn) -> None:
-        for env, state in turn.states.items():
-            if self._states is None:
-                self._states = np.zeros((self._num_envs, len(state)), np.float32)
-            self._states[env] = state
+        if turn.states is None:
+            return
+        if self._states is None:
+            self._states = np.zeros((self._num_envs, turn.states.values.shape[1]), np.float32)
+        self._states[turn.states.envs] = turn.states.values
 
 
 class JointTransitionsWithoutState(JointTransitions):
@@ -297,10 +296,10 @@ class JointTransitionsWithoutState(JointTransitions):
 
 def state_size(environment: EnvironmentConfig, interface: Interface) -> int:
     """Return s, the size of `state` in an environment. Raises ConfigError if the environment cannot be created."""
-    with closing(stepping(environment, 1, states=True)) as batched:
-        turn = batched.start(lambda _: EpisodeStart(0, list(interface.policies.values())))
-    if turn.states:
-        return len(turn.states[0])
+    with closing(stock_stepping(environment, 1, states=True)) as batched:
+        turn = batched.start(each_agent_alone([0], len(batched.agents)))
+    if turn.states is not None:
+        return turn.states.values.shape[1]
     return sum(
         math.prod(leaf.shape)
         for agent in interface.agents

@@ -4,7 +4,6 @@ Distribution inputs and raw actions are those of `league.policies.actions`; trai
 torch counterpart.
 """
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -188,9 +187,7 @@ class OrnsteinUhlenbeck:
         self._theta = theta
         self._state = np.zeros((num_envs, agents, elements), np.float32)
 
-    def draw(
-        self, envs: Sequence[int], agents: Sequence[int], dist_inputs: NDArray, rng: np.random.Generator
-    ) -> NDArray:
+    def draw(self, envs: NDArray, agents: NDArray, dist_inputs: NDArray, rng: np.random.Generator) -> NDArray:
         """Return raw actions (k, m) of the given agents. dist_inputs: (k, 2 m), means, then logarithms of σ."""
         means, log_deviations = np.split(dist_inputs, 2, axis=1)
         step = np.exp(log_deviations) * rng.standard_normal(means.shape, dtype=np.float32)
@@ -198,6 +195,6 @@ class OrnsteinUhlenbeck:
         self._state[envs, agents] = moved
         return (means + moved).astype(np.float32)
 
-    def forget(self, env: int) -> None:
-        """The episode in `env` is over."""
-        self._state[env] = 0.0
+    def forget(self, envs: NDArray) -> None:
+        """The episodes in `envs` are over."""
+        self._state[envs] = 0.0

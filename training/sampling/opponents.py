@@ -1,13 +1,13 @@
 """Opponents in training: matchups per episode, random openings, and the opponents' actions."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.stepping import Batch
+from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.loading import contestant
@@ -22,48 +22,71 @@ from training.sampling.recurrent_state import RecurrentStates
 
 @dataclass(frozen=True, slots=True)
 class OpponentPolicy:
-    """The group of agents that an opponent controls: a reference, and one of its policies."""
+    """An opponent's policy: a reference, and one of its policies."""
 
     ref: str
     policy: str
 
 
-Controller = str | OpponentPolicy
-"""Who controls an agent: one of the league's policies, by id, or an opponent."""
+@dataclass(frozen=True, slots=True)
+class RandomMoves:
+    """Random moves; `policy` has the spaces."""
+
+    policy: str
+
+
+Controller = str | OpponentPolicy | RandomMoves
+"""Who controls an agent: one of the league's policies, by id, an opponent, or nobody."""
+
+
+class Controllers:
+    """Numbers all controllers, for use as groups. The league's own policies come first, in the interface's order."""
+
+    def __init__(self, interface: Interface, opponents: Sequence[OpponentConfig]) -> None:
+        policies = interface.policy_ids
+        self._all: list[Controller] = [*policies, *(RandomMoves(policy) for policy in policies)]
+        self._all += [OpponentPolicy(opponent.ref, policy) for opponent in opponents for policy in policies]
+        self._number = {controller: number for number, controller in reversed(list(enumerate(self._all)))}
+
+    def __getitem__(self, group: int) -> Controller:
+        return self._all[group]
+
+    def groups(self, controllers: Sequence[Controller]) -> Indices:
+        """Return the numbers of some controllers."""
+        return np.array([self._number[controller] for controller in controllers], dtype=np.int64)
 
 
 class Matchups:
     """Draws for each episode an opponent or none, by their shares, and the side that learns."""
 
-    def __init__(self, interface: Interface, opponents: Sequence[OpponentConfig], agents: Sequence[str]) -> None:
+    def __init__(
+        self, interface: Interface, opponents: Sequence[OpponentConfig], agents: Sequence[str], controllers: Controllers
+    ) -> None:
         """Raises ConfigError if opponents are configured and the league has one side only."""
         if opponents and len(interface.sides) < 2:
             raise ConfigError("training.opponents: the league has one side only: divide the agents into sides")
-        self._refs = [opponent.ref for opponent in opponents]
         self._shares = np.cumsum([opponent.share for opponent in opponents])
-        self._agents = tuple(agents)
-        self._own: tuple[Controller, ...] = tuple(interface.policies[agent] for agent in agents)
-        self._sides = [frozenset(members) for members in interface.sides.values()]
-
-    def draw(self, rng: np.random.Generator) -> tuple[Controller, ...]:
-        """Return the controller of each agent in the next episode."""
-        if not self._refs:
-            return self._own
-        index = int(np.searchsorted(self._shares, rng.random(), side="right"))
-        if index == len(self._refs):
-            return self._own
-        learning = self._sides[int(rng.integers(len(self._sides)))]
-        return tuple(
-            policy if agent in learning else OpponentPolicy(self._refs[index], str(policy))
-            for agent, policy in zip(self._agents, self._own, strict=True)
+        policies = [interface.policies[agent] for agent in agents]
+        self._own = controllers.groups(policies)
+        # (opponents, agents)
+        self._opposing = np.array(
+            [
+                controllers.groups([OpponentPolicy(opponent.ref, policy) for policy in policies])
+                for opponent in opponents
+            ]
         )
+        # (sides, agents)
+        self._sides = np.array([[agent in members for agent in agents] for members in interface.sides.values()])
 
-
-@dataclass(frozen=True, slots=True)
-class RandomMoves:
-    """The group of agents that currently move at random; `policy` has their spaces."""
-
-    policy: str
+    def draw(self, episodes: int, rng: np.random.Generator) -> Indices:
+        """Return the groups of all agents in some new episodes, (episodes, agents)."""
+        groups = np.tile(self._own, (episodes, 1))
+        if len(self._shares):
+            opponents = np.searchsorted(self._shares, rng.random(episodes), side="right")
+            opposed = np.flatnonzero(opponents < len(self._shares))
+            learning = self._sides[rng.integers(len(self._sides), size=len(opposed))]
+            groups[opposed] = np.where(learning, groups[opposed], self._opposing[opponents[opposed]])
+        return groups
 
 
 class Openings:
@@ -72,28 +95,24 @@ class Openings:
     Random openings reach positions that self-play alone does not visit; evaluation matches have openings, too.
     """
 
-    def __init__(self, plies: int, policies: Sequence[str], num_envs: int) -> None:
-        """policies: the policy of each agent."""
-        self._plies = plies
-        self._left = [0] * num_envs
-        self._waiting: list[tuple[Controller, ...]] = [()] * num_envs
-        self._movers = tuple(RandomMoves(policy) for policy in policies)
+    def __init__(self, plies: int, movers: Indices, num_envs: int) -> None:
+        """movers: the groups of all agents during the opening, (agents,)."""
+        self._plies, self._movers = plies, movers
+        self._left = np.zeros(num_envs, np.int64)
+        self._waiting = np.zeros((num_envs, len(movers)), np.int64)
 
-    def begin(
-        self, env: int, controllers: tuple[Controller, ...], rng: np.random.Generator
-    ) -> tuple[Controller, ...] | tuple[RandomMoves, ...]:
-        """Return the initial groups of the agents in an episode. controllers: of the agents after the opening."""
+    def begin(self, envs: Indices, groups: Indices, rng: np.random.Generator) -> Indices:
+        """Return the initial groups of the agents in new episodes. groups: after the opening, (m, agents)."""
         if not self._plies:
-            return controllers
-        self._left[env], self._waiting[env] = int(rng.integers(self._plies + 1)), controllers
-        return self._movers if self._left[env] else controllers
+            return groups
+        self._left[envs], self._waiting[envs] = rng.integers(self._plies + 1, size=len(envs)), groups
+        return np.where(self._left[envs, np.newaxis] > 0, self._movers, groups)
 
-    def step(self) -> Iterator[tuple[int, tuple[Controller, ...]]]:
-        """Count a step in all environments; yield those whose opening ends with it, and their controllers."""
-        for env, left in enumerate(self._left) if self._plies else ():
-            self._left[env] = max(left - 1, 0)
-            if left == 1:
-                yield env, self._waiting[env]
+    def step(self) -> tuple[Indices, Indices]:
+        """Count a step in all environments. Return those whose opening ends with it, and their groups after it."""
+        ended = np.flatnonzero(self._left == 1)
+        self._left = np.maximum(self._left - 1, 0)
+        return ended, self._waiting[ended]
 
 
 VALUE_BASED_ALGORITHMS = ("dqn", "qmix")
@@ -103,7 +122,9 @@ VALUE_BASED_ALGORITHMS = ("dqn", "qmix")
 class Opponents:
     """The loaded policies of all opponents, with their recurrent states."""
 
-    def __init__(self, configs: Sequence[OpponentConfig], interface: Interface, storage: Storage | None) -> None:
+    def __init__(
+        self, configs: Sequence[OpponentConfig], interface: Interface, storage: Storage | None, num_envs: int
+    ) -> None:
         """Raises what loading raises, and ConfigError for versions without a storage to load them from."""
         self._policies = {
             OpponentPolicy(config.ref, policy_id): policy
@@ -112,7 +133,7 @@ class Opponents:
         }
         self._greedy = {config.ref for config in configs if _is_greedy(config.ref, storage)}
         self._recurrent_states = {
-            opponent: RecurrentStates({key: rows[0] for key, rows in initial.items()})
+            opponent: RecurrentStates({key: rows[0] for key, rows in initial.items()}, num_envs, len(interface.agents))
             for opponent, policy in self._policies.items()
             if isinstance(policy, OnnxPolicy) and (initial := policy.initial_state(1))
         }
@@ -124,16 +145,16 @@ class Opponents:
             batch.observations,
             state=states.get(batch) if states else None,
             explore=isinstance(policy, OnnxPolicy) and opponent.ref not in self._greedy,
-            rng=[rng] * len(batch.envs),
+            rng=[rng] * len(batch),
         )
         if states and answer.state is not None:
             states.update(batch, answer.state)
         return answer.actions
 
-    def forget(self, env: int) -> None:
-        """The episode in `env` is over."""
+    def forget(self, envs: Indices) -> None:
+        """The episodes in `envs` are over."""
         for states in self._recurrent_states.values():
-            states.forget(env)
+            states.forget(envs)
 
 
 def _is_greedy(ref: str, storage: Storage | None) -> bool:

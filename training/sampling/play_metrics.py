@@ -1,8 +1,8 @@
 """Collects a runner's statistics of play and logs them under RLlib's metric names."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ from ray.rllib.utils.metrics import (
 )
 from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
-from league.environments.stepping import Ending
+from league.environments.stepping import Batch, Indices, Turn
+from league.environments.vector.vector_env import AgentRows
 from training.sampling.distributions import Distribution
 
 ENTROPY = "entropy"
@@ -39,20 +40,17 @@ EPISODE_AGENT_LEN_MEAN = "agent_episode_len_mean"
 
 
 @dataclass(frozen=True, slots=True)
-class AgentEpisode:
-    """One agent's part of an episode: the return of the whole episode, and the steps that its policy played."""
+class PlayedEpisodes:
+    """Finished episodes.
 
-    agent: int
-    steps: int
-    return_: float
+    lengths: (m,), environment steps, including random and opponents' moves. steps: (m, agents), those of each agent
+    that the league's policies played; 0 for an agent that did not finish the episode. returns: (m, agents), of the
+    whole episode, 0 where steps is 0.
+    """
 
-
-@dataclass(slots=True)
-class PlayedEpisode:
-    """steps: of the environment, including random and opponents' moves. agents: those of the league's policies."""
-
-    steps: int = 0
-    agents: list[AgentEpisode] = field(default_factory=list)
+    lengths: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    returns: NDArray[np.float64]
 
 
 class PlayMetrics:
@@ -69,22 +67,17 @@ class PlayMetrics:
         self._agents = agents
         self._policies = policies
         self._distributions = distributions
-        self._returns = np.zeros(num_envs * len(agents))
-        self._steps = np.zeros(num_envs * len(agents), dtype=np.int64)
-        self._playing = [PlayedEpisode() for _ in range(num_envs)]
+        # Of each agent in the current episode: until now, and at its end.
+        self._returns = np.zeros((num_envs, len(agents)))
+        self._steps = np.zeros((num_envs, len(agents)), np.int64)
+        self._last_returns, self._last_steps = self._returns.copy(), self._steps.copy()
+        self._lengths = np.zeros(num_envs, np.int64)
         self.steps = 0
         """Actions of all agents since the runner started."""
         self.episodes = 0
         """Episodes finished since the runner started."""
         self._logged_steps = self._logged_episodes = 0
         self._clear()
-
-    def add_rows(self, slots: NDArray, rewards: NDArray, are_own: bool) -> None:
-        """Add the rewards of agents that must act. slots: env · agents + agent. are_own: controlled by the league's
-        policies."""
-        self._returns[slots] += rewards
-        if are_own:
-            self._steps[slots] += 1
 
     def add_play(self, policy: str, dist_inputs: NDArray) -> None:
         """Add the distribution inputs (k, d) that a policy's actions were drawn from."""
@@ -96,34 +89,49 @@ class PlayMetrics:
 
     def add_step(self) -> None:
         """Count a step in all environments."""
-        for episode in self._playing:
-            episode.steps += 1
+        self._lengths += 1
 
-    def add_agent(self, ending: Ending) -> None:
-        """Add an agent that left its episode; ignored if no policy of the league controlled it."""
-        slot = ending.env * len(self._agents) + ending.agent
-        if self._steps[slot]:
-            returned = float(self._returns[slot]) + ending.reward
-            self._playing[ending.env].agents.append(AgentEpisode(ending.agent, int(self._steps[slot]), returned))
-        self._steps[slot] = self._returns[slot] = 0
+    def add_turn(self, turn: Turn, own_policies: int) -> None:
+        """Add what has ended, and the rewards of agents that must act.
 
-    def add_episode(self, env: int) -> None:
-        """Add a finished episode."""
-        self.episodes += 1
-        if self._playing[env].agents:
-            self._finished.append(self._playing[env])
-        self.forget(env)
+        own_policies: the first groups are those of the league's own policies.
+        """
+        if len(turn.crashed):
+            self._crashes += len(turn.crashed)
+            self.forget(turn.crashed)
+        for rows in turn.endings:
+            self._add_endings(rows)
+        if len(turn.finished):
+            self._add_episodes(turn.finished)
+        for group, batch in turn.batches.items():
+            self._add_rows(batch, is_own=group < own_policies)
 
-    def add_crash(self, env: int) -> None:
-        """Add a crash, whose episode is lost."""
-        self._crashes += 1
-        self.forget(env)
+    def forget(self, envs: Indices) -> None:
+        """Drop the open episodes of some environments."""
+        for column in (self._returns, self._steps, self._last_returns, self._last_steps, self._lengths):
+            column[envs] = 0
 
-    def forget(self, env: int) -> None:
-        """Drop the open episode of an environment."""
-        self._playing[env] = PlayedEpisode()
-        slots = slice(env * len(self._agents), (env + 1) * len(self._agents))
-        self._steps[slots] = self._returns[slots] = 0
+    def _add_rows(self, batch: Batch, is_own: bool) -> None:
+        self._returns[batch.envs, batch.agents] += batch.rewards
+        if is_own:
+            self._steps[batch.envs, batch.agents] += 1
+
+    def _add_endings(self, rows: AgentRows) -> None:
+        """Agents that no policy of the league controlled are ignored."""
+        places = rows.envs, rows.agents
+        steps = self._steps[places]
+        self._last_steps[places] += steps
+        self._last_returns[places] += np.where(steps > 0, self._returns[places] + rows.rewards, 0.0)
+        self._steps[places] = self._returns[places] = 0
+
+    def _add_episodes(self, envs: Indices) -> None:
+        self.episodes += len(envs)
+        played = envs[self._last_steps[envs].any(axis=1)]
+        if len(played):
+            self._finished.append(
+                PlayedEpisodes(self._lengths[played], self._last_steps[played], self._last_returns[played])
+            )
+        self.forget(envs)
 
     def log(self, metrics: MetricsLogger) -> None:
         """Log everything since the last call under RLlib's names."""
@@ -135,8 +143,13 @@ class PlayMetrics:
         metrics.log_value(CRASHES, self._crashes, reduce="sum")
         self._log_plays(metrics)
         if self._finished:
-            self._log_episodes(metrics)
-            self._log_agents(metrics)
+            finished = PlayedEpisodes(
+                np.concatenate([played.lengths for played in self._finished]),
+                np.concatenate([played.steps for played in self._finished]),
+                np.concatenate([played.returns for played in self._finished]),
+            )
+            self._log_episodes(metrics, finished)
+            self._log_agents(metrics, finished)
         self._logged_steps, self._logged_episodes = self.steps, self.episodes
         self._clear()
 
@@ -148,9 +161,8 @@ class PlayMetrics:
             metrics.log_value((NUM_MODULE_STEPS_SAMPLED, policy), len(dist_inputs), reduce="sum")
             metrics.log_value((NUM_MODULE_STEPS_SAMPLED_LIFETIME, policy), len(dist_inputs), reduce="lifetime_sum")
 
-    def _log_episodes(self, metrics: MetricsLogger) -> None:
-        lengths = [episode.steps for episode in self._finished]
-        returns = [sum(agent.return_ for agent in episode.agents) for episode in self._finished]
+    def _log_episodes(self, metrics: MetricsLogger, episodes: PlayedEpisodes) -> None:
+        lengths, returns = episodes.lengths, episodes.returns.sum(axis=1)
         for key, values, statistic in (
             (EPISODE_LEN_MEAN, lengths, np.mean),
             (EPISODE_LEN_MIN, lengths, np.min),
@@ -161,27 +173,29 @@ class PlayMetrics:
         ):
             metrics.log_value(key, float(statistic(values)), window=1)
 
-    def _log_agents(self, metrics: MetricsLogger) -> None:
-        by_agent, by_policy = defaultdict(list), defaultdict(list)
-        for agent in (agent for episode in self._finished for agent in episode.agents):
-            by_agent[self._agents[agent.agent]].append(agent)
-            by_policy[self._policies[agent.agent]].append(agent)
-        for name, episodes in by_agent.items():
-            _log_means(metrics, EPISODE_AGENT_RETURN_MEAN, EPISODE_AGENT_LEN_MEAN, name, episodes)
-            steps = sum(episode.steps for episode in episodes)
-            metrics.log_value((NUM_AGENT_STEPS_SAMPLED, name), steps, reduce="sum")
-            metrics.log_value((NUM_AGENT_STEPS_SAMPLED_LIFETIME, name), steps, reduce="lifetime_sum")
-        for policy, episodes in by_policy.items():
-            _log_means(metrics, EPISODE_MODULE_RETURN_MEAN, EPISODE_MODULE_LEN_MEAN, policy, episodes)
+    def _log_agents(self, metrics: MetricsLogger, episodes: PlayedEpisodes) -> None:
+        for index, name in enumerate(self._agents):
+            steps = _log_means(metrics, EPISODE_AGENT_RETURN_MEAN, EPISODE_AGENT_LEN_MEAN, name, episodes, [index])
+            if steps:
+                metrics.log_value((NUM_AGENT_STEPS_SAMPLED, name), steps, reduce="sum")
+                metrics.log_value((NUM_AGENT_STEPS_SAMPLED_LIFETIME, name), steps, reduce="lifetime_sum")
+        for policy in dict.fromkeys(self._policies):
+            agents = [index for index, own in enumerate(self._policies) if own == policy]
+            _log_means(metrics, EPISODE_MODULE_RETURN_MEAN, EPISODE_MODULE_LEN_MEAN, policy, episodes, agents)
 
     def _clear(self) -> None:
         self._plays: dict[str, list[NDArray]] = defaultdict(list)
-        self._finished: list[PlayedEpisode] = []
+        self._finished: list[PlayedEpisodes] = []
         self._crashes = 0
 
 
 def _log_means(
-    metrics: MetricsLogger, return_key: str, length_key: str, name: str, episodes: Sequence[AgentEpisode]
-) -> None:
-    metrics.log_value((return_key, name), float(np.mean([episode.return_ for episode in episodes])), window=1)
-    metrics.log_value((length_key, name), float(np.mean([episode.steps for episode in episodes])), window=1)
+    metrics: MetricsLogger, return_key: str, length_key: str, name: str, episodes: PlayedEpisodes, agents: list[int]
+) -> int:
+    """Log the mean return and length of some agents' episodes, and return the number of their steps."""
+    steps, returns = episodes.steps[:, agents], episodes.returns[:, agents]
+    if not steps.any():
+        return 0
+    metrics.log_value((return_key, name), float(returns[steps > 0].mean()), window=1)
+    metrics.log_value((length_key, name), float(steps[steps > 0].mean()), window=1)
+    return int(steps.sum())

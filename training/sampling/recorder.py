@@ -1,4 +1,4 @@
-"""Records sampled steps as episode chunks for RLlib's learners.
+"""Records sampled steps as episode chunks for learners.
 
 An agent's transition is open from its action until its own next row or its end; its reward is the sum of all rewards in
 between. Transitions that are open when a sample is cut are carried over to the next sample, whose chunk starts at the
@@ -12,30 +12,35 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from ray.rllib.core.columns import Columns
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
-from league.environments.stepping import Ending, Turn
+from league.environments.stepping import Indices, Turn
+from league.environments.vector.vector_env import AgentRows
 from league.interface import Interface
-from training.rllib_compat import ChunkColumn, EpisodeChunk
+from training.sampling.episode_chunks import EpisodeChunks
 from training.sampling.reset_seeds import ResetSeeds
 
 Rows = dict[str, NDArray]
 """Column → its rows, (k, …)."""
 
-NO_INFO: dict[str, object] = {}
-STATE_PREFIX = f"{Columns.STATE_IN}/"
+ACTIONS, LOG_P, DIST_INPUTS = "actions", "log_p", "dist_inputs"
+STATE_PREFIX = "state/"
 """Prefix of the columns of recurrent states."""
 NO_ROW = -1
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeEnd:
-    """Ends an agent's part of an episode after `after` rows. ending: None if the episode is lost."""
+class EpisodeEnds:
+    """Ends of k agents' parts of episodes, after `after` rows have been observed.
+
+    slots, rewards, terminated, truncated: (k,). observations: after the last action; None if the episodes are lost.
+    """
 
     after: int
-    slot: int
-    ending: Ending | None
+    slots: Indices
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    observations: Mapping[str, NDArray] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +48,21 @@ class ChunkLayout:
     """The rows and endings of a sample sorted by slot, and the boundaries of chunks.
 
     rows: indices of the observations. rewards: received with them. For each of c chunks: firsts and lasts, the
-    positions of its first and last row; slots; started, steps of its episode before the chunk; ends, what ended it, or
-    None.
+    positions of its first and last row; slots; started, steps of its episode before the chunk; ends, the index of what
+    ended it among all ends, -1 if it is open; is_lost, whether its episode is lost.
     """
 
-    rows: NDArray
-    rewards: NDArray
-    firsts: NDArray
-    lasts: NDArray
-    slots: NDArray
-    started: NDArray
-    ends: list[EpisodeEnd | None]
+    rows: Indices
+    rewards: NDArray[np.float64]
+    firsts: Indices
+    lasts: Indices
+    slots: Indices
+    started: Indices
+    ends: Indices
+    is_lost: NDArray[np.bool_]
 
     @property
-    def steps(self) -> NDArray:
+    def steps(self) -> Indices:
         """The number of steps of each chunk, (c,)."""
         return self.lasts - self.firsts
 
@@ -68,18 +74,17 @@ class ChunkBuilder:
     actions; `cut` anywhere between `observe` and `act`.
     """
 
-    def __init__(self, policy: str, agents: Sequence[str], num_envs: int) -> None:
-        self._policy = policy
-        self._agents = tuple(agents)
-        self._started = np.zeros(num_envs * len(agents), dtype=np.int64)
-        self._slots: list[NDArray] = []
+    def __init__(self, policy: str, agents: int, num_envs: int) -> None:
+        self._policy, self._agents = policy, agents
+        self._started = np.zeros(num_envs * agents, dtype=np.int64)
+        self._slots: list[Indices] = []
         self._rewards: list[NDArray] = []
-        self._observations: list[Rows] = []
+        self._observations: list[Mapping[str, NDArray]] = []
         self._plays: list[Rows] = []
-        self._ends: list[EpisodeEnd] = []
+        self._ends: list[EpisodeEnds] = []
         self._observed = 0
 
-    def observe(self, slots: NDArray, rewards: NDArray, observations: Rows) -> None:
+    def observe(self, slots: Indices, rewards: NDArray, observations: Mapping[str, NDArray]) -> None:
         """Add the next rows, (k,) each and ONNX input name → (k, …). They close their agents' open transitions."""
         self._slots.append(slots)
         self._rewards.append(rewards)
@@ -95,48 +100,57 @@ class ChunkBuilder:
             dist_inputs: (k, d).
             state: Recurrent states before the actions, key → (k, width).
         """
-        play = {Columns.ACTIONS: raw, Columns.ACTION_LOGP: log_p, Columns.ACTION_DIST_INPUTS: dist_inputs}
+        play = {ACTIONS: raw, LOG_P: log_p, DIST_INPUTS: dist_inputs}
         self._plays.append(play | {STATE_PREFIX + key: value for key, value in (state or {}).items()})
 
-    def end(self, slot: int, ending: Ending) -> None:
-        """Add that an agent has left its episode, whoever controlled it."""
-        self._ends.append(EpisodeEnd(self._observed, slot, ending))
+    def end(self, rows: AgentRows, own: NDArray) -> None:
+        """Add that agents have left their episodes, whoever controlled them. own: indices of some of the rows."""
+        slots = rows.envs[own] * self._agents + rows.agents[own]
+        terminated = rows.terminations[own]
+        observations = {name: array[own] for name, array in rows.observations.items()}
+        self._ends.append(
+            EpisodeEnds(
+                self._observed, slots, rows.rewards[own], terminated, rows.truncations[own] & ~terminated, observations
+            )
+        )
 
-    def discard(self, env: int) -> None:
-        """Drop what was observed of the current episode of `env` since the last cut: it has no end."""
-        first = env * len(self._agents)
-        self._ends += [EpisodeEnd(self._observed, slot, None) for slot in range(first, first + len(self._agents))]
+    def discard(self, envs: Indices) -> None:
+        """Drop what was observed of the current episodes of `envs` since the last cut: they have no end."""
+        slots = (envs[:, np.newaxis] * self._agents + np.arange(self._agents)).ravel()
+        nothing = np.zeros(len(slots), dtype=bool)
+        self._ends.append(EpisodeEnds(self._observed, slots, np.zeros(len(slots)), nothing, nothing, None))
 
-    def cut(self, ids: Iterator[str]) -> list[SingleAgentEpisode]:
-        """Return all transitions closed since the last cut as chunks. Each takes its id from `ids`."""
+    def cut(self, name: str) -> EpisodeChunks | None:
+        """Return all transitions closed since the last cut as chunks; None if there are none."""
+        ends, self._ends = self._ends, []
         if not self._observed:
-            self._ends = []
-            return []
-        layout = self._layout()
-        finals = [end.ending.observation for end in self._ends if end.ending]
-        observations, played = _stack(self._observations, finals), _stack(self._plays)
-        chunks = list(self._chunks(layout, observations, played, ids))
+            return None
+        layout = self._layout(ends)
+        finals = [end.observations for end in ends if end.observations is not None]
+        observations, played = _stack([*self._observations, *finals]), _stack(self._plays)
+        chunks = self._chunks(name, layout, ends, observations, played)
         self._carry_over(layout, observations, played)
         return chunks
 
-    def _layout(self) -> ChunkLayout:
-        ends, observed = self._ends, self._observed
-        after = [end.after for end in ends]
+    def _layout(self, ends: Sequence[EpisodeEnds]) -> ChunkLayout:
+        observed = self._observed
+        after = np.repeat([end.after for end in ends], [len(end.slots) for end in ends]).astype(np.int64)
+        is_lost = np.repeat([end.observations is None for end in ends], [len(end.slots) for end in ends]).astype(bool)
         # The observations of endings follow those of all rows.
-        are_lost = np.array([end.ending is None for end in ends], dtype=bool)
-        numbers = np.where(are_lost, NO_ROW, observed - 1 + np.cumsum(~are_lost))
+        numbers = np.where(is_lost, NO_ROW, observed - 1 + np.cumsum(~is_lost))
         rows = np.insert(np.arange(observed), after, numbers)
-        slots = np.insert(np.concatenate(self._slots), after, [end.slot for end in ends])
-        gained = [end.ending.reward if end.ending else 0.0 for end in ends]
+        slots = np.insert(np.concatenate(self._slots), after, _joined([end.slots for end in ends], np.int64))
+        gained = _joined([end.rewards for end in ends], np.float64)
         rewards = np.insert(np.concatenate(self._rewards), after, gained)
-        which = np.insert(np.full(observed, len(ends)), after, np.arange(len(ends)))
+        which = np.insert(np.full(observed, NO_ROW), after, np.arange(len(after)))
         order = np.argsort(slots, kind="stable")
         rows, slots, rewards, which = rows[order], slots[order], rewards[order], which[order]
         is_other_slot = np.diff(slots) != 0
-        lasts = np.flatnonzero(np.append((which[:-1] < len(ends)) | is_other_slot, True))
+        lasts = np.flatnonzero(np.append((which[:-1] != NO_ROW) | is_other_slot, True))
         firsts = np.append(0, lasts[:-1] + 1)
         # A chunk that was carried over is the first of its slot; later chunks of the slot are new episodes.
         is_first_of_slot = np.append(True, is_other_slot)[firsts]
+        ended = which[lasts]
         return ChunkLayout(
             rows,
             rewards,
@@ -144,72 +158,44 @@ class ChunkBuilder:
             lasts,
             slots[firsts],
             np.where(is_first_of_slot, self._started[slots[firsts]], 0),
-            [ends[i] if i < len(ends) else None for i in which[lasts].tolist()],
+            ended,
+            np.append(is_lost, False)[ended],
         )
 
     def _chunks(
-        self, layout: ChunkLayout, observations: Rows, played: Rows, ids: Iterator[str]
-    ) -> Iterator[EpisodeChunk]:
-        """Gather each column once, so that each chunk's rows are adjacent; chunks hold views of it."""
-        are_whole = np.array([end is None or end.ending is not None for end in layout.ends], dtype=bool)
+        self, name: str, layout: ChunkLayout, ends: Sequence[EpisodeEnds], observations: Rows, played: Rows
+    ) -> EpisodeChunks | None:
+        """Gather each column once, so that each chunk's rows are adjacent."""
         steps = layout.steps
         # An ending without steps is that of an agent which this policy did not control.
-        are_whole &= steps > 0
-        if not are_whole.any():
-            return
-        is_seen = np.repeat(are_whole, steps + 1)
+        is_whole = ~layout.is_lost & (steps > 0)
+        if not is_whole.any():
+            return None
+        is_seen = np.repeat(is_whole, steps + 1)
         is_acted, is_rewarded = is_seen.copy(), is_seen.copy()
         is_acted[layout.lasts] = is_rewarded[layout.firsts] = False
-        observations = {name: array[layout.rows[is_seen]] for name, array in observations.items()}
-        played = {name: column[layout.rows[is_acted]] for name, column in played.items()}
-        rewards = layout.rewards[is_rewarded].astype(np.float32)
-        start = 0
-        for number, place in enumerate(np.flatnonzero(are_whole).tolist()):
-            stop = start + int(steps[place])
-            # Each earlier chunk has one observation more than steps.
-            seen = slice(start + number, stop + number + 1)
-            end = layout.ends[place]
-            yield self._chunk(
-                next(ids),
-                self._agents[int(layout.slots[place]) % len(self._agents)],
-                int(layout.started[place]),
-                {name: array[seen] for name, array in observations.items()},
-                {name: column[start:stop] for name, column in played.items()},
-                rewards[start:stop],
-                end.ending if end else None,
-            )
-            start = stop
-
-    def _chunk(
-        self,
-        id_: str,
-        agent: str,
-        started: int,
-        observations: Rows,
-        played: Rows,
-        rewards: NDArray,
-        ending: Ending | None,
-    ) -> EpisodeChunk:
-        state = {
-            name.removeprefix(STATE_PREFIX): played.pop(name) for name in list(played) if name.startswith(STATE_PREFIX)
-        }
-        columns: dict[str, NDArray | Rows] = {**played, **({Columns.STATE_IN: state} if state else {})}
-        buffers = {name: ChunkColumn(column) for name, column in columns.items()}
-        return EpisodeChunk(
-            id_=id_,
-            agent_id=agent,
-            module_id=self._policy,
-            # RLlib distinguishes the chunks of a batch by this id only, and misaligns advantages if it repeats.
-            multi_agent_episode_id=id_,
-            t_started=started,
-            len_lookback_buffer=0,
-            observations=ChunkColumn(observations),
-            infos=ChunkColumn([NO_INFO] * (len(rewards) + 1)),
-            actions=buffers.pop(Columns.ACTIONS),
-            rewards=ChunkColumn(rewards),
-            extra_model_outputs=buffers,
-            terminated=ending is not None and ending.terminated,
-            truncated=ending is not None and ending.truncated and not ending.terminated,
+        seen, acted = layout.rows[is_seen], layout.rows[is_acted]
+        # The last element is for open chunks.
+        terminated = np.append(_joined([end.terminated for end in ends], np.bool_), False)
+        truncated = np.append(_joined([end.truncated for end in ends], np.bool_), False)
+        return EpisodeChunks(
+            name=name,
+            policy=self._policy,
+            agents=layout.slots[is_whole] % self._agents,
+            started=layout.started[is_whole],
+            lengths=steps[is_whole],
+            observations={name: array[seen] for name, array in observations.items()},
+            actions=played[ACTIONS][acted],
+            log_p=played[LOG_P][acted],
+            dist_inputs=played[DIST_INPUTS][acted],
+            state={
+                name.removeprefix(STATE_PREFIX): column[acted]
+                for name, column in played.items()
+                if name.startswith(STATE_PREFIX)
+            },
+            rewards=layout.rewards[is_rewarded].astype(np.float32),
+            terminated=terminated[layout.ends[is_whole]],
+            truncated=truncated[layout.ends[is_whole]],
         )
 
     def _carry_over(self, layout: ChunkLayout, observations: Rows, played: Rows) -> None:
@@ -217,33 +203,31 @@ class ChunkBuilder:
 
         Rows with actions come first, since the rows that must act next were observed last.
         """
-        are_open = np.array([end is None for end in layout.ends], dtype=bool)
+        is_open = layout.ends == NO_ROW
         self._started[:] = 0
-        self._started[layout.slots[are_open]] = (layout.started + layout.steps)[are_open]
-        kept = np.sort(layout.rows[layout.lasts[are_open]])
-        acted = kept[kept < (len(played[Columns.ACTIONS]) if played else 0)]
+        self._started[layout.slots[is_open]] = (layout.started + layout.steps)[is_open]
+        kept = np.sort(layout.rows[layout.lasts[is_open]])
+        acted = kept[kept < (len(played[ACTIONS]) if played else 0)]
         self._slots = [np.concatenate(self._slots)[kept]]
         self._rewards = [np.concatenate(self._rewards)[kept]]
         self._observations = [{name: array[kept] for name, array in observations.items()}]
         self._plays = [{name: column[acted] for name, column in played.items()}] if len(acted) else []
-        self._ends = []
         self._observed = len(kept)
 
 
-def _stack(blocks: Sequence[Rows], rows: Sequence[Rows] = ()) -> Rows:
-    """Concatenate blocks (k_i, …) and single rows (…); no columns without blocks."""
-    if not blocks:
-        return {}
-    return {
-        name: np.concatenate([block[name] for block in blocks] + [row[name][np.newaxis] for row in rows])
-        for name in blocks[0]
-    }
+def _stack(blocks: Sequence[Mapping[str, NDArray]]) -> Rows:
+    """Concatenate blocks (k_i, …); no columns without blocks."""
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]} if blocks else {}
+
+
+def _joined(columns: Sequence[NDArray], dtype: type) -> NDArray:
+    return np.concatenate(columns) if columns else np.zeros(0, dtype)
 
 
 class Recorder(Protocol):
     """Receives each turn, then the actions of the league's own policies in it.
 
-    Groups of a turn that are not policy ids are controlled by others, and are not recorded.
+    Group i of a turn is policy i of the interface. Further groups are controlled by others, and are not recorded.
     """
 
     def begin(self, seeds: ResetSeeds) -> None:
@@ -265,35 +249,36 @@ class EpisodeRecorder:
     """Records episode chunks, one agent's steps each."""
 
     def __init__(self, interface: Interface, agents: Sequence[str], num_envs: int) -> None:
-        self._agents, self._num_envs = tuple(agents), num_envs
-        self._policies = tuple(interface.policies[agent] for agent in agents)
+        self._agents, self._num_envs = len(agents), num_envs
         self._learning = interface.policy_ids
-        self._ids: Iterator[str] = iter(())
+        self._policy_of = np.array([self._learning.index(interface.policies[agent]) for agent in agents])
+        self._names: Iterator[str] = iter(())
 
     def begin(self, seeds: ResetSeeds) -> None:
-        self._ids = (f"{seeds.runner}-{seeds.steps}-{i}" for i in itertools.count())
+        self._names = (f"{seeds.runner}-{seeds.steps}-{i}" for i in itertools.count())
 
     def restart(self) -> None:
-        self._transitions = {policy: ChunkBuilder(policy, self._agents, self._num_envs) for policy in self._learning}
+        self._builders = [ChunkBuilder(policy, self._agents, self._num_envs) for policy in self._learning]
 
     def read(self, turn: Turn) -> None:
-        for env in turn.crashed:
-            for transitions in self._transitions.values():
-                transitions.discard(env)
-        for ending in turn.endings:
-            slot = ending.env * len(self._agents) + ending.agent
-            self._transitions[self._policies[ending.agent]].end(slot, ending)
+        if len(turn.crashed):
+            for builder in self._builders:
+                builder.discard(turn.crashed)
+        for rows in turn.endings:
+            policies = self._policy_of[rows.agents]
+            for policy in np.flatnonzero(np.bincount(policies)).tolist():
+                self._builders[policy].end(rows, np.flatnonzero(policies == policy))
         for group, batch in turn.batches.items():
-            if isinstance(group, str):
-                slots = np.array(batch.envs) * len(self._agents) + np.array(batch.agents)
-                rewards = np.array(batch.rewards, dtype=np.float64)
-                self._transitions[group].observe(slots, rewards, batch.observations)
+            if group < len(self._builders):
+                slots = batch.envs * self._agents + batch.agents
+                self._builders[group].observe(slots, batch.rewards, batch.observations)
 
     def act(
         self, policy: str, raw: NDArray, log_p: NDArray, dist_inputs: NDArray, state: Mapping[str, NDArray] | None
     ) -> None:
-        self._transitions[policy].act(raw, log_p, dist_inputs, state)
+        self._builders[self._learning.index(policy)].act(raw, log_p, dist_inputs, state)
 
-    def cut(self) -> list[SingleAgentEpisode]:
-        """Return the transitions closed since the last cut."""
-        return [chunk for transitions in self._transitions.values() for chunk in transitions.cut(self._ids)]
+    def cut(self) -> list[EpisodeChunks]:
+        """Return the transitions closed since the last cut, for each policy that has any."""
+        cut = [builder.cut(next(self._names)) for builder in self._builders]
+        return [chunks for chunks in cut if chunks is not None]

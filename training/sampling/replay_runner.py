@@ -3,7 +3,6 @@
 from typing import Any
 
 import torch
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from league.seeds import derive
 from league.training_config import MADDPGConfig
@@ -12,6 +11,7 @@ from training.replay_buffer import TransitionBlock
 from training.sampling.closed_transitions import JointTransitions, JointTransitionsWithoutState, PolicyTransitions
 from training.sampling.distributions import OrnsteinUhlenbeck
 from training.sampling.env_runner import LockstepEnvRunner, initial_states, one_thread
+from training.sampling.episode_chunks import EpisodeChunks
 
 
 class ReplayRunner(LockstepEnvRunner):
@@ -44,14 +44,14 @@ class ReplayRunner(LockstepEnvRunner):
                 play.step(self._forward_exploration, explore=True)
         return play.metrics.steps - before, self._closed.cut()
 
-    def sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
+    def sample_chunks(self, **kwargs: Any) -> list[EpisodeChunks]:
         """Return episode chunks as the base class does, to inspect the policies. Drops the open episodes."""
         assert self._play is not None, "a runner that only holds weights cannot sample"
         if not self._has_begun:
             self.reset_episodes(self.num_env_steps_sampled_lifetime)
         self._play.record_by(self._chunks)
         try:
-            return super().sample(**kwargs)
+            return super().sample_chunks(**kwargs)
         finally:
             self._play.record_by(self._closed)
 

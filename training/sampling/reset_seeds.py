@@ -1,6 +1,10 @@
 """Derives a unique seed for every environment reset of a run from a counter."""
 
 from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from league.seeds import derive
 
@@ -8,6 +12,8 @@ SEEDS = 2**31
 """Environments accept seeds of 31 bits."""
 SPACING = 4
 """Numbers reserved for each step of a run. See ResetSeeds."""
+
+Numbers = TypeVar("Numbers", int, NDArray[np.int64])
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +42,8 @@ class ResetSeeds:
         """Return the seeds after a reset. seed: of the run. steps: actions of the whole run before it."""
         return cls(derive(seed, "reset") % SEEDS, runner, runners, num_envs, steps)
 
-    def __call__(self, env: int, episode: int) -> int:
+    def __call__(self, env: Numbers, episode: Numbers) -> Numbers:
+        """Return the seeds of episodes, of one or of many."""
         stride = self.runners * self.num_envs
         first = -(-SPACING * self.steps // stride) * stride
         number = first + (episode * self.runners + self.runner) * self.num_envs + env

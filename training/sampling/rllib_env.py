@@ -17,7 +17,7 @@ from ray.tune.registry import register_env
 from league.config import LeagueConfig
 from league.environments.building import build, interface
 from league.environments.lockstep import Lockstep
-from league.environments.stepping import EpisodeStart, Turn
+from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch
 from league.spaces import Space, paths
 from league.spaces.conversion import to_gymnasium
@@ -60,7 +60,6 @@ class LeagueEnv(MultiAgentEnv):
         self.action_space = gymnasium.spaces.Dict(self.action_spaces)
         self._infos = InfoRecorder(build(league.environment, render_mode))
         self._stepping = Lockstep(lambda: self._infos.env, 1)
-        self._coming: list[EpisodeStart] = []
         self._seeds: ResetSeeds | None = None
         self._episodes = 0
 
@@ -72,8 +71,7 @@ class LeagueEnv(MultiAgentEnv):
             self._episodes = 0
         number = self._seeds(0, self._episodes) if seed is None else seed
         self._episodes += 1
-        self._coming = [EpisodeStart(number, self.possible_agents)]
-        turn = self._stepping.start(lambda _: self._coming.pop() if self._coming else None)
+        turn = self._stepping.start(each_agent_alone([number], len(self.possible_agents)))
         if not turn.batches:
             raise EnvironmentMismatch("after reset, no agent of the environment has to act")
         observations, _, infos = self._rows(turn)
@@ -81,18 +79,20 @@ class LeagueEnv(MultiAgentEnv):
 
     def step(self, action_dict: Mapping[str, Any]) -> tuple[Agents, Agents, Agents, Agents, Agents]:
         """Act for each agent that had an observation. Raises IllegalAction."""
-        turn = self._stepping.step({agent: np.asarray(action_dict[agent])[np.newaxis] for agent in self.agents})
+        index = self.possible_agents.index
+        turn = self._stepping.step({index(agent): np.asarray(action_dict[agent])[np.newaxis] for agent in self.agents})
         observations, rewards, infos = self._rows(turn)
         terminated, truncated = dict.fromkeys(observations, False), dict.fromkeys(observations, False)
         is_over = not turn.batches
-        for ending in turn.endings:
+        endings = list(turn.each_ending())
+        for ending in endings:
             agent = self.possible_agents[ending.agent]
             observations[agent] = _nested_value(self._observed[agent], ending.observation)
             rewards[agent] = ending.reward
             infos[agent] = self._infos.of(agent)
             terminated[agent] = ending.terminated
             truncated[agent] = ending.truncated and not is_over
-        is_cut = is_over and any(not ending.terminated for ending in turn.endings)
+        is_cut = is_over and any(not ending.terminated for ending in endings)
         terminated["__all__"], truncated["__all__"] = is_over and not is_cut, is_cut
         return observations, rewards, terminated, truncated, infos
 
@@ -106,8 +106,8 @@ class LeagueEnv(MultiAgentEnv):
 
     def _rows(self, turn: Turn) -> tuple[Agents, Agents, Agents]:
         """Return observations, rewards and infos of the agents that must act, in the order of `possible_agents`."""
-        self.agents = [agent for agent in self.possible_agents if agent in turn.batches]
-        rows = {agent: turn.batches[agent] for agent in self.agents}
+        rows = {self.possible_agents[group]: batch for group, batch in turn.batches.items()}
+        self.agents = list(rows)
         return (
             {
                 agent: _nested_value(
@@ -115,7 +115,7 @@ class LeagueEnv(MultiAgentEnv):
                 )
                 for agent, batch in rows.items()
             },
-            {agent: batch.rewards[0] for agent, batch in rows.items()},
+            {agent: float(batch.rewards[0]) for agent, batch in rows.items()},
             {agent: self._infos.of(agent) for agent in rows},
         )
 

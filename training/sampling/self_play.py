@@ -1,13 +1,12 @@
 """Plays the league's policies against each other and opponents, step by step, and records transitions."""
 
-import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.stepping import Batch, BatchedEnvironment, EpisodeStart, Group, Turn
+from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts, Turn
 from league.interface import Interface
 from league.policies.actions import to_environment
 from league.settings import Storage
@@ -15,7 +14,7 @@ from league.spaces import ACTION_MASK
 from league.training_config import TrainingSettings
 from training.modules.policy_module import PREVIOUS_ACTION
 from training.sampling.distributions import OrnsteinUhlenbeck, distribution
-from training.sampling.opponents import Matchups, Openings, OpponentPolicy, Opponents, RandomMoves
+from training.sampling.opponents import Controllers, Matchups, Openings, OpponentPolicy, Opponents, RandomMoves
 from training.sampling.play_metrics import PlayMetrics
 from training.sampling.recorder import Recorder
 from training.sampling.recurrent_state import RecurrentStates, State
@@ -64,29 +63,34 @@ class SelfPlay:
         self._actions = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
         self._distributions = {policy: distribution(space) for policy, space in self._actions.items()}
         self._initial_states = {policy: state for policy, state in initial_states.items() if state}
-        self._matchups = Matchups(interface, settings.opponents, stepping.agents)
-        self._opponents = Opponents(settings.opponents, interface, storage)
+        self._controllers = Controllers(interface, settings.opponents)
+        self._matchups = Matchups(interface, settings.opponents, stepping.agents, self._controllers)
+        self._opponents = Opponents(settings.opponents, interface, storage, stepping.num_envs)
         self.noises: dict[str, OrnsteinUhlenbeck] = {}
         """policy id → temporally correlated exploration noise, instead of independent draws."""
-        self._openings = Openings(settings.opening_plies, self._policies, stepping.num_envs)
+        movers = self._controllers.groups([RandomMoves(policy) for policy in self._policies])
+        self._openings = Openings(settings.opening_plies, movers, stepping.num_envs)
         self.metrics = PlayMetrics(stepping.agents, self._policies, self._distributions, stepping.num_envs)
 
     def begin(self, seeds: ResetSeeds, rng: np.random.Generator) -> None:
         """Restart; all further play is determined by `seeds` and `rng`."""
         self._seeds, self._rng = seeds, rng
-        self._begun = [itertools.count() for _ in range(self._stepping.num_envs)]
+        self._begun = np.zeros(self._stepping.num_envs, np.int64)
         self.recorder.begin(seeds)
         self.restart()
 
     def restart(self) -> None:
         """Drop all open episodes, and start new ones in all environments."""
         self.recorder.restart()
-        self._recurrent_states = {policy: RecurrentStates(initial) for policy, initial in self._initial_states.items()}
-        for env in range(self._stepping.num_envs):
-            self.metrics.forget(env)
-            self._opponents.forget(env)
-            self._reset_noise(env)
-        self._read(self._stepping.start(self._next_episode))
+        num_envs = self._stepping.num_envs
+        self._recurrent_states = {
+            policy: RecurrentStates(initial, num_envs, len(self._policies))
+            for policy, initial in self._initial_states.items()
+        }
+        everywhere = np.arange(num_envs)
+        self.metrics.forget(everywhere)
+        self._forget(everywhere)
+        self._read(self._stepping.start(self._next_episodes))
 
     def record_by(self, recorder: Recorder) -> None:
         """Drop all open episodes, and let another recorder record the following ones."""
@@ -97,60 +101,52 @@ class SelfPlay:
     def step(self, forward: Forward | None, explore: bool) -> None:
         """Take a step in each environment. forward: None for random actions. explore: sample instead of taking the
         mode."""
-        batches = self._turn.batches
+        rows = {self._controllers[group]: batch for group, batch in self._turn.batches.items()}
         forward_inputs = {
-            group: ForwardInput(
+            policy: ForwardInput(
                 batch.observations,
-                self._recurrent_states[group].get(batch) if group in self._recurrent_states else None,
+                self._recurrent_states[policy].get(batch) if policy in self._recurrent_states else None,
             )
-            for group, batch in batches.items()
-            if isinstance(group, str)
+            for policy, batch in rows.items()
+            if isinstance(policy, str)
         }
         outputs = forward(forward_inputs) if forward and forward_inputs else {}
-        actions: dict[Group, NDArray] = {}
-        for group, batch in batches.items():
-            if isinstance(group, RandomMoves):
-                actions[group] = to_environment(self._random(group.policy, batch)[0], self._actions[group.policy])
-            elif isinstance(group, OpponentPolicy):
-                actions[group] = self._opponents.act(group, batch, self._rng)
+        actions: dict[int, NDArray] = {}
+        for (controller, batch), group in zip(rows.items(), self._turn.batches, strict=True):
+            if isinstance(controller, RandomMoves):
+                drawn, _ = self._random(controller.policy, batch)
+                actions[group] = to_environment(drawn, self._actions[controller.policy])
+            elif isinstance(controller, OpponentPolicy):
+                actions[group] = self._opponents.act(controller, batch, self._rng)
             else:
-                actions[group] = self._act(group, batch, forward_inputs[group], outputs.get(group), explore)
-            self.metrics.add_moves(len(batch.envs))
-        for env, controllers in self._openings.step():
-            self._stepping.assign(env, controllers)
+                forward_input = forward_inputs[controller]
+                actions[group] = self._act(controller, batch, forward_input, outputs.get(controller), explore)
+            self.metrics.add_moves(len(batch))
+        self._stepping.assign(*self._openings.step())
         self.metrics.add_step()
         self._read(self._stepping.step(actions))
 
-    def _next_episode(self, env: int) -> EpisodeStart:
-        controllers = self._matchups.draw(self._rng)
-        return EpisodeStart(self._seeds(env, next(self._begun[env])), self._openings.begin(env, controllers, self._rng))
+    def _next_episodes(self, envs: Indices) -> Starts:
+        groups = self._matchups.draw(len(envs), self._rng)
+        seeds = self._seeds(envs, self._begun[envs])
+        self._begun[envs] += 1
+        return Starts(envs, seeds, self._openings.begin(envs, groups, self._rng))
 
     def _read(self, turn: Turn) -> None:
         """Process what has ended, then what continues or starts."""
         self._turn = turn
         self.recorder.read(turn)
-        for env in turn.crashed:
-            self.metrics.add_crash(env)
-            self._forget(env)
-        for ending in turn.endings:
-            self.metrics.add_agent(ending)
-        for env in turn.finished:
-            self.metrics.add_episode(env)
-            self._forget(env)
-        for group, batch in turn.batches.items():
-            slots = np.array(batch.envs) * len(self._policies) + np.array(batch.agents)
-            rewards = np.array(batch.rewards, dtype=np.float64)
-            self.metrics.add_rows(slots, rewards, are_own=isinstance(group, str))
+        self.metrics.add_turn(turn, own_policies=len(self._distributions))
+        over = np.concatenate([turn.crashed, turn.finished])
+        if len(over):
+            self._forget(over)
 
-    def _forget(self, env: int) -> None:
+    def _forget(self, envs: Indices) -> None:
         for states in self._recurrent_states.values():
-            states.forget(env)
-        self._opponents.forget(env)
-        self._reset_noise(env)
-
-    def _reset_noise(self, env: int) -> None:
+            states.forget(envs)
+        self._opponents.forget(envs)
         for noise in self.noises.values():
-            noise.forget(env)
+            noise.forget(envs)
 
     def _act(
         self, policy: str, batch: Batch, forward_input: ForwardInput, output: ForwardOutput | None, explore: bool
@@ -179,7 +175,7 @@ class SelfPlay:
     def _random(self, policy: str, batch: Batch) -> tuple[NDArray, NDArray]:
         """Return random legal raw actions, and distribution inputs that represent them."""
         mask = batch.observations.get(ACTION_MASK)
-        return self._distributions[policy].uniform(mask, len(batch.envs), self._rng)
+        return self._distributions[policy].uniform(mask, len(batch), self._rng)
 
 
 def _with_previous_action(state: State, raw: NDArray) -> State:

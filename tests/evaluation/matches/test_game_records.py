@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evaluation.matches.game_loop import Roster, play_matches
 from evaluation.matches.game_records import forfeit_difference, forfeits
 from evaluation.matches.leaderboard import compute_leaderboard, rank_contestants
-from evaluation.matches.lockstep_runner import Roster, play_matches
 from evaluation.matches.tournament import evaluate
 from evaluation.playback.replay import recorded_game, replay
 from evaluation.schedules.builders import round_robin
 from evaluation.statistics.payoff import paired_difference
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, IllegalMask
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
@@ -103,7 +103,7 @@ def with_faulty(policy: Policy, ref: str = BAD) -> Roster:
 
 def play(schedule: Schedule, rosters: Roster, num_envs: int = 8, positions: Sequence[int] | None = None) -> Any:
     positions = range(schedule.length) if positions is None else positions
-    return play_matches(schedule, positions, stepping(CONFIG.environment, num_envs), INTERFACE, rosters)
+    return play_matches(schedule, positions, stock_stepping(CONFIG.environment, num_envs), INTERFACE, rosters)
 
 
 def schedule_of(*contestants: str, blocks: int = 4) -> Schedule:
@@ -196,7 +196,7 @@ def test_the_first_move_can_be_forfeited() -> None:
 
 def test_forfeits_are_stored_accepted_and_replayed() -> None:
     schedule = schedule_of("script:one_ply", BAD, blocks=10)
-    environment, forfeited = stepping(CONFIG.environment, 1), 0
+    environment, forfeited = stock_stepping(CONFIG.environment, 1), 0
     for match in play(schedule, with_faulty(faulty(illegal))):
         admit(match, schedule)
         stored = replace(match, games=load_games(dump_games(match.games)))
@@ -233,11 +233,13 @@ def test_a_forged_forfeit_is_detected_by_replay(change: str) -> None:
     games = list(match.games)
     games[index] = FORGED[change](games[index], games[index].forfeits[0])
     with pytest.raises(EnvironmentMismatch, match="cannot be replayed"):
-        list(replay(stepping(CONFIG.environment, 1), CONFIG, INTERFACE, replace(match, games=tuple(games)), index))
+        list(
+            replay(stock_stepping(CONFIG.environment, 1), CONFIG, INTERFACE, replace(match, games=tuple(games)), index)
+        )
 
 
 def test_a_mask_without_legal_actions_is_not_a_forfeit() -> None:
-    environment = stepping(CONFIG.environment, 2)
+    environment = stock_stepping(CONFIG.environment, 2)
     start = environment.start
 
     def start_without_legal_actions(next_episode: Any) -> Any:
@@ -282,7 +284,7 @@ NEVER = 99
 
 def play_pair(kind: Kind, first: int, second: int, num_envs: int = 4) -> tuple[Schedule, list[Match]]:
     schedule = kind.schedule(["kind@a", "kind@b"], plies=1)
-    environment = stepping(kind.config.environment, num_envs)
+    environment = stock_stepping(kind.config.environment, num_envs)
     rosters = failing_roster(kind, a=first, b=second)
     return schedule, play_matches(schedule, range(schedule.length), environment, kind.interface, rosters)
 
@@ -327,7 +329,7 @@ def test_actions_are_recorded_in_the_dtype_of_the_policy() -> None:
     rosters = {ref: dict.fromkeys(FREE.interface.agents, ("shared", policy)) for ref, policy in policies.items()}
 
     def play(num_envs: int) -> list[Match]:
-        environment = stepping(FREE.config.environment, num_envs)
+        environment = stock_stepping(FREE.config.environment, num_envs)
         return play_matches(schedule, range(schedule.length), environment, FREE.interface, rosters)
 
     alone = play(1)
@@ -352,7 +354,7 @@ ROLES = Kind(
 def test_compared_by_side_a_forfeit_loses_the_block(kind: Kind, first: int, second: int, expected: float) -> None:
     schedule, matches = play_pair(kind, first, second)
     assert schedule.scoring == "side"
-    environment = stepping(kind.config.environment, 1)
+    environment = stock_stepping(kind.config.environment, 1)
     for match in matches:
         admit(match, schedule)
         assert (match.score(0), match.score(1)) == (expected, 1 - expected)

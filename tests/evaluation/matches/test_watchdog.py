@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from evaluation.gating.nightly import nightly
-from evaluation.matches.lockstep_runner import play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.matches.tournament import play_schedule
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import ANCHOR, round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import GameCrashed, GameHung, LeagueError
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -33,13 +33,14 @@ SOON = 1.0
 """In seconds: 1,000 times the duration of a game that does not hang."""
 
 
-def config(ends: str, where: str = "step", seconds: float = SOON) -> LeagueConfig:
+def config(ends: str, where: str = "step", seconds: float = SOON, vector: str | None = None) -> LeagueConfig:
     return LeagueConfig.from_mapping(
         {
             "league": "fuse",
             "environment": {
                 "entry_point": "tests.support.environments.fuses:fuse",
                 "kwargs": {"ends": ends, "where": where},
+                "vector": vector,
             },
             "play": {"num_envs": 3, "game_seconds": seconds},
             "gate": {"elo1": 100, "max_blocks": 4},
@@ -98,12 +99,36 @@ def test_a_crash_of_the_environment_names_the_game(tmp_path: Path) -> None:
     assert len(worker.play(schedule_of(registry, "fuse@1", "fuse@3"), range(4))) == 4
 
 
+VECTOR = "tests.support.environments.vector_copies:VectorFuse"
+
+
+def test_a_crash_in_a_vectorised_environment_names_the_game(tmp_path: Path) -> None:
+    settings = config("breaks", vector=VECTOR)
+    registry = league(tmp_path, settings, 1, 2, LIGHT)
+    worker = MatchWorker(settings, registry)
+    schedule = schedule_of(registry, "fuse@1", "fuse@2", "fuse@3")
+    message = (
+        r"of fuse@. and fuse@3 \(game 0 of match .*\) cannot continue: .* raised ValueError: the fuse has burnt down"
+    )
+    with pytest.raises(GameCrashed, match=message):
+        worker.play(schedule, range(schedule.length))
+    assert len(worker.play(schedule_of(registry, "fuse@1", "fuse@2"), range(4))) == 4
+
+
+def test_a_hanging_vectorised_environment_is_interrupted(tmp_path: Path) -> None:
+    settings = config("waits", vector=VECTOR)
+    registry = league(tmp_path, settings, 1, LIGHT)
+    schedule = schedule_of(registry, "fuse@1", "fuse@2")
+    with pytest.raises(GameHung, match="or one of 2 others that are stepped with it, has not ended after 1 s"):
+        MatchWorker(settings, registry).play(schedule, range(4))
+
+
 def test_slow_steps_add_up_in_any_thread(tmp_path: Path) -> None:
     """No single step is too long; in threads without signals, the deadline is checked after each step."""
     settings = config("breaks")
     registry = league(tmp_path, settings, 1, 2)
     schedule, raised = schedule_of(registry, "fuse@1", "fuse@2"), []
-    environment = stepping(settings.environment, 2)
+    environment = stock_stepping(settings.environment, 2)
     player = MatchWorker(settings, registry)
     roster = {ref: player.contestant(ref) for ref in schedule.contestants}
 

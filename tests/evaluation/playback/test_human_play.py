@@ -16,7 +16,7 @@ from evaluation.playback.human_play import PERSON, GameState, human_play
 from evaluation.playback.single_game import GameStep, play_game
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput
 from league.interface import Interface
@@ -39,7 +39,7 @@ def league_and_environment(entry_point: str, **kwargs: Any) -> tuple[LeagueConfi
     config = LeagueConfig.from_mapping(
         {"league": "home", "environment": {"entry_point": entry_point, "kwargs": dict(kwargs)}}
     )
-    return config, interface(config), stepping(config.environment, 1)
+    return config, interface(config), stock_stepping(config.environment, 1)
 
 
 def all_agents(described: Interface, policy: Policy) -> dict[str, Policy]:

@@ -17,7 +17,7 @@ from evaluation.playback.recorded_steps import RecordedGame, recorded_steps
 from evaluation.playback.replay import recorded_game
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -42,7 +42,7 @@ def play_match(registry: Registry, league: str = LEAGUE, *refs: str) -> Match:
 
 def record_steps(registry: Registry, match: Match, game: int = 0, draws: bool = False, **options: int) -> RecordedGame:
     source = recorded_game(match.id, game, registry, chances=True)
-    environment = stepping(source.config.environment, 1, render_mode="rgb_array" if draws else None)
+    environment = stock_stepping(source.config.environment, 1, render_mode="rgb_array" if draws else None)
     return recorded_steps(source, match, RecordingRequest(match=match.id, game=game, **options), environment, draws)
 
 
@@ -158,7 +158,7 @@ def test_the_inputs_of_the_replay_are_those_of_the_policy(registry: Registry) ->
     match = play_match(registry, LEAGUE, "tictactoe@1", "script:random")
     source = recorded_game(match.id, 0, registry, chances=True)
     policy = OnnxPolicy(tictactoe.graph(wins=True))
-    for step in source.play(stepping(source.config.environment, 1)):
+    for step in source.play(stock_stepping(source.config.environment, 1)):
         for move in step.moves:
             if move.dist_inputs is not None:
                 batch = {name: array[np.newaxis] for name, array in move.observation.items()}

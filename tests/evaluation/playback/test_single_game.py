@@ -6,7 +6,7 @@ import pytest
 from evaluation.playback.single_game import first_observation, play_game
 from league.config import LeagueConfig
 from league.environments.building import build, interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import UnknownPolicy
 from league.policies.loading import contestant
 
@@ -24,14 +24,14 @@ def test_a_game_is_played_step_by_step(entry_point: str, simultaneous: bool) -> 
     config = league(entry_point)
     league_interface = interface(config)
     players = {agent: policy for agent, (_, policy) in contestant("script:random", None, league_interface).items()}
-    steps = list(play_game(stepping(config.environment, 1), players, seed=3))
+    steps = list(play_game(stock_stepping(config.environment, 1), players, seed=3))
     assert [step.step for step in steps] == list(range(len(steps)))
     assert [step.is_over for step in steps] == [False] * (len(steps) - 1) + [True]
     assert steps[0].moves == ()
     assert {len(step.moves) for step in steps[1:]} == {len(league_interface.agents) if simultaneous else 1}
     assert sorted(ending.agent for ending in steps[-1].endings) == list(range(len(league_interface.agents)))
-    again = list(play_game(stepping(config.environment, 1), players, seed=3))
-    other = list(play_game(stepping(config.environment, 1), players, seed=4))
+    again = list(play_game(stock_stepping(config.environment, 1), players, seed=3))
+    other = list(play_game(stock_stepping(config.environment, 1), players, seed=4))
     taken = [[[move.action for move in step.moves] for step in each] for each in (steps, again, other)]
     assert taken[0] == taken[1] != taken[2]
     assert steps[-1].returns == again[-1].returns

@@ -8,7 +8,7 @@ import pytest
 
 from league.environment_config import EnvironmentConfig
 from league.environments.building import action_space, build
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from tests.conformance.stepping import Reports, assert_same_episode, lockstep
 
 STEPS = 13
@@ -44,12 +44,12 @@ def test_an_episode_depends_on_its_seed_only(entry_point: str) -> None:
     config = EnvironmentConfig(entry_point=entry_point, kwargs=ENVIRONMENTS[entry_point])
     env = build(config)
     spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    envs = stepping(config, 2)
+    envs = stock_stepping(config, 2)
     first = lockstep(envs, spaces, [3, 4], STEPS)
     assert sum(len(reports) for reports in first[3].values()) > 2
 
     again = lockstep(envs, spaces, [4, 3], STEPS)
-    elsewhere = lockstep(stepping(config, 1), spaces, [3], STEPS)
+    elsewhere = lockstep(stock_stepping(config, 1), spaces, [3], STEPS)
     for seed, episode in again.items():
         assert_same_episode(episode, first[seed])
     assert_same_episode(elsewhere[3], first[3])

@@ -9,8 +9,8 @@ import pytest
 from examples import two_step
 from examples.traffic import crossing
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
-from league.environments.stepping import EpisodeStart
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import each_agent_alone
 from tests.conformance.stepping import assert_abandoning_conforms, assert_states_conform, assert_stepping_conforms
 from tests.support.environments.simultaneous import meeting, rllib_meeting
 
@@ -57,12 +57,12 @@ def case(request: pytest.FixtureRequest) -> Case:
 @pytest.mark.parametrize("num_envs", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_lockstep_equals_the_plain_loop(case: Case, num_envs: int) -> None:
     config, stock = case
-    assert_stepping_conforms(lambda n: stepping(config, n), stock, seeds=[11, 12, 13, 14], num_envs=num_envs)
+    assert_stepping_conforms(lambda n: stock_stepping(config, n), stock, seeds=[11, 12, 13, 14], num_envs=num_envs)
 
 
 def test_an_abandoned_episode_has_no_effect_on_the_next(case: Case) -> None:
     config, stock = case
-    assert_abandoning_conforms(lambda n: stepping(config, n), stock, seeds=[11, 12, 13, 14], num_envs=2)
+    assert_abandoning_conforms(lambda n: stock_stepping(config, n), stock, seeds=[11, 12, 13, 14], num_envs=2)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -73,11 +73,13 @@ def test_states_equal_those_of_the_plain_loop(entry_point: str, num_envs: int) -
     module, _, name = entry_point.partition(":")
     stock = getattr(importlib.import_module(module), name or "parallel_env")
     config = EnvironmentConfig(entry_point=entry_point)
-    assert_states_conform(lambda n: stepping(config, n, states=True), stock, seeds=[11, 12, 13, 14], num_envs=num_envs)
+    assert_states_conform(
+        lambda n: stock_stepping(config, n, states=True), stock, seeds=[11, 12, 13, 14], num_envs=num_envs
+    )
 
 
 def test_environments_without_state_return_none() -> None:
-    env = stepping(EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2"), 2, states=True)
-    turn = env.start(lambda env_index: EpisodeStart(env_index, env.agents))
-    assert (turn.states, turn.last_states) == ({}, {})
+    env = stock_stepping(EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2"), 2, states=True)
+    turn = env.start(each_agent_alone(range(2), 2))
+    assert (turn.states, turn.last_states) == (None, None)
     env.close()

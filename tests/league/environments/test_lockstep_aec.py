@@ -6,10 +6,11 @@ from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
 from league.environment_config import EnvironmentConfig
 from league.environments.building import build
-from league.environments.lockstep import stepping
-from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import BatchedEnvironment, Starts, Turn, each_agent_alone
 from league.errors import IllegalAction
 from tests.conformance.stepping import assert_abandoning_conforms, assert_stepping_conforms
+from tests.support.environments.episodes import episodes
 
 COUNTING = "tests.support.environments.counting:counting"
 
@@ -32,7 +33,7 @@ ENVIRONMENTS = {
 def test_lockstep_equals_the_plain_loop(name: str, num_envs: int) -> None:
     config = ENVIRONMENTS[name]
     assert_stepping_conforms(
-        lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
+        lambda n: stock_stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
     )
 
 
@@ -41,22 +42,22 @@ def test_lockstep_equals_the_plain_loop(name: str, num_envs: int) -> None:
 def test_an_abandoned_episode_has_no_effect_on_the_next(name: str, num_envs: int) -> None:
     config = ENVIRONMENTS[name]
     assert_abandoning_conforms(
-        lambda n: stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
+        lambda n: stock_stepping(config, n), lambda: build(config), seeds=list(range(100, 112)), num_envs=num_envs
     )
 
 
 def play_out(env: BatchedEnvironment, turn: Turn) -> list[Turn]:
     turns = [turn]
     while turn.batches:
-        turn = env.step({group: np.zeros(len(batch.envs), int) for group, batch in turn.batches.items()})
+        turn = env.step({group: np.zeros(len(batch), int) for group, batch in turn.batches.items()})
         turns.append(turn)
     return turns
 
 
 def test_truncated_agents_are_not_terminated_and_keep_their_last_observation() -> None:
-    env = stepping(counting(lives=[2, 3], truncated=[1]), num_envs=1)
-    episodes = iter([EpisodeStart(5, "ab")])
-    endings = [ending for turn in play_out(env, env.start(lambda _: next(episodes, None))) for ending in turn.endings]
+    env = stock_stepping(counting(lives=[2, 3], truncated=[1]), num_envs=1)
+    turns = play_out(env, env.start(each_agent_alone([5], 2)))
+    endings = [ending for turn in turns for ending in turn.each_ending()]
     flags = {ending.agent: (ending.terminated, ending.truncated) for ending in endings}
     assert flags == {0: (True, False), 1: (False, True)}
     last = {ending.agent: ending.observation["observation"].tolist() for ending in endings}
@@ -64,66 +65,63 @@ def test_truncated_agents_are_not_terminated_and_keep_their_last_observation() -
 
 
 def test_rewards_between_turns_are_summed() -> None:
-    env = stepping(counting(lives=[3, 3]), num_envs=1)
-    episodes = iter([EpisodeStart(0, "ab")])
-    turns = play_out(env, env.start(lambda _: next(episodes, None)))
+    env = stock_stepping(counting(lives=[3, 3]), num_envs=1)
+    turns = play_out(env, env.start(each_agent_alone([0], 2)))
     rewards = [(group, batch.rewards[0]) for turn in turns for group, batch in turn.batches.items()]
-    assert rewards == [("a", 0.0), ("b", 10.0), ("a", 2.0), ("b", 20.0), ("a", 2.0), ("b", 20.0)]
-    assert [(ending.agent, ending.reward) for turn in turns for ending in turn.endings] == [(0, 1.0), (1, 10.0)]
+    assert rewards == [(0, 0.0), (1, 10.0), (0, 2.0), (1, 20.0), (0, 2.0), (1, 20.0)]
+    assert [(ending.agent, ending.reward) for turn in turns for ending in turn.each_ending()] == [(0, 1.0), (1, 10.0)]
 
 
 def test_each_episode_is_reset_with_its_seed() -> None:
-    env = stepping(counting(lives=[1, 1]), num_envs=2)
+    env = stock_stepping(counting(lives=[1, 1]), num_envs=2)
     seeds = iter(range(10, 16))
     seeds_by_env: dict[int, list[int]] = {0: [], 1: []}
 
-    def next_episode(env_index: int) -> EpisodeStart | None:
-        seed = next(seeds, None)
-        if seed is None:
-            return None
-        seeds_by_env[env_index].append(seed)
-        return EpisodeStart(seed, "ab")
+    def next_episodes(envs: np.ndarray) -> Starts:
+        taken = list(zip(envs.tolist(), seeds, strict=False))
+        for env_index, seed in taken:
+            seeds_by_env[env_index].append(seed)
+        return Starts(envs[: len(taken)], np.array([seed for _, seed in taken]), np.tile([0, 1], (len(taken), 1)))
 
-    turns = play_out(env, env.start(next_episode))
+    turns = play_out(env, env.start(next_episodes))
     for env_index in (0, 1):
         reset_seeds = [
             int(ending.observation["observation"][2])
             for turn in turns
-            for ending in turn.endings
+            for ending in turn.each_ending()
             if ending.env == env_index and ending.agent == 0
         ]
         assert reset_seeds == seeds_by_env[env_index]
 
 
 def test_groups_can_change_within_an_episode() -> None:
-    env = stepping(counting(lives=[2, 2]), num_envs=1)
-    episodes = iter([EpisodeStart(0, ("opening", "opening"))])
-    turn = env.start(lambda _: next(episodes, None))
-    assert list(turn.batches) == ["opening"]
-    env.assign(0, ("first", "second"))
-    turn = env.step({"opening": np.array([0])})
-    assert list(turn.batches) == ["second"]
+    env = stock_stepping(counting(lives=[2, 2]), num_envs=1)
+    turn = env.start(episodes([0], [7, 7]))
+    assert list(turn.batches) == [7]
+    env.assign(np.array([0]), np.array([[1, 2]]))
+    turn = env.step({7: np.array([0])})
+    assert list(turn.batches) == [2]
 
 
 def test_agents_of_a_group_share_a_batch() -> None:
-    env = stepping(ENVIRONMENTS["connect_four"], num_envs=5)
-    turn = env.start(lambda env_index: EpisodeStart(env_index, ("shared", "shared")))
-    batch = turn.batches["shared"]
-    assert batch.envs == [0, 1, 2, 3, 4]
+    env = stock_stepping(ENVIRONMENTS["connect_four"], num_envs=5)
+    turn = env.start(episodes(range(5), [3, 3]))
+    batch = turn.batches[3]
+    assert batch.envs.tolist() == [0, 1, 2, 3, 4]
     assert batch.observations["observation"].shape == (5, 6, 7, 2)
     assert batch.observations["action_mask"].dtype == np.int8
 
 
 @pytest.mark.parametrize("action", [9, -1])
 def test_an_illegal_action_is_rejected_before_any_step(action: int) -> None:
-    env = stepping(ENVIRONMENTS["tictactoe"], num_envs=2)
-    turn = env.start(lambda _: EpisodeStart(0, ("x", "o")))
+    env = stock_stepping(ENVIRONMENTS["tictactoe"], num_envs=2)
+    turn = env.start(each_agent_alone([0, 0], 2))
     with pytest.raises(IllegalAction, match=rf"action {action} of player_1 is illegal"):
-        env.step({"x": np.array([0, action])})
-    turn = env.step({"x": np.array([4, 4])})
-    assert (turn.batches["o"].observations["observation"].sum(axis=(1, 2, 3)) == 1).all()
+        env.step({0: np.array([0, action])})
+    turn = env.step({0: np.array([4, 4])})
+    assert (turn.batches[1].observations["observation"].sum(axis=(1, 2, 3)) == 1).all()
     with pytest.raises(IllegalAction, match="action_mask is"):
-        env.step({"o": np.array([4, 0])})
+        env.step({1: np.array([4, 0])})
 
 
 def test_checking_wrappers_are_removed_and_others_kept() -> None:
@@ -131,5 +129,5 @@ def test_checking_wrappers_are_removed_and_others_kept() -> None:
     wrapped = EnvironmentConfig.model_validate(
         {"entry_point": COUNTING, "wrappers": [{"frame_stack_v1": {"stack_size": 2}}]}
     )
-    env = stepping(wrapped, num_envs=1)
-    assert env.start(lambda _: EpisodeStart(0, "ab")).batches["a"].observations["observation"].shape == (1, 6)
+    env = stock_stepping(wrapped, num_envs=1)
+    assert env.start(each_agent_alone([0], 2)).batches[0].observations["observation"].shape == (1, 6)

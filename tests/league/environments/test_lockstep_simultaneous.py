@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.environment_config import EnvironmentConfig
-from league.environments.lockstep import stepping
-from league.environments.stepping import BatchedEnvironment, EpisodeStart, Turn
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
+from tests.support.environments.episodes import episodes
 from tests.support.environments.simultaneous import RLlibSimultaneous, Simultaneous
 
 HERE = "tests.support.environments.simultaneous"
@@ -21,12 +22,11 @@ def config(function: str = "meeting", **kwargs: Any) -> EnvironmentConfig:
 
 
 def zeros(turn: Turn) -> dict[Any, np.ndarray]:
-    return {group: np.zeros(len(batch.envs), np.int64) for group, batch in turn.batches.items()}
+    return {group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}
 
 
 def begin(env: BatchedEnvironment, seeds: list[int]) -> Turn:
-    queue = iter(seeds)
-    return env.start(lambda _: None if (seed := next(queue, None)) is None else EpisodeStart(seed, env.agents))
+    return env.start(each_agent_alone(seeds, len(env.agents)))
 
 
 def reports(env: BatchedEnvironment, seed: int) -> dict[str, list[tuple[float, bool, bool]]]:
@@ -34,17 +34,17 @@ def reports(env: BatchedEnvironment, seed: int) -> dict[str, list[tuple[float, b
     found: dict[str, list[tuple[float, bool, bool]]] = defaultdict(list)
     turn = begin(env, [seed])
     while True:
-        for ending in turn.endings:
+        for ending in turn.each_ending():
             found[env.agents[ending.agent]].append((ending.reward, ending.terminated, ending.truncated))
         for group, batch in turn.batches.items():
-            found[group].append((batch.rewards[0], False, False))
+            found[env.agents[group]].append((batch.rewards[0], False, False))
         if not turn.batches:
             return found
         turn = env.step(zeros(turn))
 
 
 def test_termination_and_truncation_are_kept_apart() -> None:
-    found = reports(stepping(config(leaves=[3, 3, 3], truncated=[1], arrives=[0, 0, 0]), 1), seed=0)
+    found = reports(stock_stepping(config(leaves=[3, 3, 3], truncated=[1], arrives=[0, 0, 0]), 1), seed=0)
     assert [flags[-1][1:] for flags in (found["agent_0"], found["agent_1"], found["agent_2"])] == [
         (True, False),
         (False, True),
@@ -61,7 +61,7 @@ def test_agents_join_and_leave_and_each_step_is_rewarded_once(data: st.DataObjec
     leaves[0] = max(leaves)
     arrives = [0] + [data.draw(st.integers(0, leave - 1)) for leave in leaves[1:]]
     cut = sorted(data.draw(st.sets(st.integers(0, n - 1))))
-    found = reports(stepping(config(arrives=arrives, leaves=leaves, truncated=cut), 1), seed=3)
+    found = reports(stock_stepping(config(arrives=arrives, leaves=leaves, truncated=cut), 1), seed=3)
     for i, (come, leave) in enumerate(zip(arrives, leaves, strict=True)):
         own = found[f"agent_{i}"]
         assert len(own) == leave - come + 1
@@ -71,15 +71,15 @@ def test_agents_join_and_leave_and_each_step_is_rewarded_once(data: st.DataObjec
 
 
 def test_episodes_do_not_depend_on_the_number_of_environments() -> None:
-    one = [reports(stepping(config(leaves=[2, 4]), 1), seed) for seed in range(5)]
-    env = stepping(config(leaves=[2, 4]), 3)
+    one = [reports(stock_stepping(config(leaves=[2, 4]), 1), seed) for seed in range(5)]
+    env = stock_stepping(config(leaves=[2, 4]), 3)
     turn = begin(env, list(range(5)))
     finished = len(turn.finished)
     rewards = 0.0
     while turn.batches:
         rewards += sum(sum(batch.rewards) for batch in turn.batches.values())
         turn = env.step(zeros(turn))
-        rewards += sum(ending.reward for ending in turn.endings)
+        rewards += sum(ending.reward for ending in turn.each_ending())
         finished += len(turn.finished)
     assert finished == 5
     assert rewards == sum(reward for episode in one for own in episode.values() for reward, _, _ in own)
@@ -88,15 +88,15 @@ def test_episodes_do_not_depend_on_the_number_of_environments() -> None:
 @pytest.mark.parametrize("silent", [False, True])
 @pytest.mark.parametrize("truncated", [False, True])
 def test_rllibs_all_flag_ends_the_remaining_agents(silent: bool, truncated: bool) -> None:
-    env = stepping(config("rllib_meeting", ends=3, truncated=truncated, silent=silent), 1)
+    env = stock_stepping(config("rllib_meeting", ends=3, truncated=truncated, silent=silent), 1)
     turn = begin(env, [0])
     rows: dict[str, list[float]] = defaultdict(list)
     while turn.batches:
-        (agent,) = turn.batches
-        rows[agent].append(float(turn.batches[agent].observations["observation"][0, 1]))
+        (group,) = turn.batches
+        rows[env.agents[group]].append(float(turn.batches[group].observations["observation"][0, 1]))
         turn = env.step(zeros(turn))
     assert rows == {"agent_0": [0.0, 2.0], "agent_1": [1.0]}
-    endings = {env.agents[ending.agent]: ending for ending in turn.endings}
+    endings = {env.agents[ending.agent]: ending for ending in turn.each_ending()}
     assert {agent: (e.terminated, e.truncated) for agent, e in endings.items()} == dict.fromkeys(
         env.agents, (not truncated, truncated)
     )
@@ -107,22 +107,21 @@ def test_rllibs_all_flag_ends_the_remaining_agents(silent: bool, truncated: bool
 
 
 def test_a_crash_affects_its_own_episode_only() -> None:
-    env = stepping(config(crashes=[1]), 2, crashes=1)
-    seeds = itertools.chain([0, 1, 2], itertools.repeat(None))
-    turn = env.start(lambda _: None if (seed := next(seeds)) is None else EpisodeStart(seed, env.agents))
+    env = stock_stepping(config(crashes=[1]), 2, crashes=1)
+    turn = begin(env, [0, 1, 2])
     crashed, finished, ended = [], [], []
     while turn.batches:
         turn = env.step(zeros(turn))
-        crashed += turn.crashed
-        finished += turn.finished
-        ended += turn.endings
+        crashed += turn.crashed.tolist()
+        finished += turn.finished.tolist()
+        ended += turn.each_ending()
     assert crashed == [1]
     assert finished == [0, 1]
     assert len(ended) == 4
 
 
 def test_only_consecutive_crashes_are_limited() -> None:
-    env = stepping(config(crashes=[0, 2, 4]), 1, crashes=1)
+    env = stock_stepping(config(crashes=[0, 2, 4]), 1, crashes=1)
     turn, crashed = begin(env, list(range(6))), 0
     while turn.batches:
         turn = env.step(zeros(turn))
@@ -141,18 +140,17 @@ class ReusedArrays(Simultaneous):
 
 
 def test_the_last_observation_survives_the_next_reset() -> None:
-    env = stepping(EnvironmentConfig(entry_point=f"{__name__}:ReusedArrays", kwargs={"truncated": [0, 1]}), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point=f"{__name__}:ReusedArrays", kwargs={"truncated": [0, 1]}), 1)
     turn = begin(env, [5, 6])
     while not turn.endings:
         turn = env.step(zeros(turn))
     assert turn.batches, "the next episode has begun"
-    assert [ending.observation["observation"].tolist() for ending in turn.endings] == [[0, 3, 5], [1, 3, 5]]
+    assert [ending.observation["observation"].tolist() for ending in turn.each_ending()] == [[0, 3, 5], [1, 3, 5]]
 
 
 def test_an_environment_that_always_crashes_reraises() -> None:
-    env = stepping(config(crashes=list(range(10))), 1, crashes=2)
-    seeds = itertools.count()
-    turns = [env.start(lambda _: EpisodeStart(next(seeds), env.agents))]
+    env = stock_stepping(config(crashes=list(range(10))), 1, crashes=2)
+    turns = [env.start(each_agent_alone(itertools.count(), 2))]
 
     def play() -> None:
         for _ in range(20):
@@ -164,31 +162,31 @@ def test_an_environment_that_always_crashes_reraises() -> None:
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_reward_that_is_not_finite_is_rejected_despite_a_crash_budget(value: float) -> None:
-    env = stepping(config(bad_reward=value), 1, crashes=3)
+    env = stock_stepping(config(bad_reward=value), 1, crashes=3)
     turn = begin(env, [12])
     with pytest.raises(InvalidReward, match=rf"agent_0 got a reward of {value} in the episode with seed 12"):
         env.step(zeros(turn))
 
 
 def test_an_illegal_action_is_rejected_before_any_step() -> None:
-    env = stepping(config(), 2)
+    env = stock_stepping(config(), 2)
     turn = begin(env, [0, 1])
     actions = zeros(turn)
-    actions["agent_1"][1] = 3
+    actions[1][1] = 3
     with pytest.raises(IllegalAction, match="action 3 of agent_1"):
         env.step(actions)
-    assert set(env.step(zeros(turn)).batches) == {"agent_0", "agent_1"}
+    assert set(env.step(zeros(turn)).batches) == {0, 1}
 
 
 def test_an_environment_without_rendering_is_reported() -> None:
-    env = stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1)
     begin(env, [0])
     with pytest.raises(EnvironmentMismatch, match="cannot be rendered"):
         env.render(0)
 
 
 def test_an_environment_is_rendered() -> None:
-    env = stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1, render_mode="rgb_array")
+    env = stock_stepping(EnvironmentConfig(entry_point="mpe2.simple_spread_v3"), 1, render_mode="rgb_array")
     begin(env, [0])
     image = env.render(0)
     assert image.dtype == np.uint8
@@ -212,12 +210,12 @@ def repeated_termination() -> RepeatedTermination:
 
 
 def test_an_agent_terminates_once() -> None:
-    env = stepping(EnvironmentConfig(entry_point=f"{__name__}:repeated_termination"), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point=f"{__name__}:repeated_termination"), 1)
     turn = begin(env, [0])
     left = []
     while turn.batches:
         turn = env.step(zeros(turn))
-        left += [(env.agents[ending.agent], ending.reward) for ending in turn.endings]
+        left += [(env.agents[ending.agent], ending.reward) for ending in turn.each_ending()]
     assert sorted(left) == [("agent_0", 1.0), ("agent_1", 1.0)]
 
 
@@ -236,12 +234,12 @@ def no_all_flag() -> NoAllFlag:
 
 
 def test_an_episode_without_agents_is_over() -> None:
-    env = stepping(EnvironmentConfig(entry_point=f"{__name__}:no_all_flag"), 1)
+    env = stock_stepping(EnvironmentConfig(entry_point=f"{__name__}:no_all_flag"), 1)
     turn = begin(env, [0])
     finished = []
     while turn.batches:
         turn = env.step(zeros(turn))
-        finished += turn.finished
+        finished += turn.finished.tolist()
     assert finished == [0]
 
 
@@ -286,9 +284,9 @@ def contract_violation(fault: str) -> ContractViolation:
 )
 @pytest.mark.parametrize("shared", [False, True])
 def test_contract_violations_are_rejected_with_the_agent(fault: str, message: str, shared: bool) -> None:
-    env = stepping(
+    env = stock_stepping(
         EnvironmentConfig(entry_point=f"{__name__}:contract_violation", kwargs={"fault": fault}), 1, crashes=3
     )
-    groups = ("all", "all") if shared else env.agents
+    groups = [0, 0] if shared else [0, 1]
     with pytest.raises(LeagueError, match=message):
-        env.step(zeros(env.start(lambda _: EpisodeStart(5, groups))))
+        env.step(zeros(env.start(episodes([5], groups))))

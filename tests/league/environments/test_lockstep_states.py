@@ -11,7 +11,8 @@ from pettingzoo.classic import tictactoe_v3
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
 from league.environments.lockstep import Lockstep
-from league.environments.stepping import EpisodeStart
+from tests.conformance.stepping import states_of as by_env
+from tests.support.environments.episodes import episodes
 
 LENGTH = 3
 
@@ -43,15 +44,14 @@ class StateInInfo(MultiAgentEnv):
 
 def states_of(make: Callable[[], Any], steps: int, states: bool = True) -> list[tuple[dict[int, Any], dict[int, Any]]]:
     """States and last states of each turn of one environment, whose episodes have the seeds 1, 2, …"""
-    seeds = iter(range(1, 99))
     lockstep = Lockstep(make, 1, states=states)
-    turn = lockstep.start(lambda _: EpisodeStart(next(seeds), ["all"] * len(lockstep.agents)))
-    found = [(turn.states, turn.last_states)]
+    turn = lockstep.start(episodes(range(1, 99), [0] * len(lockstep.agents)))
+    found = [(by_env(turn.states), by_env(turn.last_states))]
     for _ in range(steps):
-        legal = turn.batches["all"].observations.get("action_mask")
-        rows = len(turn.batches["all"].envs)
-        turn = lockstep.step({"all": np.zeros(rows, np.int64) if legal is None else legal.argmax(axis=1)})
-        found.append((turn.states, turn.last_states))
+        legal = turn.batches[0].observations.get("action_mask")
+        rows = len(turn.batches[0])
+        turn = lockstep.step({0: np.zeros(rows, np.int64) if legal is None else legal.argmax(axis=1)})
+        found.append((by_env(turn.states), by_env(turn.last_states)))
     lockstep.close()
     return found
 

@@ -15,7 +15,8 @@ AGENTS = ("first", "second")
 def check(space: spaces.Space, actions: np.ndarray, mask: np.ndarray | None = None) -> None:
     rows = 2
     observations = {} if mask is None else {ACTION_MASK: np.stack([mask] * rows)}
-    check_actions(Batch([0, 0], [0, 1], observations, [0.0] * rows), actions, from_gymnasium(space), AGENTS)
+    batch = Batch(np.zeros(rows, int), np.arange(rows), observations, np.zeros(rows))
+    check_actions(batch, actions, from_gymnasium(space), AGENTS)
 
 
 @settings(deadline=None)

@@ -7,7 +7,7 @@ import pytest
 
 from league.environment_config import EnvironmentConfig
 from league.environments.building import action_space, build
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import ConfigError
 from tests.conformance.stepping import lockstep
 
@@ -81,7 +81,7 @@ def test_each_wrapper_steps_in_lockstep_and_follows_the_seed(name: str, api: Any
     wrapped = config(entry_point, {name: arguments}, api=api, kwargs=kwargs)
     env = build(wrapped)
     spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
-    envs = stepping(wrapped, 2)
+    envs = stock_stepping(wrapped, 2)
     first, again = (lockstep(envs, spaces, seeds, 6) for seeds in ([1, 2], [2, 1]))
     for seed in (1, 2):
         for agent, reports in first[seed].items():

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from evaluation.matches.lockstep_runner import Roster, play_matches
+from evaluation.matches.game_loop import Roster, play_matches
 from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.scripted import script
@@ -63,7 +63,7 @@ class Kind:
         return round_robin(config, self.interface, contestants, blocks)
 
     def play(self, schedule: Schedule, num_envs: int = 5, max_moves: int = 10_000) -> list[Match]:
-        environment = stepping(self.config.environment, num_envs)
+        environment = stock_stepping(self.config.environment, num_envs)
         return play_matches(schedule, range(schedule.length), environment, self.interface, self.roster, max_moves)
 
 

@@ -1,12 +1,13 @@
 """A scripted batched environment that uses everything the protocol allows, and records its episodes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.stepping import Batch, Ending, EpisodeStart, Group, NextEpisode, Turn
+from league.environments.stepping import Batch, Ending, NextEpisodes, Turn
+from league.environments.vector.vector_env import AgentRows
 from league.interface import AgentInterface, Interface
 from league.seeds import generator
 from league.spaces import Box, DictSpace, Discrete
@@ -18,11 +19,16 @@ LEAVING, ACTING, JOINING = 0.15, 0.6, 0.8
 
 @dataclass
 class AgentRecord:
-    """The groups, rewards and ending of an agent in an episode."""
+    """The groups, rewards and ending of an agent in an episode. policies: number of the league's own."""
 
-    groups: list[Group] = field(default_factory=list)
+    policies: int
+    groups: list[int] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
     ending: Ending | None = None
+
+    def is_own(self, group: int) -> bool:
+        """Whether a group is a policy of the league, and not that of an opening or an opponent."""
+        return group < self.policies
 
 
 @dataclass
@@ -68,38 +74,39 @@ class Scripted:
     def __init__(self, agents: int, num_envs: int, crashing: float = 0.0) -> None:
         self.agents = tuple(f"agent_{i}" for i in range(agents))
         self._crashing = crashing
+        self._policies = min(agents, 2)
         self._playing: list[EpisodeRecord] = [EpisodeRecord(-1)] * num_envs
-        self._groups: list[Sequence[Group]] = [()] * num_envs
+        self._groups = np.zeros((num_envs, agents), np.int64)
         self.played: dict[int, EpisodeRecord] = {}
-        self._rows: dict[Group, tuple[list[int], list[int], list[NDArray], list[float]]] = {}
+        self._rows: dict[int, tuple[list[int], list[int], list[NDArray], list[float]]] = {}
         self._waiting: dict[tuple[int, int], float] = {}
 
     @property
     def num_envs(self) -> int:
         return len(self._playing)
 
-    def start(self, next_episode: NextEpisode) -> Turn:
-        self._next_episode = next_episode
+    def start(self, next_episodes: NextEpisodes) -> Turn:
+        self._next_episodes = next_episodes
         self._rows, self._waiting = {}, {}
         for played in self._playing:
             played.is_lost = not played.is_over
-        for env in range(self.num_envs):
-            self._begin(env)
-        return self._turn(Turn())
+        self._begin(list(range(self.num_envs)))
+        return self._turn([], [], [])
 
-    def step(self, actions: Mapping[Group, NDArray]) -> Turn:
-        turn = Turn()
+    def step(self, actions: Mapping[int, NDArray]) -> Turn:
         for group, (envs, agents, _, _) in self._rows.items():
             assert actions[group].shape == (len(envs),)
             for env, agent, action in zip(envs, agents, actions[group].tolist(), strict=True):
                 assert action - 1 != self._masked(env, agent), "an illegal action"
         self._rows = {}
-        for env in range(self.num_envs):
-            self._advance(env, turn)
-        return self._turn(turn)
+        endings: list[Ending] = []
+        over = [self._advance(env, endings) for env in range(self.num_envs)]
+        crashed, finished = ([env for env, how in enumerate(over) if how == each] for each in ("crashed", "finished"))
+        self._begin(sorted(crashed + finished))
+        return self._turn(endings, finished, crashed)
 
-    def assign(self, env: int, groups: Sequence[Group]) -> None:
-        self._groups[env] = groups
+    def assign(self, envs: NDArray, groups: NDArray) -> None:
+        self._groups[envs] = groups
 
     def render(self, env: int) -> NDArray:
         raise NotImplementedError
@@ -107,48 +114,49 @@ class Scripted:
     def close(self) -> None:
         pass
 
-    def _begin(self, env: int) -> None:
-        episode = self._next_episode(env)
-        assert isinstance(episode, EpisodeStart)
-        assert episode.seed not in self.played, "duplicate seed"
-        self._playing[env] = self.played[episode.seed] = EpisodeRecord(episode.seed)
-        self._groups[env] = episode.groups
-        self._report(env, generator(episode.seed, "first"))
+    def _begin(self, envs: list[int]) -> None:
+        if not envs:
+            return
+        starts = self._next_episodes(np.array(envs))
+        assert starts.envs.tolist() == envs
+        self._groups[starts.envs] = starts.groups
+        for env, seed in zip(envs, starts.seeds.tolist(), strict=True):
+            assert seed not in self.played, "duplicate seed"
+            self._playing[env] = self.played[seed] = EpisodeRecord(seed)
+            self._report(env, generator(seed, "first"))
 
-    def _advance(self, env: int, turn: Turn) -> None:
+    def _advance(self, env: int, endings: list[Ending]) -> str:
+        """Step an environment. Return whether it `crashed`, `finished` or `goes on`."""
         played = self._playing[env]
         rng = generator(played.seed, played.steps)
         played.steps += 1
         if rng.random() < self._crashing:
             played.is_lost = True
-            turn.crashed.append(env)
-            self._begin(env)
-            return
+            return "crashed"
         for agent, seen in played.agents.items():
             if seen.ending is None:
                 self._waiting[played.seed, agent] = self._waiting.get((played.seed, agent), 0.0) + int(rng.integers(9))
                 if rng.random() < LEAVING:
                     seen.ending = self._ending(env, agent, bool(rng.random() < 0.5))
-                    turn.endings.append(seen.ending)
+                    endings.append(seen.ending)
         if played.agents and all(seen.ending for seen in played.agents.values()):
             played.is_over = True
-            turn.finished.append(env)
-            self._begin(env)
-        else:
-            self._report(env, rng)
+            return "finished"
+        self._report(env, rng)
+        return "goes on"
 
     def _report(self, env: int, rng: np.random.Generator) -> None:
         """A random subset of agents must act, at least one; agents drawn for the first time join."""
         played = self._playing[env]
         for agent in range(len(self.agents)):
             if agent not in played.agents and rng.random() < JOINING:
-                played.agents[agent] = AgentRecord()
+                played.agents[agent] = AgentRecord(self._policies)
         if not played.agents:
-            played.agents[0] = AgentRecord()
+            played.agents[0] = AgentRecord(self._policies)
         alive = [agent for agent, seen in played.agents.items() if seen.ending is None]
         acting = [agent for agent in alive if rng.random() < ACTING] or alive[:1]
         for agent in acting:
-            group = self._groups[env][agent]
+            group = int(self._groups[env, agent])
             envs, agents, observations, rewards = self._rows.setdefault(group, ([], [], [], []))
             reward = self._waiting.pop((played.seed, agent), 0.0)
             envs.append(env)
@@ -170,11 +178,29 @@ class Scripted:
         reward = self._waiting.pop((self._playing[env].seed, agent), 0.0)
         return Ending(env, agent, observation, reward, terminated, not terminated)
 
-    def _turn(self, turn: Turn) -> Turn:
-        for group, (envs, agents, observations, rewards) in self._rows.items():
+    def _turn(self, endings: list[Ending], finished: list[int], crashed: list[int]) -> Turn:
+        turn = Turn(finished=np.array(finished, np.int64), crashed=np.array(crashed, np.int64))
+        turn.endings = [self._block(endings)] if endings else []
+        for group, (envs, agents, observations, rewards) in sorted(self._rows.items()):
+            order = np.argsort(envs, kind="stable")
             masks = np.ones((len(envs), ACTIONS), np.int8)
             for row, (env, agent) in enumerate(zip(envs, agents, strict=True)):
                 masks[row, self._masked(env, agent)] = 0
             arrays = {"observation": np.array(observations), "action_mask": masks}
-            turn.batches[group] = Batch(envs, agents, arrays, rewards)
+            turn.batches[group] = Batch(np.array(envs), np.array(agents), arrays, np.array(rewards)).rows(order)
+        # Actions arrive in the order of the batches.
+        self._rows = {
+            group: (batch.envs.tolist(), batch.agents.tolist(), [], []) for group, batch in turn.batches.items()
+        }
         return turn
+
+    @staticmethod
+    def _block(endings: list[Ending]) -> AgentRows:
+        return AgentRows(
+            np.array([ending.env for ending in endings]),
+            np.array([ending.agent for ending in endings]),
+            {name: np.stack([e.observation[name] for e in endings]) for name in endings[0].observation},
+            np.array([ending.reward for ending in endings]),
+            np.array([ending.terminated for ending in endings]),
+            np.array([ending.truncated for ending in endings]),
+        )

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from ray.rllib.core.learner.training_data import TrainingData
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ALL_MODULES
 
 from league.config import LeagueConfig
@@ -19,6 +18,7 @@ from training.learners import ppo
 from training.learners.ppo import PPOLearner
 from training.learners.train_batch import train_batch
 from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.episode_chunks import EpisodeChunks
 
 TWO: dict[str, Any] = {"kwargs": {"agents": 2}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
 UPDATE = {"num_epochs": 2, "minibatch_size": 64}
@@ -33,15 +33,15 @@ def learner_of(league: LeagueConfig) -> PPOLearner:
     return learner
 
 
-def sample_episodes(league: LeagueConfig, steps: int = 256) -> list[SingleAgentEpisode]:
+def sample_episodes(league: LeagueConfig, steps: int = 256) -> list[EpisodeChunks]:
     runner = LockstepEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
     try:
-        return runner.sample(num_timesteps=steps)
+        return runner.sample_chunks(num_timesteps=steps)
     finally:
         runner.stop()
 
 
-def learn(learner: PPOLearner, episodes: list[SingleAgentEpisode], **options: Any) -> dict[str, Any]:
+def learn(learner: PPOLearner, episodes: list[EpisodeChunks], **options: Any) -> dict[str, Any]:
     return learner.update(training_data=TrainingData(episodes=episodes), **(UPDATE | options))
 
 
@@ -59,7 +59,7 @@ def equal(first: Any, second: Any) -> bool:
 
 
 @pytest.fixture(scope="module")
-def two() -> tuple[LeagueConfig, list[SingleAgentEpisode]]:
+def two() -> tuple[LeagueConfig, list[EpisodeChunks]]:
     league = solvable("discrete", **TWO)
     return league, sample_episodes(league)
 
@@ -130,7 +130,7 @@ def test_each_policy_learns_with_its_own_settings(two: tuple, monkeypatch: pytes
     used: dict[str, Any] = {}
 
     def batch(module: Any, chunks: Any, **options: Any) -> Any:
-        used[chunks[0].module_id] = (options["gamma"], options["lambda_"])
+        used[chunks[0].policy] = (options["gamma"], options["lambda_"])
         return train_batch(module, chunks, **options)
 
     def loss(steps: Any, *arguments: Any, **options: Any) -> Any:
@@ -159,7 +159,7 @@ def test_a_shared_encoder_has_one_optimizer_for_the_losses_of_all_policies(two: 
     assert sum(map(len, parameters)) == len(set.union(*parameters))
     assert parameters[2] == set(map(id, learner.module.encoder.parameters()))
     before = learner.module.encoder.hidden[0].weight.detach().clone()
-    learn(learner, [episode for episode in two[1] if episode.module_id == "b"])
+    learn(learner, [chunks for chunks in two[1] if chunks.policy == "b"])
     assert not torch.equal(before, learner.module.encoder.hidden[0].weight)
 
 

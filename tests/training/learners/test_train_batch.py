@@ -8,12 +8,11 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
-from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from training.learners import train_batch as train_batches
-from training.learners.train_batch import Chunks, TrainBatch, generalized_advantages, train_batch
+from training.learners.train_batch import TrainBatch, generalized_advantages, train_batch
 from training.modules.actor_critic import ActorCritic
+from training.sampling.episode_chunks import EpisodeChunks
 
 GAMMA, LAMBDA = 0.5, 0.9
 
@@ -44,27 +43,30 @@ def identity() -> Identity:
 
 
 def chunk(
-    observations: list[Any], rewards: list[float], states: NDArray | None = None, **end: bool
-) -> SingleAgentEpisode:
+    observations: list[Any],
+    rewards: list[float],
+    states: NDArray | None = None,
+    terminated: bool = False,
+    truncated: bool = False,
+) -> EpisodeChunks:
+    """A single chunk."""
     n = len(rewards)
     dtype = np.float32 if isinstance(observations[0], float) else np.int64
     seen = np.array(observations, dtype)
-    outputs = {
-        Columns.ACTION_LOGP: InfiniteLookbackBuffer(np.zeros(n, np.float32)),
-        Columns.ACTION_DIST_INPUTS: InfiniteLookbackBuffer(np.zeros((n, 2), np.float32)),
-    }
-    if states is not None:
-        outputs[Columns.STATE_IN] = InfiniteLookbackBuffer({"h": states, "c": -states})
-    return SingleAgentEpisode(
-        module_id="a",
-        agent_id="x",
-        len_lookback_buffer=0,
-        observations=InfiniteLookbackBuffer({"observation": seen[:, None] if dtype == np.float32 else seen}),
-        infos=InfiniteLookbackBuffer([{}] * (n + 1)),
-        actions=InfiniteLookbackBuffer(np.arange(n)),
-        rewards=InfiniteLookbackBuffer(np.array(rewards, np.float32)),
-        extra_model_outputs=outputs,
-        **end,
+    return EpisodeChunks(
+        name="chunk",
+        policy="a",
+        agents=np.zeros(1, np.int64),
+        started=np.zeros(1, np.int64),
+        lengths=np.array([n]),
+        observations={"observation": seen[:, None] if dtype == np.float32 else seen},
+        actions=np.arange(n),
+        log_p=np.zeros(n, np.float32),
+        dist_inputs=np.zeros((n, 2), np.float32),
+        state={} if states is None else {"h": states, "c": -states},
+        rewards=np.array(rewards, np.float32),
+        terminated=np.array([terminated]),
+        truncated=np.array([truncated]),
     )
 
 
@@ -92,8 +94,8 @@ def test_the_last_value_is_used_unless_the_agent_terminated(
 def test_bootstrapping_can_be_configured(identity: Identity) -> None:
     """Like RLlib, which treats truncation as termination."""
 
-    def unless_over(chunks: Chunks) -> NDArray:
-        return np.array([not chunk.is_done for chunk in chunks])
+    def unless_over(chunks: EpisodeChunks) -> NDArray:
+        return ~(chunks.terminated | chunks.truncated)
 
     chunks = [chunk([2.0, 4.0], [1.0], truncated=True), chunk([2.0, 4.0], [1.0])]
     found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0, bootstraps=unless_over)

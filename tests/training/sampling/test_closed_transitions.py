@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 
 from league.config import LeagueConfig
 from league.environments.building import interface as interface_of
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch
 from league.seeds import generator
 from league.training_config import OpponentConfig, PPOConfig
@@ -45,7 +45,7 @@ def expected_rows(seed: int, agent: int, record: AgentRecord) -> list[tuple[obje
     rows: list[tuple[object, ...]] = []
     for row, group in enumerate(record.groups):
         is_last = row == len(record.groups) - 1
-        if isinstance(group, str) and not (is_last and record.ending is None):
+        if record.is_own(group) and not (is_last and record.ending is None):
             ends = (record.ending.terminated, record.ending.truncated) if is_last and record.ending else (False, False)
             rows.append(((agent, seed, row), following_rewards[row + 1], *ends))
     return rows
@@ -99,7 +99,7 @@ def test_each_transition_is_recorded_once_with_its_successor(
 
 def joint(league: LeagueConfig, steps: int, num_envs: int = 2) -> TransitionBlock:
     interface_of_league = interface_of(league)
-    env = stepping(league.environment, num_envs, states=True)
+    env = stock_stepping(league.environment, num_envs, states=True)
     try:
         recorder = JointTransitions(interface_of_league, env.agents, num_envs)
         play = SelfPlay(

@@ -29,6 +29,7 @@ from training.algorithms.ppo import algorithm_config
 from training.learners.train_batch import train_batch
 from training.runs.trial import build_algorithm
 from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.episode_chunks import as_episodes
 from training.sampling.play_metrics import ENTROPY
 
 LIVES = [4, 6]
@@ -207,7 +208,8 @@ def test_newer_weights_are_applied() -> None:
 def test_rllibs_learner_accepts_the_episodes_and_agrees_on_value_targets(truncated: list[int]) -> None:
     league = counting(LIVES, truncated)
     runner = runner_of(league)
-    episodes = [episode for _ in range(3) for episode in runner.sample(num_timesteps=50)]
+    samples = [chunks for _ in range(3) for chunks in runner.sample_chunks(num_timesteps=50)]
+    episodes = [episode for chunks in samples for episode in as_episodes(chunks, runner.env.agents)]
     config = algorithm_config(league, interface(league))
     config.learners(
         learner_class=PPOTorchLearner,
@@ -218,7 +220,7 @@ def test_rllibs_learner_accepts_the_episodes_and_agrees_on_value_targets(truncat
     ours = {
         policy: train_batch(
             learner.module[policy],
-            [episode for episode in episodes if episode.module_id == policy],
+            [chunks for chunks in samples if chunks.policy == policy],
             gamma=league.training.gamma,
             lambda_=league.training.lambda_,
         )

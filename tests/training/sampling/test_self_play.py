@@ -16,8 +16,8 @@ from league.seeds import generator
 from league.training_config import OpponentConfig, PPOConfig
 from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
+from training.sampling.episode_chunks import as_episodes
 from training.sampling.opponents import OpponentPolicy
-from training.sampling.play_metrics import AgentEpisode
 from training.sampling.recorder import EpisodeRecorder
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import ForwardInput, SelfPlay
@@ -44,8 +44,13 @@ def sample(play: SelfPlay, fragment_lengths: Iterable[int]) -> list[SingleAgentE
     for steps in fragment_lengths:
         for _ in range(steps):
             play.step(forward, explore=True)
-        chunks += play.recorder.cut()
+        chunks += cut(play)
     return chunks
+
+
+def cut(play: SelfPlay) -> list[SingleAgentEpisode]:
+    names = tuple(f"agent_{i}" for i in range(9))
+    return [episode for chunks in play.recorder.cut() for episode in as_episodes(chunks, names)]
 
 
 def by_agent_of_episode(chunks: Iterable[SingleAgentEpisode]) -> dict[tuple[int, int], list[SingleAgentEpisode]]:
@@ -65,8 +70,8 @@ def check_agent(
     chunks: list[SingleAgentEpisode], record: AgentRecord, episode: EpisodeRecord, seed: int, agent: int
 ) -> int:
     """The chunks are the agent's rows from the first one of its policy; returns their number of steps."""
-    first = next(i for i, group in enumerate(record.groups) if isinstance(group, str))
-    assert all(isinstance(group, str) for group in record.groups[first:])
+    first = next(i for i, group in enumerate(record.groups) if record.is_own(group))
+    assert all(record.is_own(group) for group in record.groups[first:])
     steps = 0
     for chunk in chunks:
         assert chunk.t_started == steps
@@ -138,7 +143,7 @@ def test_each_step_of_a_policy_is_recorded_once(
         check_agent(own, played.agents[agent], played, seed, agent)
     for seed, played in env.played.items():
         for agent, seen in played.agents.items():
-            rows = [group for group in seen.groups if isinstance(group, str)]
+            rows = [group for group in seen.groups if seen.is_own(group)]
             closed = len(rows) - (seen.ending is None)
             if not played.is_lost and closed > 0:
                 assert sum(map(len, found[seed, agent])) == closed
@@ -154,7 +159,7 @@ def test_a_crashed_episode_is_not_continued(fragment_lengths: list[int]) -> None
         lost = {seed for seed, episode in env.played.items() if episode.is_lost}
         for _ in range(steps):
             play.step(forward, explore=True)
-        assert not {seed for seed, _ in by_agent_of_episode(play.recorder.cut())} & lost
+        assert not {seed for seed, _ in by_agent_of_episode(cut(play))} & lost
 
 
 def test_an_opponent_plays_all_sides_but_one() -> None:
@@ -169,7 +174,9 @@ def test_an_opponent_plays_all_sides_but_one() -> None:
     for seed, played in env.played.items():
         by = {agent: set(seen.groups) for agent, seen in played.agents.items() if seen.groups}
         assert all(len(groups) == 1 for groups in by.values())
-        others = {agent for agent, groups in by.items() if isinstance(next(iter(groups)), OpponentPolicy)}
+        others = {
+            agent for agent, groups in by.items() if isinstance(play._controllers[next(iter(groups))], OpponentPolicy)
+        }
         assert not others & learning[seed]
         assert others in (set(), others & {0, 2}, others & {1, 3})
         opposed.append((bool(others & {0, 2}), bool(others & {1, 3})))
@@ -187,7 +194,7 @@ def test_opponents_forget_an_episode_when_it_ends(monkeypatch: pytest.MonkeyPatc
     env = Scripted(3, 2)
     play = self_play(env, opponents=[RANDOM])
     forgotten: list[int] = []
-    monkeypatch.setattr(play._opponents, "forget", forgotten.append)
+    monkeypatch.setattr(play._opponents, "forget", lambda envs: forgotten.extend(envs.tolist()))
     sample(play, [60])
     assert len(forgotten) == sum(episode.is_over for episode in env.played.values()) > 2
     assert set(forgotten) == {0, 1}
@@ -228,20 +235,22 @@ def test_metrics_exclude_opponents_and_crashed_episodes() -> None:
     finished = [episode for episode in env.played.values() if episode.is_over]
     assert play.metrics.episodes == len(finished)
     rows = [group for episode in env.played.values() for seen in episode.agents.values() for group in seen.groups]
-    waiting = sum(len(batch.envs) for batch in play._turn.batches.values())
+    waiting = sum(len(batch) for batch in play._turn.batches.values())
     assert play.metrics.steps == len(rows) - waiting
-    expected = defaultdict(list)
+    expected = []
     for episode in finished:
+        steps, returns = [0] * 3, [0.0] * 3
         for agent, seen in episode.agents.items():
-            if seen.ending and seen.groups and isinstance(seen.groups[0], str):
-                own = AgentEpisode(agent, len(seen.groups), sum(seen.rewards) + seen.ending.reward)
-                expected[episode.seed].append((episode.steps, own))
-    logged = [[(done.steps, agent) for agent in done.agents] for done in play.metrics._finished]
-    assert sorted(map(repr, map(by_agent, logged))) == sorted(map(repr, map(by_agent, expected.values())))
-
-
-def by_agent(episode: list[tuple[int, AgentEpisode]]) -> list[tuple[int, AgentEpisode]]:
-    return sorted(episode, key=lambda entry: entry[1].agent)
+            if seen.ending and seen.groups and seen.is_own(seen.groups[0]):
+                steps[agent], returns[agent] = len(seen.groups), sum(seen.rewards) + seen.ending.reward
+        if any(steps):
+            expected.append((episode.steps, steps, returns))
+    logged = [
+        entry
+        for done in play.metrics._finished
+        for entry in zip(done.lengths.tolist(), done.steps.tolist(), done.returns.tolist(), strict=True)
+    ]
+    assert sorted(logged) == sorted(expected)
 
 
 def test_random_play_is_uniform_over_legal_actions() -> None:
@@ -249,7 +258,7 @@ def test_random_play_is_uniform_over_legal_actions() -> None:
     play = self_play(env)
     for _ in range(60):
         play.step(None, explore=False)
-    for chunk in play.recorder.cut():
+    for chunk in cut(play):
         np.testing.assert_allclose(np.exp(chunk.extra_model_outputs[Columns.ACTION_LOGP].data), 0.5, rtol=1e-6)
         legal = to_environment(chunk.actions.data, interface(2).of_policy("policy_0").action)
         assert set(legal.tolist()) <= {1, 2, 3}

@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.matches.lockstep_runner import play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.playback.replay import replay
 from evaluation.schedules.builders import round_robin
-from league.environments.lockstep import stepping
+from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, GameHung
 from league.results.records import Match, Schedule
 from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, WINNER, build_roster
@@ -20,7 +20,7 @@ def schedule(blocks: int = 4, plies: int = 2, contestants: Sequence[str] = CONTE
 
 
 def play(schedule: Schedule, num_envs: int = 8, positions: Sequence[int] | None = None) -> list[Match]:
-    environment = stepping(CONFIG.environment, num_envs)
+    environment = stock_stepping(CONFIG.environment, num_envs)
     return play_matches(
         schedule, range(schedule.length) if positions is None else positions, environment, INTERFACE, build_roster()
     )
@@ -88,7 +88,7 @@ def test_returns_belong_to_contestants_on_each_side() -> None:
 def test_recorded_games_replay() -> None:
     for match in play(schedule()):
         for index, game in enumerate(match.games):
-            steps = list(replay(stepping(CONFIG.environment, 1), CONFIG, INTERFACE, match, index))
+            steps = list(replay(stock_stepping(CONFIG.environment, 1), CONFIG, INTERFACE, match, index))
             assert [move.action for m in steps for move in m.moves] == [*game.opening, *game.actions]
 
 
@@ -106,7 +106,7 @@ def test_a_record_that_cannot_be_replayed_is_rejected(change: str) -> None:
     digest = "another" if change == "environment" else match.environment_digest
     record = replace(match, games=(forged, match.games[1]), environment_digest=digest)
     with pytest.raises(EnvironmentMismatch):
-        list(replay(stepping(CONFIG.environment, 1), CONFIG, INTERFACE, record, 0))
+        list(replay(stock_stepping(CONFIG.environment, 1), CONFIG, INTERFACE, record, 0))
 
 
 def test_a_game_that_does_not_end_is_reported() -> None:
@@ -114,7 +114,7 @@ def test_a_game_that_does_not_end_is_reported() -> None:
         play_matches(
             schedule(contestants=["script:random", "script:one_ply"]),
             [0],
-            stepping(CONFIG.environment, 2),
+            stock_stepping(CONFIG.environment, 2),
             INTERFACE,
             build_roster(),
             max_moves=4,

@@ -1,0 +1,97 @@
+"""The actions of episodes in progress, and their replay in the stock environment."""
+
+import contextlib
+from collections import deque
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environment_config import EnvironmentConfig
+from league.environments.adapters import EnvAdapter, adapter_for, splitter
+from league.environments.building import build, observation_space
+from league.environments.lockstep import plain_actions
+from league.environments.stepping import Indices
+from league.environments.vector.vector_env import VectorEnv
+from league.spaces.conversion import from_gymnasium
+
+
+class StepActions(NamedTuple):
+    """The actions of one step, sorted by environment, then by agent: (k,), (k,), and (k,) or (k, …)."""
+
+    envs: Indices
+    agents: Indices
+    actions: NDArray[Any]
+
+
+class EpisodeActions:
+    """The seeds and actions of all episodes in progress."""
+
+    def __init__(self, num_envs: int) -> None:
+        self._seeds = np.zeros(num_envs, np.int64)
+        self._began = np.zeros(num_envs, np.int64)
+        """Number of the first step of each environment's episode, counted since the start."""
+        self._steps: deque[StepActions] = deque()
+        self._first = 0
+        """Number of the first step in `_steps`."""
+
+    def begin(self, envs: Indices, seeds: Indices) -> None:
+        """Start episodes."""
+        self._seeds[envs], self._began[envs] = seeds, self._total
+
+    def add(self, step: StepActions) -> None:
+        """Add a step of all environments with an episode, and drop the steps of episodes that are over."""
+        self._steps.append(step)
+        oldest = int(self._began[step.envs].min())
+        while self._first < oldest:
+            self._steps.popleft()
+            self._first += 1
+
+    def seed(self, env: int) -> int:
+        """Return the seed of an environment's episode."""
+        return int(self._seeds[env])
+
+    def in_stock(
+        self, config: EnvironmentConfig, env: int, further: StepActions | None = None, render_mode: str | None = None
+    ) -> EnvAdapter:
+        """Replay an environment's episode in a new stock environment, which is returned. Raises what it raises.
+
+        further: a step after the recorded ones.
+        """
+        stock = build(config, render_mode)
+        splits = [splitter(from_gymnasium(observation_space(stock, agent))) for agent in stock.possible_agents]
+        adapter = adapter_for(stock, splits)
+        try:
+            adapter.reset(int(self._seeds[env]))
+            for step in (*self._since(int(self._began[env])), *(() if further is None else (further,))):
+                own = slice(*np.searchsorted(step.envs, [env, env + 1]))
+                adapter.step(list(zip(step.agents[own].tolist(), plain_actions(step.actions[own]), strict=True)))
+        except BaseException:
+            with contextlib.suppress(Exception):
+                adapter.close()
+            raise
+        return adapter
+
+    def in_vector(self, vector: VectorEnv, envs: Indices) -> None:
+        """Replay the episodes of some environments in a new vectorised environment."""
+        began = self._began[envs]
+        oldest = int(began.min(initial=self._total))
+        for number, step in enumerate(self._since(oldest), oldest):
+            _reset(vector, envs[began == number], self._seeds)
+            playing = envs[began <= number]
+            vector.step(playing, step.actions[np.isin(step.envs, playing)])
+        _reset(vector, envs[began == self._total], self._seeds)
+
+    @property
+    def _total(self) -> int:
+        """Number of steps since the start."""
+        return self._first + len(self._steps)
+
+    def _since(self, number: int) -> list[StepActions]:
+        return list(islice(self._steps, number - self._first, None))
+
+
+def _reset(vector: VectorEnv, envs: Indices, seeds: Indices) -> None:
+    if len(envs):
+        vector.reset(envs, seeds[envs])

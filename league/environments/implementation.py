@@ -1,0 +1,106 @@
+"""Chooses between the stock environment in lockstep and a vectorised environment, which is faster and equal to it."""
+
+import importlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+from league.environment_config import EnvironmentConfig
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import BatchedEnvironment
+from league.environments.vector.vector_env import UnsupportedArguments, VectorEnv
+from league.environments.vector_stepping import VectorStepping
+from league.errors import ConfigError
+from league.stack import VERIFIED, installed
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """A vectorised environment, as `package.module:Class`, and what it was verified against."""
+
+    vector: str
+    api: Literal["aec", "parallel"]
+    packages: tuple[str, ...]
+
+
+VECTOR = "league.environments.vector"
+VECTORISED = {
+    "pettingzoo.classic.connect_four_v3": Verified(f"{VECTOR}.connect_four:ConnectFour", "aec", ("pettingzoo",)),
+    "pettingzoo.classic.tictactoe_v3": Verified(f"{VECTOR}.tictactoe:TicTacToe", "aec", ("pettingzoo",)),
+    "pettingzoo.classic.rps_v2": Verified(f"{VECTOR}.rps:RockPaperScissors", "parallel", ("pettingzoo",)),
+    "pettingzoo.classic.leduc_holdem_v4": Verified(
+        f"{VECTOR}.leduc_holdem:LeducHoldem", "aec", ("pettingzoo", "rlcard")
+    ),
+    "mpe2.simple_spread_v3": Verified(f"{VECTOR}.mpe.simple_spread:SimpleSpread", "parallel", ("mpe2",)),
+    "mpe2.simple_adversary_v3": Verified(f"{VECTOR}.mpe.simple_adversary:SimpleAdversary", "parallel", ("mpe2",)),
+    "mpe2.simple_tag_v3": Verified(f"{VECTOR}.mpe.simple_tag:SimpleTag", "parallel", ("mpe2",)),
+    "mpe2.simple_reference_v3": Verified(f"{VECTOR}.mpe.simple_reference:SimpleReference", "parallel", ("mpe2",)),
+}
+"""Entry point of the stock environment → its vectorised environment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Implementation:
+    """How copies of an environment are stepped. vector: None for lockstep. reason: why, in one sentence."""
+
+    vector: Callable[..., VectorEnv] | None
+    reason: str
+
+
+def implementation(config: EnvironmentConfig) -> Implementation:
+    """Return how copies of an environment are stepped. Raises ConfigError if `environment.vector` is invalid."""
+    if config.wrappers:
+        return Implementation(None, f"It is stepped in lockstep, because wrapper {config.wrappers[0].name} needs it.")
+    if config.vector is not None:
+        return _if_supported(config.vector, config)
+    verified = VECTORISED.get(config.entry_point)
+    if verified is None:
+        return Implementation(None, "It is stepped in lockstep, because it has no vectorised implementation.")
+    if config.api not in (None, verified.api):
+        return Implementation(None, f"It is stepped in lockstep, because {config.api} is not the vectorised API.")
+    found = installed()
+    for package in verified.packages:
+        if found.get(package) != VERIFIED[package]:
+            return Implementation(
+                None,
+                f"It is stepped in lockstep, because the vectorised implementation equals {package}"
+                f" {VERIFIED[package]}, but {found.get(package, 'none')} is installed.",
+            )
+    return _if_supported(verified.vector, config)
+
+
+def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False) -> BatchedEnvironment:
+    """Create environments that are stepped together, vectorised if possible. See `stock_stepping`."""
+    chosen = implementation(config)
+    logger.info("%s: %s", config.entry_point, chosen.reason)
+    vector = chosen.vector
+    if vector is None:
+        return stock_stepping(config, num_envs, crashes=crashes, states=states)
+    make: Callable[[int], VectorEnv] = partial(vector, **config.kwargs)
+    return VectorStepping(config, make, num_envs, crashes, states)
+
+
+def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation:
+    make = _imported(entry_point)
+    try:
+        make(1, **config.kwargs)
+    except UnsupportedArguments as error:
+        return Implementation(None, f"It is stepped in lockstep, because of its arguments: {error}.")
+    except TypeError as error:
+        raise ConfigError(f"environment.kwargs: {entry_point} does not accept them: {error}") from error
+    return Implementation(make, f"It is vectorised by {entry_point}.")
+
+
+def _imported(entry_point: str) -> Callable[..., VectorEnv]:
+    module_name, _, name = entry_point.partition(":")
+    try:
+        found: Any = getattr(importlib.import_module(module_name), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"environment.vector: cannot import {entry_point!r}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, VectorEnv)):
+        raise ConfigError(f"environment.vector: {entry_point} is not a subclass of VectorEnv")
+    return found

@@ -1,0 +1,1 @@
+"""Vectorised environments: faster implementations of PettingZoo environments, equal to them bit by bit."""

@@ -1,0 +1,1 @@
+"""Leduc hold'em of RLCard: random generators, deals, rules, and tables of all situations."""

@@ -1,0 +1,87 @@
+"""Base class of vectorised environments: many copies of an environment, stepped by array operations.
+
+A vectorised environment is a faster implementation of a PettingZoo environment, its *stock environment*. With the same
+seeds and actions both report the same, bit for bit.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class AgentRows:
+    """Reports of k agents with the same observation space: what PettingZoo's `last()` returns, in columns.
+
+    Rows are sorted by environment. An agent must act next if its row has neither flag. The arrays belong to the caller:
+    an environment must not change them later.
+
+    Attributes:
+        envs: Environment of each row, (k,) int64.
+        agents: Index of the agent in `possible_agents`, (k,) int64.
+        observations: ONNX input name → (k, …), in the dtypes of the observation space: `observation`, and `action_mask`
+            if the environment has masks.
+        rewards: Sum of the agent's rewards since its previous row, (k,) float64; 0 after a reset.
+        terminations: (k,) bool.
+        truncations: (k,) bool.
+    """
+
+    envs: NDArray[np.int64]
+    agents: NDArray[np.int64]
+    observations: Mapping[str, NDArray[Any]]
+    rewards: NDArray[np.float64]
+    terminations: NDArray[np.bool_]
+    truncations: NDArray[np.bool_]
+
+
+class UnsupportedArguments(Exception):
+    """A vectorised environment does not implement these constructor arguments; the stock environment must be used."""
+
+
+class VectorEnv(ABC):
+    """`num_envs` copies of an environment.
+
+    A copy does not restart on its own: when none of its agents must act, its episode is over, and the caller resets it
+    with the next seed. Reports of a copy depend on its own seed and actions only, not on the other copies of a call.
+
+    The constructor takes `num_envs` and the arguments of the stock environment. It raises UnsupportedArguments for
+    those that it does not implement.
+    """
+
+    possible_agents: tuple[str, ...]
+    num_envs: int
+
+    @abstractmethod
+    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
+        """Start an episode in each of the copies `env_ids`.
+
+        Args:
+            env_ids: Copies, (m,), ascending. Those in the middle of an episode abandon it.
+            seeds: Seeds of the episodes, (m,), from 0 to 2³¹ - 1.
+
+        Returns:
+            The first rows of these copies, in one AgentRows for each observation space, in the order of the agents.
+        """
+
+    @abstractmethod
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        """Step the copies `env_ids`.
+
+        Args:
+            env_ids: Copies, (m,), ascending.
+            actions: One row for each agent that must act in these copies, (k,) or (k, …), sorted by copy, then by
+                agent. The caller has validated them against action spaces and masks.
+
+        Returns:
+            The next rows of these copies, including the last rows of agents that have left. Within a copy, rows are in
+            the order in which the stock environment reports them. See `reset`.
+        """
+
+    def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
+        """Return the global states of some copies, (m, size) float32; None if the stock environment has none."""
+        del env_ids
+        return None

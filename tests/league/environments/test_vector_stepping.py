@@ -1,0 +1,187 @@
+"""A vectorised environment gives the turns of the stock environment in lockstep: rows, order, dtypes, and crashes."""
+
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from league.environment_config import EnvironmentConfig
+from league.environments.implementation import implementation, stepping
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import Batch, BatchedEnvironment, Starts, States, Turn
+from league.environments.vector.vector_env import AgentRows
+from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward
+from league.spaces import ACTION_MASK
+from tests.support.environments import vector_copies
+from tests.support.environments.episodes import episodes
+
+COPIES = vector_copies.__name__
+
+
+def copied(name: str, **kwargs: Any) -> EnvironmentConfig:
+    """A stock environment with VectorCopies of it."""
+    cls = getattr(vector_copies, name)
+    return EnvironmentConfig(entry_point=cls.entry_point, kwargs=kwargs, vector=f"{COPIES}:{name}")
+
+
+ENVIRONMENTS = {
+    "connect four": EnvironmentConfig(entry_point="pettingzoo.classic.connect_four_v3"),
+    "tic-tac-toe": EnvironmentConfig(entry_point="pettingzoo.classic.tictactoe_v3"),
+    "Leduc hold'em": EnvironmentConfig(entry_point="pettingzoo.classic.leduc_holdem_v4"),
+    "rock, paper, scissors": EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2", kwargs={"max_cycles": 4}),
+    "spread": EnvironmentConfig(entry_point="mpe2.simple_spread_v3", kwargs={"max_cycles": 5}),
+    "two kinds of agents": EnvironmentConfig(entry_point="mpe2.simple_adversary_v3", kwargs={"max_cycles": 5}),
+    "joining and leaving": copied("VectorMeeting", arrives=[0, 2, 1, 0], leaves=[4, 5, 2, 3], truncated=[1, 2]),
+    "crashing": copied("VectorMeeting", crashes=list(range(0, 2**31, 2**28)) + list(range(0, 60, 7))),
+    "turns, early deaths": copied("VectorCounting", lives=[1, 4, 2, 4], truncated=[1, 2]),
+}
+
+
+class Player:
+    """Plays a batched environment, with everything the protocol allows, by draws of one generator."""
+
+    def __init__(self, env: BatchedEnvironment, seed: int) -> None:
+        self.env, self.rng = env, np.random.default_rng(seed)
+        self.seeds = iter(range(10_000))
+
+    def next_episodes(self, envs: NDArray) -> Starts:
+        starting = envs[self.rng.random(len(envs)) < 0.9]
+        seeds = np.array([next(self.seeds) for _ in starting], np.int64)
+        return Starts(starting, seeds, self.groups(len(starting)))
+
+    def groups(self, m: int) -> NDArray:
+        """Agents of different spaces are never in one group."""
+        return np.arange(len(self.env.agents)) + len(self.env.agents) * self.rng.integers(3, size=(m, 1))
+
+    def start(self) -> Turn:
+        self.turn = self.env.start(self.next_episodes)
+        return self.turn
+
+    def step(self) -> Turn:
+        playing = np.unique(np.concatenate([np.zeros(0, int), *(batch.envs for batch in self.turn.batches.values())]))
+        abandoned = playing[self.rng.random(len(playing)) < 0.05]
+        actions = {group: self.actions(batch) for group, batch in self.turn.batches.items()}
+        kept = {group: batch.without(abandoned) for group, batch in self.turn.batches.items()}
+        self.env.abandon(abandoned)
+        regrouped = playing[self.rng.random(len(playing)) < 0.2]
+        self.env.assign(regrouped, self.groups(len(regrouped)))
+        self.turn = self.env.step({group: actions[group][rows] for group, rows in kept.items()})
+        return self.turn
+
+    def actions(self, batch: Batch) -> NDArray:
+        mask = batch.observations.get(ACTION_MASK)
+        if mask is None:
+            return self.rng.integers(2, size=len(batch))
+        return (self.rng.random(mask.shape) * mask).argmax(axis=1)
+
+
+def assert_same_rows(found: AgentRows | Batch, expected: AgentRows | Batch) -> None:
+    for field in fields(expected):
+        mine, other = getattr(found, field.name), getattr(expected, field.name)
+        columns = ((mine[name], other[name]) for name in other) if isinstance(other, dict) else [(mine, other)]
+        for own, column in columns:
+            assert own.dtype == column.dtype, field.name
+            assert own.tobytes() == column.tobytes(), field.name
+            assert own.shape == column.shape
+
+
+def assert_same_states(found: States | None, expected: States | None) -> None:
+    assert (found is None) == (expected is None)
+    if found is not None and expected is not None:
+        np.testing.assert_array_equal(found.envs, expected.envs)
+        np.testing.assert_array_equal(found.values, expected.values)
+
+
+def assert_same_turn(found: Turn, expected: Turn) -> None:
+    assert list(found.batches) == list(expected.batches)
+    for group, batch in expected.batches.items():
+        assert_same_rows(found.batches[group], batch)
+    assert len(found.endings) == len(expected.endings)
+    for mine, other in zip(found.endings, expected.endings, strict=True):
+        assert_same_rows(mine, other)
+    np.testing.assert_array_equal(found.finished, expected.finished)
+    np.testing.assert_array_equal(found.crashed, expected.crashed)
+    assert_same_states(found.states, expected.states)
+    assert_same_states(found.last_states, expected.last_states)
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32), num_envs=st.integers(1, 6))
+def test_turns_equal_those_of_lockstep(name: str, seed: int, num_envs: int) -> None:
+    config = ENVIRONMENTS[name]
+    assert implementation(config).vector is not None
+    found = Player(stepping(config, num_envs, crashes=3, states=True), seed)
+    expected = Player(stock_stepping(config, num_envs, crashes=3, states=True), seed)
+    assert_same_turn(found.start(), expected.start())
+    for _ in range(30):
+        assert_same_turn(found.step(), expected.step())
+        if not expected.turn.batches:
+            break
+
+
+def zeros(turn: Turn) -> dict[int, NDArray]:
+    return {group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}
+
+
+def started(config: EnvironmentConfig, seeds: Iterable[int], num_envs: int, **options: Any) -> Any:
+    env = stepping(config, num_envs, **options)
+    return env, env.start(episodes(seeds, range(len(env.agents))))
+
+
+def test_an_environment_that_raises_too_often_is_named() -> None:
+    env, turn = started(copied("VectorMeeting", crashes=[3]), range(5), 5)
+    turn = env.step(zeros(turn))
+    with pytest.raises(RuntimeError, match="simulator is gone"):
+        env.step(zeros(turn))
+    assert env.busy.tolist() == [3]
+
+
+def test_a_fault_of_the_vectorised_environment_alone_is_reported() -> None:
+    env, turn = started(copied("Faulty"), range(50), 4, crashes=3)
+    for _ in range(2):
+        turn = env.step(zeros(turn))
+    with pytest.raises(EnvironmentMismatch, match="the stock environment does not: ArithmeticError: the array is on"):
+        env.step(zeros(turn))
+
+
+def test_a_reward_that_is_not_finite_is_rejected() -> None:
+    env, turn = started(copied("VectorMeeting", bad_reward=float("nan")), [12, 13], 2, crashes=3)
+    with pytest.raises(InvalidReward, match="agent_0 got a reward of nan in the episode with seed 12"):
+        env.step(zeros(turn))
+
+
+def test_an_illegal_action_is_rejected_before_any_step() -> None:
+    env, turn = started(copied("VectorMeeting"), [0, 1], 2)
+    actions = zeros(turn)
+    actions[1][1] = 3
+    with pytest.raises(IllegalAction, match="action 3 of agent_1"):
+        env.step(actions)
+    assert set(env.step(zeros(turn)).batches) == {0, 1}
+
+
+def test_an_environment_is_rendered_by_the_stock_environment() -> None:
+    config = EnvironmentConfig(entry_point="pettingzoo.classic.tictactoe_v3")
+    env, _ = started(config, [0, 1], 2)
+    empty = env.render(1)
+    env.step({0: np.array([0, 4])})
+    boards = [env.render(index) for index in (0, 1)]
+    assert boards[0].shape == empty.shape
+    assert not np.array_equal(boards[0], boards[1])
+    assert not np.array_equal(boards[0], empty)
+
+
+def test_time_is_shared_by_the_environments_of_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a clock that advances by one second at each reading."""
+    clock = iter(np.arange(100.0))
+    env, turn = started(copied("VectorMeeting"), range(3), 4)
+    monkeypatch.setattr("league.environments.vector_stepping.perf_counter", lambda: next(clock))
+    before = env.seconds()
+    env.step(zeros(turn))
+    assert (env.seconds() - before).tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0])
+    assert env.busy.tolist() == []

@@ -1,0 +1,84 @@
+"""Generated calls of a vectorised environment: idle copies, abandoned copies, seeds and actions."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from league.environment_config import EnvironmentConfig
+from league.environments.vector.equality import DifferentialTest
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+
+MAX_COPIES = 4
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Calls for the same copies. abandoned: those of them that start a new episode in the first call."""
+
+    present: list[bool]
+    abandoned: list[bool]
+    calls: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The choices select among the legal actions. Choices and seeds are repeated as often as necessary."""
+
+    num_envs: int
+    phases: list[Phase]
+    choices: bytes
+    seeds: list[int]
+
+
+def copies(probable: bool) -> st.SearchStrategy[list[bool]]:
+    mostly = st.just([probable] * MAX_COPIES)
+    return mostly | st.lists(st.booleans(), min_size=MAX_COPIES, max_size=MAX_COPIES)
+
+
+plans = st.builds(
+    Plan,
+    st.integers(1, MAX_COPIES),
+    st.lists(st.builds(Phase, copies(True), copies(False), st.integers(1, 24)), min_size=1, max_size=8),
+    st.binary(min_size=1, max_size=64),
+    st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=6),
+)
+
+
+def assert_equal(config: EnvironmentConfig, vector: VectorEnv, plan: Plan) -> None:
+    """Play a plan in a vectorised environment with `plan.num_envs` copies and Discrete actions."""
+    test = DifferentialTest(config, vector)
+    ids, choices, seeds = np.arange(plan.num_envs), itertools.cycle(plan.choices), itertools.cycle(plan.seeds)
+    for phase in plan.phases:
+        present, abandoned = (np.array(chosen[: plan.num_envs]) for chosen in (phase.present, phase.abandoned))
+        for call in range(phase.calls):
+            starting = ids[present & (test.is_over | (abandoned & (call == 0)))]
+            test.reset(starting, np.fromiter(seeds, np.int64, len(starting)))
+            test.step(ids[present], chosen_actions(test, ids[present], choices))
+    test.finish()
+    test.close()
+
+
+def last_rows(config: EnvironmentConfig, vector: VectorEnv, actions: list[int], seed: int = 0) -> AgentRows:
+    """Play an episode of one copy, in the stock environment as well, and return its last rows."""
+    test, copy = DifferentialTest(config, vector), np.zeros(1, dtype=np.int64)
+    test.reset(copy, np.array([seed]))
+    for action in actions:
+        assert not test.is_over[0], "the episode is longer"
+        test.step(copy, np.array([action]))
+    assert test.is_over[0], "the episode is over"
+    test.close()
+    (rows,) = test.rows
+    return rows
+
+
+def chosen_actions(test: DifferentialTest, env_ids: NDArray[np.int64], choices: Iterator[int]) -> NDArray[np.int64]:
+    legal = [
+        np.arange(test.action_space(agent).n) if mask is None else np.flatnonzero(mask)
+        for env in env_ids.tolist()
+        for agent, mask in test.legal(env)
+    ]
+    return np.array([actions[next(choices) % len(actions)] for actions in legal], dtype=np.int64)

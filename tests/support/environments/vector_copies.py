@@ -1,0 +1,95 @@
+"""Vectorised environments for tests: loops over copies of small stock environments."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environment_config import EnvironmentConfig
+from league.environments.adapters import Report, adapter_for, splitter
+from league.environments.building import build, observation_space
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.spaces import inputs
+from league.spaces.conversion import from_gymnasium
+
+
+class VectorCopies(VectorEnv):
+    """Copies of `entry_point`."""
+
+    entry_point: str
+
+    def __init__(self, num_envs: int, **kwargs: Any) -> None:
+        config = EnvironmentConfig(entry_point=self.entry_point, kwargs=kwargs)
+        envs = [build(config) for _ in range(num_envs)]
+        self.num_envs, self.possible_agents = num_envs, tuple(envs[0].possible_agents)
+        spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.possible_agents]
+        self._inputs = [inputs(space) for space in spaces]
+        self._copies = [adapter_for(env, [splitter(space) for space in spaces]) for env in envs]
+        self._acting: list[list[int]] = [[] for _ in envs]
+
+    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
+        starting = zip(env_ids.tolist(), seeds.tolist(), strict=True)
+        return self._rows({env: self._copies[env].reset(seed) for env, seed in starting})
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        coming = iter(actions.tolist())
+        reports = {}
+        for env in env_ids.tolist():
+            reports[env] = self._copies[env].step([(agent, next(coming)) for agent in self._acting[env]])
+        assert next(coming, None) is None, "more actions than agents"
+        return self._rows(reports)
+
+    def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
+        states = [self._copies[env].state() for env in env_ids.tolist()]
+        return None if states[0] is None else np.array([np.ravel(state) for state in states], np.float32)
+
+    def _rows(self, reports: dict[int, list[Report]]) -> Sequence[AgentRows]:
+        for env, own in reports.items():
+            self._acting[env] = [report[0] for report in own if not (report[3] or report[4])]
+        every = [(env, report) for env, own in reports.items() for report in own]
+        kinds = {str(kind): kind for kind in self._inputs}
+        return [
+            self._block([(env, report) for env, report in every if str(self._inputs[report[0]]) == kind])
+            for kind in kinds
+        ]
+
+    def _block(self, rows: Iterable[tuple[int, Report]]) -> AgentRows:
+        rows = list(rows)
+        observed = self._inputs[rows[0][1][0]] if rows else {}
+        return AgentRows(
+            np.array([env for env, _ in rows], np.int64),
+            np.array([report[0] for _, report in rows], np.int64),
+            {name: np.array([report[1][name] for _, report in rows], leaf.dtype) for name, leaf in observed.items()},
+            np.array([report[2] for _, report in rows], np.float64),
+            np.array([report[3] for _, report in rows], bool),
+            np.array([report[4] for _, report in rows], bool),
+        )
+
+
+class VectorMeeting(VectorCopies):
+    entry_point = "tests.support.environments.simultaneous:meeting"
+
+
+class VectorCounting(VectorCopies):
+    entry_point = "tests.support.environments.counting:counting"
+
+
+class VectorFuse(VectorCopies):
+    entry_point = "tests.support.environments.fuses:fuse"
+
+
+class VectorSpread(VectorCopies):
+    entry_point = "mpe2.simple_spread_v3"
+
+
+class Faulty(VectorMeeting):
+    """Raises in its third step, which the stock environment does not."""
+
+    _steps = 0
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        self._steps += 1
+        if self._steps == 3:
+            raise ArithmeticError("the array is on fire")
+        return super().step(env_ids, actions)
