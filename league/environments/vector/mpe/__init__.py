@@ -1,0 +1,1 @@
+"""Vectorised environments of MPE2 (multi-particle environments)."""

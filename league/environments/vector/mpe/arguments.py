@@ -1,0 +1,26 @@
+"""Checks of constructor arguments. The stock environment reports those that are wrong."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from league.environments.vector.vector_env import UnsupportedArguments
+
+
+def reject_changed(arguments: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
+    """Raise UnsupportedArguments unless these arguments exist and have their defaults."""
+    for name, value in arguments.items():
+        if name not in defaults or value != defaults[name]:
+            raise UnsupportedArguments(f"{name}={value!r}")
+
+
+def check_counts(least: int, **counts: Any) -> None:
+    """Raise UnsupportedArguments unless these are integers of at least `least`."""
+    for name, value in counts.items():
+        if not isinstance(value, int) or value < least:
+            raise UnsupportedArguments(f"{name}={value!r}")
+
+
+def check_ratio(local_ratio: Any) -> None:
+    """Raise UnsupportedArguments unless this is a number from 0 to 1."""
+    if not isinstance(local_ratio, int | float) or not 0 <= local_ratio <= 1:
+        raise UnsupportedArguments(f"local_ratio={local_ratio!r}")

@@ -1,0 +1,34 @@
+"""Initial states that MPE2 draws: goals, then positions."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environments.vector import pcg64
+
+
+def goals_and_positions(
+    seeds: NDArray[np.int64], goals: int, landmarks: int, entities: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Draw at most two goals, each of them the index of a landmark, and positions in [-1, 1]².
+
+    Returns:
+        Goals (goals, m) and positions (entities, 2, m).
+    """
+    if landmarks == 1:
+        # NumPy draws nothing if there is no choice.
+        return np.zeros((goals, len(seeds)), dtype=np.int64), positions_only(seeds, entities)
+    outputs = pcg64.outputs(seeds, 1 + 2 * entities)
+    halves = np.stack([outputs[0], outputs[0] >> 32])[:goals]
+    chosen, accepted = pcg64.integers(halves, landmarks)
+    positions = pcg64.uniform(outputs[1:], -1.0, 1.0)
+    for i in np.flatnonzero(~accepted.all(axis=0)):
+        # At most one seed in four billion: NumPy draws again.
+        generator = np.random.default_rng(int(seeds[i]))
+        chosen[:, i] = [generator.integers(landmarks) for _ in range(goals)]
+        positions[:, i] = generator.uniform(-1.0, 1.0, 2 * entities)
+    return chosen, positions.reshape(entities, 2, -1)
+
+
+def positions_only(seeds: NDArray[np.int64], entities: int) -> NDArray[np.float64]:
+    """Draw positions in [-1, 1]², (entities, 2, m)."""
+    return pcg64.uniform(pcg64.outputs(seeds, 2 * entities), -1.0, 1.0).reshape(entities, 2, -1)

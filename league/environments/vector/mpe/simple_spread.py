@@ -1,0 +1,73 @@
+"""Vectorised `mpe2.simple_spread_v3`: agents cover landmarks without colliding."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environments.vector.mpe.arguments import check_counts, check_ratio, reject_changed
+from league.environments.vector.mpe.initial_states import positions_only
+from league.environments.vector.mpe.particle_env import ParticleEnv, relative
+from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
+
+SIZE = 0.15
+NOT_IMPLEMENTED = {
+    "render_mode": None,
+    "dynamic_rescaling": True,
+    "benchmark_data": False,
+    "curriculum": False,
+    "terminate_on_success": False,
+    "num_agent_neighbors": None,
+    "num_landmark_neighbors": None,
+}
+
+
+class SimpleSpread(ParticleEnv):
+    """N agents and N landmarks. Agents observe each other's messages, which are always 0."""
+
+    def __init__(
+        self,
+        num_envs: int,
+        N: int = 3,  # noqa: N803
+        local_ratio: float = 0.5,
+        max_cycles: int = 25,
+        continuous_actions: bool = False,
+        **others: Any,
+    ) -> None:
+        reject_changed(others, NOT_IMPLEMENTED)
+        check_counts(1, N=N)
+        check_ratio(local_ratio)
+        self._local_ratio = local_ratio
+        self._pairs = [(a, b) for a in range(N) for b in range(a + 1, N)]
+        world = World(num_agents=N, num_landmarks=N, sizes=[SIZE] * N, accelerations=[5.0] * N)
+        super().__init__(num_envs, [f"agent_{i}" for i in range(N)], world, max_cycles, continuous_actions)
+
+    def draw(self, seeds: NDArray[np.int64]) -> Particles:
+        """See ParticleEnv."""
+        return at_rest(self.world, positions_only(seeds, self.world.num_entities))
+
+    def observation(self, particles: Particles, agent: int) -> Sequence[NDArray[Any]]:
+        """See ParticleEnv."""
+        positions, others = particles.positions, self.others[agent]
+        return (
+            particles.velocities[agent],
+            positions[agent],
+            relative(positions, agent, self.landmarks),
+            relative(positions, agent, others),
+            np.zeros((2 * len(others), positions.shape[-1]), dtype=np.float32),
+        )
+
+    def rewards(self, particles: Particles) -> NDArray[np.float64]:
+        """Mix the common reward for covered landmarks with each agent's own for collisions."""
+        agents, landmarks = particles.positions[: self.world.num_agents], particles.positions[self.landmarks]
+        n = agents.shape[-1]
+        coverage = np.zeros(n)
+        for distances in lengths(agents[:, np.newaxis] - landmarks).min(axis=0):
+            coverage -= distances
+        collisions = np.zeros((len(agents), n))
+        for a, b in self._pairs:
+            hits = lengths(agents[a] - agents[b]) < SIZE + SIZE
+            collisions[a] -= hits
+            collisions[b] -= hits
+        return coverage * (1 - self._local_ratio) + collisions * self._local_ratio
