@@ -79,13 +79,13 @@ class ParticleEnv(VectorEnv):
             return np.stack([axis.take(moves) for axis in MOVES], axis=1)
         # The league accepts actions that exceed the bounds by a rounding error.
         actions = np.clip(actions, 0, 1)
-        # The sum, as in stock, turns -0.0 into 0.0.
-        return 0.0 + (actions[:, 2::2] - actions[:, 1::2])[:, :2].astype(np.float64)
+        return (actions[:, [2, 4]] - actions[:, [1, 3]]).astype(np.float64)
 
     def _messages(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return what the agents say, (agents, symbols, n)."""
         if not self._continuous:
             return (actions // 5)[:, np.newaxis] == np.arange(self.world.num_symbols)[:, np.newaxis]
+        # The sum, as in stock, turns -0.0 into 0.0.
         return 0.0 + np.clip(actions[:, 5:], 0, 1)
 
     def _rows(
@@ -100,7 +100,7 @@ class ParticleEnv(VectorEnv):
                 envs=env_ids.repeat(len(agents)),
                 agents=np.tile(np.array(agents), len(env_ids)),
                 observations={OBSERVATION: self._observations(particles, agents).reshape(-1, size)},
-                # The sum, as in stock, turns -0.0 into 0.0.
+                # As above.
                 rewards=(0.0 + rewards[agents].T).ravel(),
                 terminations=np.zeros(len(agents) * len(env_ids), dtype=bool),
                 truncations=truncations.repeat(len(agents)),
