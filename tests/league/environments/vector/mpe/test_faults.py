@@ -43,7 +43,7 @@ PARTICLES = [
     Fault("particles", "-(distances - self._contacts) /", "-(distances + self._contacts) /"),
     Fault("particles", "-(distances - self._contacts) / CONTACT_MARGIN", "(self._contacts - distances) * 1e3"),
     Fault("particles", "UNDERFLOW = -746.0", "UNDERFLOW = -20.0"),
-    Fault("particles", "np.logaddexp(0, exponents[near])", "np.log1p(np.exp(exponents[near]))"),
+    Fault("particles", "np.logaddexp(0, exponents[near])", "np.maximum(0, exponents[near])"),
     Fault("particles", "forces[a] += repulsion", "forces[a] -= repulsion"),
     Fault("particles", "if b < len(forces):", "if False:"),
     Fault(
@@ -57,7 +57,7 @@ PARTICLES = [
         "reversed(list(zip(self._pairs, repulsions)))",
         "simple_tag",
     ),
-    Fault("particles", "forces *= TIME_STEP", "velocities += forces * TIME_STEP; return"),
+    Fault("particles", "forces *= TIME_STEP", "velocities += forces * TIME_STEP; return", "simple_tag"),
     Fault("particles", "if a < world.num_agents]", "if b < world.num_agents]", "simple_tag"),
     Fault("particles", "* self._max_speeds[agents]", "* self._max_speeds[0]", "simple_tag"),
     Fault("particles", "array[..., envs] = new", "array[..., : new.shape[-1]] = new"),
@@ -112,7 +112,12 @@ ADVERSARY = [
     Fault("simple_adversary", "-distances[1:].min", "-distances.min", "simple_adversary"),
     Fault("simple_adversary", "[-distances[0], *", "[distances[0], *", "simple_adversary"),
     Fault("simple_adversary", "entities if agent == 0", "entities if agent == 1", "simple_adversary"),
-    Fault("simple_adversary", "seeds, 1, self", "seeds, 1, 1 + self", "simple_adversary"),
+    Fault(
+        "simple_adversary",
+        "draw(self, seeds: NDArray[np.int64]) -> Particles:",
+        "draw(self, seeds: NDArray[np.int64]) -> Particles:\n        seeds = seeds + 1",
+        "simple_adversary",
+    ),
 ]
 TAG = [
     Fault("simple_tag", "obstacles, -0.9, 0.9", "obstacles, -1.0, 1.0", "simple_tag"),
@@ -120,8 +125,8 @@ TAG = [
     Fault("simple_tag", "others[others >= self._adversaries]", "others[others < self._adversaries]", "simple_tag"),
     Fault("simple_tag", "distances < 0.9", "distances <= 0.95", "simple_tag"),
     Fault("simple_tag", "np.exp(2 * distances[outside] - 2)", "np.exp(distances[outside] - 1) ** 2", "simple_tag"),
-    Fault("simple_tag", "- horizontal - vertical", "- (horizontal + vertical)", "simple_tag"),
-    Fault("simple_tag", "contacts.sum(axis=1)", "contacts.any(axis=1)", "simple_tag"),
+    Fault("simple_tag", "- horizontal - vertical", "- horizontal + vertical", "simple_tag"),
+    Fault("simple_tag", "contacts.sum(axis=1)", "contacts.any(axis=1)", "simple_tag", {"num_adversaries": 8}),
     Fault("simple_tag", "caught.sum(axis=0)", "caught.max(axis=0)", "simple_tag", {"num_good": 3}),
 ]
 REFERENCE = [
