@@ -1,4 +1,4 @@
-"""The differential test finds faults that are injected into the vectorised environments, one at a time."""
+"""Mutants of the vectorised MPE environments: the differential test finds each."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -7,9 +7,16 @@ import pytest
 
 from league.environment_config import EnvironmentConfig
 from league.environments.vector.equality import compare
-from tests.support.environments.faults import with_fault
+from tests.support.environments.mutants import Mutation, mutated
 
-VECTOR = "league.environments.vector"
+PACKAGE = "league.environments.vector.mpe"
+MODULES = {
+    "pcg64": "league.environments.vector.pcg64",
+    "particles": f"{PACKAGE}.particles",
+    "initial_states": f"{PACKAGE}.initial_states",
+    "particle_env": f"{PACKAGE}.particle_env",
+}
+"""Each imports only earlier ones of them."""
 CLASSES = {
     "simple_spread": "SimpleSpread",
     "simple_adversary": "SimpleAdversary",
@@ -144,10 +151,10 @@ def name(fault: Fault) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [*PARTICLES, *PARTICLE_ENV, *DRAWS, *SPREAD, *ADVERSARY, *TAG, *REFERENCE], ids=name)
-def test_faults_are_found(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = f"{VECTOR}.mpe"
-    module = f"{VECTOR}.pcg64" if fault.module == "pcg64" else f"{package}.{fault.module}"
-    wanted = with_fault(monkeypatch, module, fault.old, fault.new, f"{package}.{fault.environment}", package)
-    vector = getattr(wanted, CLASSES[fault.environment])(16, **fault.kwargs)
-    config = EnvironmentConfig(entry_point=f"mpe2.{fault.environment}_v3", kwargs=fault.kwargs)
-    assert compare(config, vector, steps=8000, seed=0).difference is not None
+def test_each_mutant_is_found(fault: Fault) -> None:
+    wanted = f"{PACKAGE}.{fault.environment}"
+    mutation = Mutation(MODULES.get(fault.module, wanted), fault.old, fault.new)
+    with mutated(mutation, [*MODULES.values(), wanted]) as module:
+        vector = getattr(module, CLASSES[fault.environment])(16, **fault.kwargs)
+        config = EnvironmentConfig(entry_point=f"mpe2.{fault.environment}_v3", kwargs=fault.kwargs)
+        assert compare(config, vector, steps=8000, seed=0).difference is not None
