@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from league.environment_config import EnvironmentConfig
 from league.environments.vector.equality import DifferentialTest
 from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.spaces import Box, Discrete, Space
 
 MAX_COPIES = 4
 
@@ -26,7 +27,10 @@ class Phase:
 
 @dataclass(frozen=True)
 class Plan:
-    """The choices select among the legal actions. Choices and seeds are repeated as often as necessary."""
+    """The choices select among the legal actions, or between the bounds of a Box.
+
+    Choices and seeds are repeated as often as necessary.
+    """
 
     num_envs: int
     phases: list[Phase]
@@ -49,7 +53,7 @@ plans = st.builds(
 
 
 def assert_equal(config: EnvironmentConfig, vector: VectorEnv, plan: Plan) -> None:
-    """Play a plan in a vectorised environment with `plan.num_envs` copies and Discrete actions."""
+    """Play a plan in a vectorised environment with `plan.num_envs` copies and Discrete or Box actions."""
     test = DifferentialTest(config, vector)
     ids, choices, seeds = np.arange(plan.num_envs), itertools.cycle(plan.choices), itertools.cycle(plan.seeds)
     for phase in plan.phases:
@@ -75,10 +79,21 @@ def last_rows(config: EnvironmentConfig, vector: VectorEnv, actions: list[int], 
     return rows
 
 
-def chosen_actions(test: DifferentialTest, env_ids: NDArray[np.int64], choices: Iterator[int]) -> NDArray[np.int64]:
-    legal = [
-        np.arange(test.action_space(agent).n) if mask is None else np.flatnonzero(mask)
-        for env in env_ids.tolist()
-        for agent, mask in test.legal(env)
-    ]
-    return np.array([actions[next(choices) % len(actions)] for actions in legal], dtype=np.int64)
+def chosen_actions(test: DifferentialTest, env_ids: NDArray[np.int64], choices: Iterator[int]) -> NDArray:
+    return np.array(
+        [
+            chosen_action(test.action_space(agent), mask, choices)
+            for env in env_ids.tolist()
+            for agent, mask in test.legal(env)
+        ]
+    )
+
+
+def chosen_action(space: Space, mask: NDArray | None, choices: Iterator[int]) -> int | NDArray:
+    if isinstance(space, Box):
+        shares = np.fromiter(choices, np.uint8, int(np.prod(space.shape))) / 255
+        low, high = np.array(space.low), np.array(space.high)
+        return (low + (high - low) * shares.reshape(space.shape)).astype(space.dtype)
+    assert isinstance(space, Discrete)
+    legal = range(space.n) if mask is None else np.flatnonzero(mask)
+    return int(legal[next(choices) % len(legal)])
