@@ -1,12 +1,14 @@
-"""Atomic and durable file writes, and translation of their errors."""
+"""Atomic and durable file writes, digests of files, and translation of disk errors."""
 
 import errno
+import hashlib
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from league.errors import StorageError
+from league.errors import ArtifactCorrupt, StorageError
 
 DISK_FULL_OR_READ_ONLY = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -61,3 +63,55 @@ def flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def files_in(directory: Path) -> list[str]:
+    """Return the relative paths of all files in `directory`, sorted. A symbolic link counts as a file."""
+    found = [path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir()]
+    return sorted(path.relative_to(directory).as_posix() for path in found)
+
+
+def digests_of(directory: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return relative path → SHA-256 of some files in `directory`."""
+    return {name: file_sha256(directory / name) for name in names}
+
+
+def copy_verified(source: Path, digests: Mapping[str, str], target: Path, name: str) -> None:
+    """Copy the files in `digests` from `source` to the new directory `target`, and verify the copies.
+
+    Only this account can access `target`. A later change of `source`, which others may be able to write to, has no
+    influence.
+
+    Args:
+        source: Directory of the files.
+        digests: Relative path → expected SHA-256.
+        target: Directory of the copies.
+        name: Name of `source` in errors.
+
+    Raises:
+        ArtifactCorrupt: A file is missing, not a regular file, or was changed.
+    """
+    with disk_errors(target):
+        target.mkdir(mode=0o700)
+    for path, digest in digests.items():
+        copied = target / path
+        with disk_errors(copied):
+            copied.parent.mkdir(parents=True, exist_ok=True)
+            is_file = (source / path).is_file()
+            if is_file:
+                shutil.copyfile(source / path, copied)
+            check_digest(f"{name}/{path}", digest, file_sha256(copied) if is_file else None)
+
+
+def check_digest(name: str, expected: str, found: str | None) -> None:
+    """Raise ArtifactCorrupt, which names the file, unless its digest is the expected one. found: None if missing."""
+    if found is None:
+        raise ArtifactCorrupt(f"{name} is missing or not a regular file")
+    if found != expected:
+        raise ArtifactCorrupt(f"{name} was changed: its SHA-256 is {found[:12]}…, expected {expected[:12]}…")

@@ -6,6 +6,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from hypothesis import strategies as st
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.servers import postgresql
 from tests.support.servers.two_databases import is_available, outline, replicas_of_both
+
+EXAMPLES = 25
+"""Of an operation at a time."""
 
 
 def databases(requests: int) -> bool:
@@ -42,9 +46,11 @@ def databases(requests: int) -> bool:
             if not is_available(*one[:2]):
                 failed.append(f"{call}: {one[:2]}")
 
-        for number, operation in enumerate(OPERATIONS):
-            examples = requests // len(OPERATIONS) + (number < requests % len(OPERATIONS))
-            _generate(partial(send, operation=operation), examples, number)
+        for turn in count():
+            for number, operation in enumerate(OPERATIONS):
+                _generate(partial(send, operation=operation), EXAMPLES, turn * len(OPERATIONS) + number)
+            if sum(statuses.values()) >= requests:
+                break
     for line in (*different[:20], *failed[:20]):
         print(f"    {line}")
     sent = ", ".join(f"{count:,} × {status}" for status, count in sorted(statuses.items()))

@@ -6,9 +6,8 @@ from pathlib import Path, PurePosixPath
 
 from pydantic import TypeAdapter, ValidationError
 
-from league import digests
 from league.errors import ArtifactCorrupt
-from league.files import disk_errors
+from league.files import copy_verified, digests_of, disk_errors, files_in
 
 DIGESTS_FILE = "digests.json"
 """In a checkpoint: relative path → SHA-256 of every other file."""
@@ -16,7 +15,7 @@ DIGESTS_FILE = "digests.json"
 
 def write_digests(checkpoint: Path) -> None:
     """Record the digests of all files of a new checkpoint."""
-    found = digests.of_files(checkpoint, digests.files(checkpoint))
+    found = digests_of(checkpoint, files_in(checkpoint))
     (checkpoint / DIGESTS_FILE).write_text(json.dumps(found, indent=2))
 
 
@@ -36,5 +35,5 @@ def private_copy(checkpoint: Path, target: Path) -> Path:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise ArtifactCorrupt(f"{path}: {name!r}: expected a path inside the checkpoint")
     shutil.rmtree(target, ignore_errors=True)
-    digests.copy_verified(checkpoint, recorded, target, str(checkpoint))
+    copy_verified(checkpoint, recorded, target, str(checkpoint))
     return target

@@ -9,9 +9,17 @@ import shutil
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
-from league.digests import check_digest, copy_verified, file_sha256, files, of_files
 from league.errors import ArtifactCorrupt
-from league.files import disk_errors, flush, move_durably
+from league.files import (
+    check_digest,
+    copy_verified,
+    digests_of,
+    disk_errors,
+    file_sha256,
+    files_in,
+    flush,
+    move_durably,
+)
 from league.registry.storage.manifest import MANIFEST, TRAINING, Manifest
 
 STAGING = ".publishing-"
@@ -54,7 +62,7 @@ class ArtifactStore:
         staging = self._staging(manifest.league, manifest.version)
         target = self.path(manifest.league, manifest.version)
         with disk_errors(target):
-            digests = of_files(staging, (name for name in files(staging) if name != MANIFEST))
+            digests = digests_of(staging, (name for name in files_in(staging) if name != MANIFEST))
             text = manifest.model_copy(update={"files": digests}).to_json()
             (staging / MANIFEST).write_text(text, encoding="utf-8")
             move_durably(staging, target)
@@ -110,7 +118,7 @@ class ArtifactStore:
         """
         directory, manifest = self.path(league, number), self.manifest(league, number, sha256)
         with disk_errors(directory):
-            present = set(files(directory)) - {MANIFEST}
+            present = set(files_in(directory)) - {MANIFEST}
         for name in sorted(present - set(manifest.files)):
             raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
         for name in sorted(self._expected(manifest) - present):
