@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import OrderedDict
 from collections.abc import Iterable
 from functools import lru_cache
@@ -35,6 +36,8 @@ class MatchWorker:
         self._registry = registry
         self._environment: BatchedEnvironment | None = None
         self._contestants: OrderedDict[str, dict[str, tuple[str, Policy]]] = OrderedDict()
+        # Games create many objects. Without freezing, each collection would traverse everything that is loaded.
+        gc.freeze()
 
     def play(self, schedule: Schedule, positions: Iterable[int], *, expendable: bool = False) -> list[Match]:
         """Play the matches at `positions`, in that order.

@@ -81,16 +81,18 @@ def rllib_runner(make: Any, agents: list[str], **env_runners: Any) -> MultiAgent
 
 def test_1_truncated_agents_are_not_terminated_and_are_bootstrapped() -> None:
     runner = our_runner(spread())
-    chunks = [chunk for chunk in runner.sample(num_episodes=4) if chunk.is_done]
-    assert len(chunks) == 12
-    assert all(chunk.is_truncated and not chunk.is_terminated for chunk in chunks)
+    (chunks,) = runner.sample_chunks(num_episodes=4)
+    ended = np.flatnonzero(chunks.truncated)
+    assert len(ended) == 12
+    assert not chunks.terminated.any()
     module = runner.config.get_multi_rl_module_spec(spaces=runner.get_spaces()).build()["shared"]
-    last = chunks[0]
-    target = float(train_batch(module, [last], gamma=0.5, lambda_=1.0).targets[-1])
-    final = torch.from_numpy(last.observations.data["observation"][-1:].copy())
+    last = int(chunks.lengths[: ended[0] + 1].sum()) - 1
+    target = float(train_batch(module, [chunks], gamma=0.5, lambda_=1.0).targets[last])
+    # Each chunk has one observation more than steps.
+    final = torch.from_numpy(chunks.observations["observation"][[last + ended[0] + 1]])
     value = float(module.compute_values({"obs": {"observation": final}}).detach())
     assert value != 0
-    assert target == pytest.approx(last.rewards.data[-1] + 0.5 * value, rel=1e-4)
+    assert target == pytest.approx(chunks.rewards[last] + 0.5 * value, rel=1e-4)
 
     # UPSTREAM env/multi_agent_episode.py, "Case 2": the bootstrap is 0.
     env = simple_spread_v3.parallel_env(max_cycles=CYCLES)
@@ -175,15 +177,14 @@ def test_5_each_step_is_learned_from_once_per_epoch() -> None:
     few, many, epochs = 10, 150, 3
     league = meeting(leaves=[few, many])
     runner = our_runner(league.with_training(num_envs=1))
-    chunks = [chunk for chunk in runner.sample(num_episodes=1) if chunk.is_done]
     batches = {
-        policy: train_batch(
-            runner.config.get_multi_rl_module_spec(spaces=runner.get_spaces()).build()[policy],
-            [chunk for chunk in chunks if chunk.module_id == policy],
+        chunks.policy: train_batch(
+            runner.config.get_multi_rl_module_spec(spaces=runner.get_spaces()).build()[chunks.policy],
+            [chunks],
             gamma=0.9,
             lambda_=0.9,
         )
-        for policy in ("policy_0", "policy_1")
+        for chunks in runner.sample_chunks(num_episodes=1)
     }
     seen: Counter[str] = Counter()
     for minibatch in minibatches(batches, size=20, epochs=epochs):

@@ -31,7 +31,7 @@ from league.spaces.conversion import to_gymnasium
 from tests.support.environments.cases import CASES, Case
 from tests.support.environments.simultaneous import Simultaneous
 from tests.support.leagues import registries
-from tests.support.leagues.training_leagues import solvable, tictactoe
+from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from tests.support.policies.graphs import masked_mlp
 from training.algorithms.ppo import algorithm_config
 from training.sampling.env_runner import LockstepEnvRunner
@@ -277,7 +277,7 @@ def test_a_fault_at_setup_names_the_league_once() -> None:
 def test_environments_are_closed_and_rebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
     monkeypatch.setattr(lockstep.Lockstep, "close", lambda self: closed.append(self))
-    runner = runner_of(tictactoe())
+    runner = runner_of(counting([3, 3], []))
     first = runner.env
     runner.sample(num_timesteps=10)
     runner.make_env()
