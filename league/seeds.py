@@ -1,6 +1,7 @@
 """Derives seeds and random generators from a recorded seed and a path."""
 
 import zlib
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,6 +20,8 @@ def generator(seed: int, *path: int | str) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(_sequence(seed, path)))
 
 
+# The games of a block share their openings.
+@lru_cache(maxsize=4096)
 def _sequence(seed: int, path: tuple[int | str, ...]) -> np.random.SeedSequence:
     key = tuple(zlib.crc32(part.encode()) if isinstance(part, str) else part for part in path)
     return np.random.SeedSequence(seed, spawn_key=key)
