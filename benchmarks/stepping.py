@@ -1,5 +1,5 @@
-"""Stepping without a network: our lockstep environments compared with the unmodified ones, all with random legal
-actions.
+"""Stepping without a network, through the protocol of training and matches, compared with the unmodified environments,
+all with random legal actions.
 
 The unmodified environment is PettingZoo's `env()` or `parallel_env()`, in PettingZoo's loop; its resets have no seed,
 which saves some work, while each of ours has one. For pistonball it is SuperSuit's stack on the raw parallel
@@ -16,19 +16,22 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 import numpy as np
 import supersuit
-from mpe2 import simple_spread_v3
+from mpe2 import simple_adversary_v3, simple_spread_v3, simple_tag_v3
 from pettingzoo.butterfly.pistonball import pistonball
-from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
+from pettingzoo.classic import connect_four_v3, leduc_holdem_v4, tictactoe_v3
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
 from league.environment_config import EnvironmentConfig
+from league.environments.building import build, observation_space
 from league.environments.implementation import stepping
 from league.environments.stepping import Batch, Indices, Starts
 from league.spaces import ACTION_MASK
@@ -72,7 +75,7 @@ def main() -> int:
 
 def measure(case: Case, rounds: int, seconds: float) -> tuple[float, float]:
     """Steps per second of our and of the unmodified environment."""
-    ours, stock = lockstep(case.config, case.num_envs), case.stock()
+    ours, stock = batched(case.config, case.num_envs), case.stock()
     rates: tuple[list[float], list[float]] = ([], [])
     for _ in range(rounds + 1):
         for found, steps, each in zip(rates, (ours, stock), (case.num_envs, 1), strict=True):
@@ -89,18 +92,25 @@ def rate(steps: Iterator[None], seconds: float) -> float:
     return taken / elapsed
 
 
-def lockstep(config: EnvironmentConfig, num_envs: int) -> Iterator[None]:
+def batched(config: EnvironmentConfig, num_envs: int) -> Iterator[None]:
     """All environments, one step in each at a time."""
-    env, rng = stepping(config, num_envs), np.random.default_rng(0)
+    env, rng, groups = stepping(config, num_envs), np.random.default_rng(0), groups_of(config)
 
     def next_episodes(envs: Indices) -> Starts:
-        return Starts(envs, rng.integers(2**31, size=len(envs)), np.zeros((len(envs), len(env.agents)), np.int64))
+        return Starts(envs, rng.integers(2**31, size=len(envs)), np.tile(groups, (len(envs), 1)))
 
     turn = env.start(next_episodes)
     space = DRAWS[config.entry_point]
     while True:
         turn = env.step({group: space(batch, rng) for group, batch in turn.batches.items()})
         yield
+
+
+def groups_of(config: EnvironmentConfig) -> list[int]:
+    """A group for each kind of observation."""
+    with closing(build(config)) as env:
+        spaces = [observation_space(env, agent) for agent in env.possible_agents]
+    return [spaces.index(space) for space in spaces]
 
 
 def masked(batch: Batch, rng: np.random.Generator) -> Any:
@@ -141,31 +151,48 @@ def stock_pistonball() -> Iterator[None]:
     return parallel_loop(env, lambda: rng.uniform(-1, 1, 1).astype(np.float32))
 
 
+def five(batch: Batch, rng: np.random.Generator) -> Any:
+    """One of MPE's actions for each row."""
+    return rng.integers(5, size=len(batch))
+
+
 DRAWS: dict[str, Callable[[Batch, np.random.Generator], Any]] = {
-    "mpe2.simple_spread_v3": lambda batch, rng: rng.integers(5, size=len(batch)),
+    "mpe2.simple_spread_v3": five,
+    "mpe2.simple_adversary_v3": five,
+    "mpe2.simple_tag_v3": five,
     "pettingzoo.classic.connect_four_v3": masked,
+    "pettingzoo.classic.tictactoe_v3": masked,
     "pettingzoo.classic.leduc_holdem_v4": masked,
     "pettingzoo.butterfly.pistonball_v6": lambda batch, rng: rng.uniform(-1, 1, (len(batch), 1)).astype(np.float32),
 }
+VECTOR_ENVS = 1024
+"""Copies of a vectorised environment."""
+
+
+def classic(name: str, module: Any, target: float) -> Case:
+    """A game of PettingZoo with masks."""
+    config = EnvironmentConfig(entry_point=f"pettingzoo.classic.{name}")
+    return Case(config, VECTOR_ENVS, lambda: aec_loop(module.env()), target)
+
+
+def mpe(name: str, module: Any, target: float) -> Case:
+    """An environment of MPE with discrete actions."""
+    stock = partial(random.randrange, 5)
+    return Case(
+        EnvironmentConfig(entry_point=f"mpe2.{name}"),
+        VECTOR_ENVS,
+        lambda: parallel_loop(module.parallel_env(), stock),
+        target,
+    )
+
+
 CASES = {
-    "simple_spread": Case(
-        EnvironmentConfig(entry_point="mpe2.simple_spread_v3"),
-        32,
-        lambda: parallel_loop(simple_spread_v3.parallel_env(), lambda: random.randrange(5)),
-        1.2,
-    ),
-    "connect_four": Case(
-        EnvironmentConfig(entry_point="pettingzoo.classic.connect_four_v3"),
-        32,
-        lambda: aec_loop(connect_four_v3.env()),
-        1.5,
-    ),
-    "leduc_holdem": Case(
-        EnvironmentConfig(entry_point="pettingzoo.classic.leduc_holdem_v4"),
-        32,
-        lambda: aec_loop(leduc_holdem_v4.env()),
-        1.2,
-    ),
+    "connect_four": classic("connect_four_v3", connect_four_v3, 100),
+    "tictactoe": classic("tictactoe_v3", tictactoe_v3, 100),
+    "leduc_holdem": classic("leduc_holdem_v4", leduc_holdem_v4, 20),
+    "simple_spread": mpe("simple_spread_v3", simple_spread_v3, 100),
+    "simple_adversary": mpe("simple_adversary_v3", simple_adversary_v3, 80),
+    "simple_tag": mpe("simple_tag_v3", simple_tag_v3, 80),
     "pistonball with its wrappers": Case(
         EnvironmentConfig.model_validate(
             {"entry_point": "pettingzoo.butterfly.pistonball_v6", "kwargs": RENDERED, "wrappers": STACK}
