@@ -33,9 +33,17 @@ def policy(registry: Registry, league: str) -> LoadedPolicy:
 
 
 def leaves(dtype: str, rows: int) -> st.SearchStrategy[np.ndarray]:
-    """Arrays without NaN and infinity, which requests may contain."""
-    finite = {"allow_nan": False, "allow_infinity": False} if np.dtype(dtype).kind == "f" else {}
-    return arrays.arrays(np.dtype(dtype), (rows, 2, 3), elements=arrays.from_dtype(np.dtype(dtype), **finite))
+    """Arrays of any bytes, without NaN and infinity: requests may contain neither."""
+    shape, kind = (rows, 2, 3), np.dtype(dtype)
+    size = int(np.prod(shape)) * kind.itemsize
+
+    def array(content: bytes) -> np.ndarray:
+        if kind.kind == "b":
+            return (np.frombuffer(content, np.uint8) & 1).astype(bool).reshape(shape)
+        values = np.frombuffer(content, kind).reshape(shape)
+        return np.where(np.isfinite(values), values, kind.type(0)) if kind.kind == "f" else values
+
+    return st.binary(min_size=size, max_size=size).map(array)
 
 
 @st.composite

@@ -10,6 +10,7 @@ from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
 from league.settings import Storage
 from serve_app.runtime import launch
 from serve_app.runtime.launch import DEPLOY_YAML, running
+from tests.support.waiting import until
 
 
 @pytest.mark.parametrize("which", ["port", "grpc_port"])
@@ -62,6 +63,8 @@ def test_a_password_is_in_no_command_line(tmp_path: Path) -> None:
     class Recorded(launch.Subprocess):
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
+            # The command line is set shortly after the constructor returns.
+            until(Path(f"/proc/{self.pid}/cmdline").read_text)
             commands.append(Path(f"/proc/{self.pid}/cmdline").read_text())
 
     with pytest.MonkeyPatch.context() as patch:

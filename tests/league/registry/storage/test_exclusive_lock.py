@@ -36,7 +36,9 @@ def champion(registry: Registry) -> int | None:
 def terminate_holder(registry: Registry) -> None:
     with registry.database.write() as session:
         database = "database = (SELECT oid FROM pg_database WHERE datname = current_database())"
-        ended = session.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({HOLDERS} AND {database}) AS holders"))
+        # With a timeout, it returns after the process has ended and released its locks.
+        end = f"SELECT pg_terminate_backend(pid, 60000) FROM ({HOLDERS} AND {database}) AS holders"
+        ended = session.execute(text(end))
         assert len(ended.all()) == 1
 
 
