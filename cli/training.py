@@ -67,6 +67,13 @@ def check_env(
                 f" {min(found.lengths)} to {max(found.lengths)} steps, {found.steps_per_second:,.0f} steps per second"
             )
             say(found.implementation)
+        if (vectorised := found.vectorised) is not None:
+            ratio = vectorised.steps_per_second / vectorised.stock_steps_per_second
+            say(
+                f"The vectorised and the stock environment reported the same in {vectorised.steps:,} steps. Steps per"
+                f" second: {vectorised.steps_per_second:,.0f} with {vectorised.copies:,} copies, stock"
+                f" {vectorised.stock_steps_per_second:,.0f} ({ratio:.0f}×)."
+            )
         if found.findings:
             table(("severity", "finding"), ((finding.severity, str(finding)) for finding in found.findings))
         if found.passed:

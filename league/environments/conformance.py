@@ -20,9 +20,12 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.test import api_test, parallel_api_test
 
 from league.config import LeagueConfig
+from league.environment_config import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import action_space, build, describe, observation_space
 from league.environments.implementation import implementation
+from league.environments.vector.equality import compare
+from league.environments.vector.measurement import steps_per_second
 from league.errors import IllegalMask, LeagueError, one_line
 from league.interface import Interface
 from league.seeds import derive
@@ -59,6 +62,11 @@ ENOUGH_TURNS = 20
 CYCLES = 50
 """Number of cycles of PettingZoo's API tests."""
 
+COMPARED_COPIES, COMPARED_STEPS = 32, 20_000
+"""Size of the comparison of a vectorised environment with its stock environment."""
+MEASURED_COPIES, MEASURED_SECONDS = 1024, 1.0
+"""Copies and duration of the measurement of its speed."""
+
 Severity = Literal["fault", "note"]
 Trace = list[tuple[int, bytes, float, bool, bool]]
 """All reports of an episode, in order."""
@@ -79,6 +87,23 @@ class Finding:
         return f"{first}{f' and {len(others)} more' if others else ''}: {self.text}"
 
 
+@dataclass(frozen=True, slots=True)
+class Vectorised:
+    """A vectorised environment that reported the same as its stock environment.
+
+    Attributes:
+        steps: Environment steps that were compared.
+        copies: Number of copies in the measurement of its speed.
+        steps_per_second: Environment steps per second of all copies.
+        stock_steps_per_second: The same of the stock environment.
+    """
+
+    steps: int
+    copies: int
+    steps_per_second: float
+    stock_steps_per_second: float
+
+
 @dataclass(slots=True)
 class Examination:
     """Distinct findings, the lengths of the episodes and the speed."""
@@ -92,6 +117,8 @@ class Examination:
     """Size of the global state; None without one."""
     implementation: str = ""
     """How copies of the environment are stepped, and why."""
+    vectorised: Vectorised | None = None
+    """Comparison with the vectorised environment, if there is one."""
 
     @property
     def passed(self) -> bool:
@@ -140,7 +167,27 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int = 2000, seed: in
         env.close()
     if found.passed:
         _run_pettingzoo_tests(build(config.environment), found)
+    if found.passed:
+        _compare_vectorised(config.environment, interface, found, seed)
     return found
+
+
+def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: Examination, seed: int) -> None:
+    """Compare the vectorised environment, if there is one, with the stock one."""
+    vector = implementation(config).vector
+    if vector is None:
+        return
+    try:
+        comparison = compare(config, vector(COMPARED_COPIES, **config.kwargs), COMPARED_STEPS, seed)
+        if comparison.difference is not None:
+            found.add("fault", f"the vectorised environment differs: {comparison.difference}")
+            return
+        actions = [spaces.action for spaces in interface.agents.values()]
+        rate = steps_per_second(vector(MEASURED_COPIES, **config.kwargs), actions, seed, MEASURED_SECONDS)
+    except Exception as error:
+        found.add("fault", f"the vectorised environment raised an exception: {one_line(error, with_type=True)}")
+        return
+    found.vectorised = Vectorised(comparison.steps, MEASURED_COPIES, rate, comparison.stock_rate)
 
 
 def _play(

@@ -1,13 +1,27 @@
+import re
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from numpy.typing import NDArray
 
+from examples.kuhn_poker_vector import KuhnPokerVector
 from league.config import LeagueConfig
+from league.environments import conformance
 from league.environments.conformance import Examination, examine
+from league.environments.vector.vector_env import AgentRows
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
+
+
+@pytest.fixture(autouse=True)
+def short_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conformance, "COMPARED_STEPS", 500)
+    monkeypatch.setattr(conformance, "MEASURED_SECONDS", 0.01)
+
 
 HERE = "tests.league.environments"
 SUPPORT = "tests.support.environments"
@@ -194,3 +208,43 @@ def test_a_global_state_is_a_vector_of_fixed_size(kind: str, severity: str, expe
 def test_the_size_of_the_global_state_is_reported() -> None:
     assert examine(league(f"{HERE}.test_conformance:stateful", kind="sound")).state_size == 6
     assert examine(league("pettingzoo.classic.rps_v2")).state_size is None
+
+
+class WrongKuhnPoker(KuhnPokerVector):
+    """Pays the loser."""
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        return [replace(rows, rewards=-rows.rewards) for rows in super().step(env_ids, actions)]
+
+
+class BrokenKuhnPoker(KuhnPokerVector):
+    """Raises at each step."""
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        raise ZeroDivisionError("no cards")
+
+
+def kuhn_poker(vector: str) -> Examination:
+    environment = {"entry_point": "examples.kuhn_poker:env", "vector": vector}
+    return examine(LeagueConfig.from_mapping({"league": "kuhn", "environment": environment}))
+
+
+def test_a_vectorised_environment_is_compared() -> None:
+    found = kuhn_poker("examples.kuhn_poker_vector:KuhnPokerVector")
+    assert found.passed, found.findings
+    assert found.vectorised is not None
+    assert found.vectorised.steps >= 500
+    assert found.vectorised.steps_per_second > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("WrongKuhnPoker", "the vectorised environment differs: .*reward"),
+        ("BrokenKuhnPoker", "the vectorised environment raised an exception: ZeroDivisionError: no cards"),
+    ],
+)
+def test_a_wrong_vectorised_environment_is_a_fault(name: str, message: str) -> None:
+    found = kuhn_poker(f"{HERE}.test_conformance:{name}")
+    assert found.vectorised is None
+    assert re.search(message, findings(found, "fault"))

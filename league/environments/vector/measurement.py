@@ -1,0 +1,52 @@
+"""Measures the speed of a vectorised environment with all of its copies in each call, as in training."""
+
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environments.vector.random_actions import random_actions
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.spaces import ACTION_MASK, Space
+
+
+def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds: float) -> float:
+    """Return environment steps per second, all copies together, with random legal actions and resets.
+
+    Drawing the actions is not counted.
+
+    Args:
+        vector: The environment.
+        actions: Action space of each agent.
+        seed: Seed of the actions and of the episodes' seeds.
+        seconds: Duration of the measurement.
+    """
+    rng = np.random.default_rng(seed)
+    copies = np.arange(vector.num_envs)
+    steps, taken = 0, 0.0
+    rows = list(vector.reset(copies, rng.integers(2**31, size=len(copies))))
+    while taken < seconds:
+        drawn = _draw(rows, actions, rng)
+        began = perf_counter()
+        rows = list(vector.step(copies, drawn))
+        over = np.ones(len(copies), dtype=bool)
+        for block in rows:
+            over[block.envs[~(block.terminations | block.truncations)]] = False
+        if len(ended := np.flatnonzero(over)):
+            rows += vector.reset(ended, rng.integers(2**31, size=len(ended)))
+        taken += perf_counter() - began
+        steps += len(copies)
+    return steps / taken
+
+
+def _draw(rows: list[AgentRows], actions: list[Space], rng: np.random.Generator) -> NDArray:
+    """Draw legal actions for all rows that must act, sorted by copy, then by agent."""
+    drawn, places = [], []
+    for block in rows:
+        acting = np.flatnonzero(~(block.terminations | block.truncations))
+        mask = block.observations.get(ACTION_MASK)
+        for agent in np.unique(block.agents[acting]).tolist():
+            own = acting[block.agents[acting] == agent]
+            drawn.append(random_actions(actions[agent], len(own), None if mask is None else mask[own], rng))
+            places.append(block.envs[own] * len(actions) + agent)
+    return np.concatenate(drawn)[np.argsort(np.concatenate(places), kind="stable")]
