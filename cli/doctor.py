@@ -15,7 +15,7 @@ import typer
 from cli.output import emit, say, table
 from league.errors import LeagueError, last_line
 from league.settings import Storage
-from league.stack import VERIFIED, installed
+from league.stack import OPTIONAL, VERIFIED, installed
 
 GIGABYTE = 10**9
 MINIMUM_DISK = 2 * GIGABYTE
@@ -71,7 +71,9 @@ def _stack() -> Iterator[Check]:
     found = installed()
     for package, verified in VERIFIED.items():
         version = found.get(package)
-        if version is None:
+        if version is None and package in OPTIONAL:
+            yield Check(package, "note", "not installed", "pip install 'policy-league[environments]' for Leduc hold'em")
+        elif version is None:
             yield Check(package, "fail", "not installed", f"pip install -c constraints.txt {package}")
         elif version.partition("+")[0] == verified:
             yield Check(package, "ok", version)

@@ -22,6 +22,8 @@ VERIFIED = {
     "sqlalchemy": "2.1.9",
 }
 """Versions in constraints.txt, with which all tests and benchmarks were run."""
+OPTIONAL = ("rlcard",)
+"""Packages of the extra `environments`."""
 
 
 def installed() -> dict[str, str]:

@@ -28,17 +28,19 @@ class Verified:
 
 
 VECTOR = "league.environments.vector"
+MPE_PACKAGES = ("mpe2", "numpy")
+"""The draws of NumPy's generators are reproduced as well."""
 VECTORISED = {
     "pettingzoo.classic.connect_four_v3": Verified(f"{VECTOR}.connect_four:ConnectFour", "aec", ("pettingzoo",)),
     "pettingzoo.classic.tictactoe_v3": Verified(f"{VECTOR}.tictactoe:TicTacToe", "aec", ("pettingzoo",)),
     "pettingzoo.classic.rps_v2": Verified(f"{VECTOR}.rps:RockPaperScissors", "parallel", ("pettingzoo",)),
     "pettingzoo.classic.leduc_holdem_v4": Verified(
-        f"{VECTOR}.leduc_holdem:LeducHoldem", "aec", ("pettingzoo", "rlcard")
+        f"{VECTOR}.leduc_holdem:LeducHoldem", "aec", ("pettingzoo", "rlcard", "numpy")
     ),
-    "mpe2.simple_spread_v3": Verified(f"{VECTOR}.mpe.simple_spread:SimpleSpread", "parallel", ("mpe2",)),
-    "mpe2.simple_adversary_v3": Verified(f"{VECTOR}.mpe.simple_adversary:SimpleAdversary", "parallel", ("mpe2",)),
-    "mpe2.simple_tag_v3": Verified(f"{VECTOR}.mpe.simple_tag:SimpleTag", "parallel", ("mpe2",)),
-    "mpe2.simple_reference_v3": Verified(f"{VECTOR}.mpe.simple_reference:SimpleReference", "parallel", ("mpe2",)),
+    "mpe2.simple_spread_v3": Verified(f"{VECTOR}.mpe.simple_spread:SimpleSpread", "parallel", MPE_PACKAGES),
+    "mpe2.simple_adversary_v3": Verified(f"{VECTOR}.mpe.simple_adversary:SimpleAdversary", "parallel", MPE_PACKAGES),
+    "mpe2.simple_tag_v3": Verified(f"{VECTOR}.mpe.simple_tag:SimpleTag", "parallel", MPE_PACKAGES),
+    "mpe2.simple_reference_v3": Verified(f"{VECTOR}.mpe.simple_reference:SimpleReference", "parallel", MPE_PACKAGES),
 }
 """Entry point of the stock environment → its vectorised environment."""
 

@@ -24,3 +24,13 @@ def test_doctor_explains_a_broken_home(league: League, home: Path, monkeypatch: 
     broken = [check for check in document["checks"] if check["status"] == "fail"]
     assert [check["what"] for check in broken] == ["registry"]
     assert "LEAGUE_HOME" in broken[0]["advice"]
+
+
+def test_a_missing_optional_package_is_a_note(league: League, monkeypatch: pytest.MonkeyPatch) -> None:
+    present = {name: version for name, version in doctor.VERIFIED.items() if name not in ("rlcard", "onnx")}
+    monkeypatch.setattr(doctor, "installed", lambda: present)
+    monkeypatch.setattr(doctor, "CHECKS", (doctor._stack,))
+    statuses = {check["what"]: check["status"] for check in league("doctor", "--json").json["checks"]}
+    assert statuses.pop("rlcard") == "note"
+    assert statuses.pop("onnx") == "fail"
+    assert set(statuses.values()) == {"ok"}
