@@ -174,7 +174,9 @@ def test_a_replica_registers_before_it_reads_the_aliases(registry: Registry, mon
     read = AliasRepository.all
 
     def observed(aliases: AliasRepository) -> dict[tuple[str, str], AliasTarget]:
-        seen.append(names(registry))
+        # Servers of other tests in this process read their own database at the same time.
+        if aliases._database.engine.url == registry.aliases._database.engine.url:
+            seen.append(names(registry))
         return read(aliases)
 
     monkeypatch.setattr(AliasRepository, "all", observed)

@@ -111,10 +111,9 @@ def test_metrics_require_a_key_with_read_scope_if_keys_are_required(locked: Test
     def status(scope: str) -> int:
         return locked.get("/metrics", headers={"authorization": f"Bearer {tokens[scope]}"}).status_code
 
-    until(lambda: status("read") == 200)
-    assert status("act") == 403
+    until(lambda: (status("read"), status("act")) == (200, 403))
     locked.headers["authorization"] = f"Bearer {tokens['read']}"
-    until(lambda: value(locked, "league_key_rejections_total", code="forbidden") == 1)
+    until(lambda: value(locked, "league_key_rejections_total", code="forbidden") >= 1)
     assert value(locked, "league_key_rejections_total", code="unauthenticated") >= 1
 
 
