@@ -29,6 +29,7 @@ EMPTY = "·"
 def demo(
     minutes: Annotated[float, typer.Option(help="Training time in minutes.")] = 4.0,
     port: Annotated[int, typer.Option(help="HTTP port of the server on 127.0.0.1.")] = 8000,
+    grpc_port: Annotated[int, typer.Option(help="gRPC port of the server; 0 selects a free one.")] = 0,
     exit_: Annotated[bool, typer.Option("--exit", help="Exit after the game instead of serving until Ctrl-C.")] = False,
 ) -> None:
     """Train, evaluate and serve Connect Four, then play a game against it.
@@ -46,7 +47,7 @@ def demo(
     _train(config, minutes)
     _evaluate(config)
     _step(3, f"Serve: Ray Serve and HAProxy serve the champion on 127.0.0.1:{port}.")
-    with running(storage, port=port) as url:
+    with running(storage, port=port, grpc_port=grpc_port) as url:
         _play(config, url)
         if exit_:
             _show_next_steps(config.league, url, f"`league serve --port {port}` starts the server again.")

@@ -61,6 +61,7 @@ def create(
         return
     say(token)
     say(f"\nStore the key {name} now: it is not shown again. Clients send `Authorization: Bearer {token[:12]}_…`.")
+    say("From now on, servers require a key for every request, unless deploy.yaml sets require_keys to never.")
 
 
 @app.command("list")
@@ -96,11 +97,14 @@ def revoke(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name or ID of the key.")], as_json: AsJson = False
 ) -> None:
     """Revoke an API key. Every replica that can reach the database rejects it within a second."""
-    key = open_registry().keys.revoke(name)
+    keys = open_registry().keys
+    key = keys.revoke(name)
     if as_json:
         emit(_document(key))
     else:
         say(f"Revoked the key {key.name}.")
+        if not any(_state(each) == "valid" for each in keys.all()):
+            say("No valid key is left. Servers continue to require one: league keys create NAME --scope SCOPE")
 
 
 def _document(key: "KeyRow") -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import orjson
 import typer
@@ -10,8 +10,11 @@ import typer
 from cli.options import DEFAULT_URL, open_registry
 from cli.output import emit, say
 from league.errors import ConfigError, InvalidReference
-from league.refs import CheckpointRef, PolicyRef, ScriptRef, parse_ref
+from league.refs import CHAMPION, CheckpointRef, PolicyRef, ScriptRef, parse_ref
 from league.settings import Storage
+
+if TYPE_CHECKING:
+    from league.registry.registry import Registry
 
 
 def serve(
@@ -56,13 +59,19 @@ def serve(
             f"  {url}/v1/leagues                          leagues as JSON\n"
             f"  {url}/v1/policies/LEAGUE/action           POST an observation to get an action\n"
             f"  {url}/v2/models/LEAGUE                    Open Inference Protocol over HTTP; also over gRPC\n"
-            f"Try: league act connect_four@champion{_url_option(url)}          Stop: Ctrl-C"
+            f"{first_call(open_registry(), url)}\n"
+            "Stop: Ctrl-C"
         ),
     )
 
 
-def _url_option(url: str) -> str:
-    return "" if url == DEFAULT_URL else f" --url {url}"
+def first_call(registry: "Registry", url: str) -> str:
+    """What to do first: call a champion, or get one."""
+    option = "" if url == DEFAULT_URL else f" --url {url}"
+    for league, alias in sorted(registry.aliases.all()):
+        if alias == CHAMPION:
+            return f"Try: league act {league}@{CHAMPION}{option}"
+    return "No league has a champion yet: league train CONFIG, then league nightly LEAGUE."
 
 
 def act(

@@ -19,7 +19,7 @@ from evaluation.gating.verdicts import gate_result, report_of
 from evaluation.playback.replay import replay
 from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
-from league.errors import InvalidInput, LedgerConflict, VerdictRefuted
+from league.errors import EnvironmentMismatch, InvalidInput, LedgerConflict, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.storage.rows import VerdictRow
 from league.registry.verdicts import VOID
@@ -50,7 +50,7 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     """Recompute a closed verdict, and replay `replays` of its games, evenly spaced.
 
     Raises:
-        VerdictRefuted: The record differs. The message names every difference.
+        VerdictRefuted: The record differs, with every difference in the message, or a game cannot be replayed.
         NotFound: There is no such verdict.
         InvalidInput: The verdict is open.
     """
@@ -112,6 +112,9 @@ def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], repla
     with closing(stock_stepping(league.config.environment, 1)) as environment:
         for number in np.linspace(0, len(games) - 1, wanted).astype(int):
             match, index = games[number]
-            for _ in replay(environment, league.config, league.interface, match, index):
-                pass
+            try:
+                for _ in replay(environment, league.config, league.interface, match, index):
+                    pass
+            except EnvironmentMismatch as error:
+                raise VerdictRefuted(f"verdict {row.id}: {error}") from error
     return wanted

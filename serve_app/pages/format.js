@@ -26,7 +26,11 @@ export function short(value) {
   return counts.format(Number(value.toPrecision(4))).replace("-", "−");
 }
 
-export const percent = (share, digits = 1) => (share == null ? NONE : `${(100 * share).toFixed(digits)} %`);
+export const percent = (share, digits = 1) => {
+  if (share == null) return NONE;
+  const rounded = (100 * share).toFixed(digits);
+  return `${share && Number(rounded) === 0 ? (100 * share).toPrecision(2) : rounded} %`;
+};
 
 /** An interval; a null bound is infinite. */
 export function interval(bounds) {

@@ -14,13 +14,14 @@ def test_a_key_is_shown_once_listed_and_revoked(league: League, registry: Regist
     token = created.out.splitlines()[0]
     assert token.startswith("plk_")
     assert "it is not shown again" in created.out
+    assert "require a key for every request" in created.out
     (key,) = league("keys", "list", "--json").json["keys"]
     assert (key["name"], key["scopes"], key["rate"], key["state"]) == ("lobby", ["act", "read"], 10, "valid")
     ends_in = datetime.fromisoformat(key["expires_at"]) - datetime.now(UTC)
     assert timedelta(days=29) < ends_in <= timedelta(days=30)
     assert token not in league("keys", "list").out
     assert token.encode() not in b"".join(path.read_bytes() for path in registry.storage.home.glob("league.db*"))
-    assert "Revoked the key lobby." in league("keys", "revoke", "lobby").out
+    assert "No valid key is left" in league("keys", "revoke", "lobby").out
     assert league("keys", "list", "--json").json["keys"][0]["state"] == "revoked"
 
 

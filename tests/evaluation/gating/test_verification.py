@@ -11,7 +11,7 @@ from sqlalchemy import select
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
 from evaluation.matches.game_records import forfeits
-from league.errors import EnvironmentMismatch, InvalidInput, NotFound, VerdictRefuted
+from league.errors import InvalidInput, NotFound, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.storage import tables
 from league.registry.storage.rows import VerdictRow
@@ -125,7 +125,7 @@ def test_a_modified_game_is_detected_by_replay(registry: Registry) -> None:
 
     change_moves(registry, row.id, change)
     verify(row.id, registry=registry)
-    with pytest.raises(EnvironmentMismatch, match="cannot be replayed"):
+    with pytest.raises(VerdictRefuted, match="cannot be replayed"):
         verify(row.id, registry=registry, replays=2)
 
 
@@ -157,7 +157,7 @@ def test_a_verdict_with_forfeits_is_verified(tmp_path: Path) -> None:
 
     for match in range(row.evidence["blocks"]):  # type: ignore[index]
         change_moves(registry, row.id, change, match)
-    with pytest.raises(EnvironmentMismatch, match="which did not have to act then"):
+    with pytest.raises(VerdictRefuted, match="which did not have to act then"):
         verify(row.id, registry=registry, replays=8)
 
 
