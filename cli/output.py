@@ -81,7 +81,7 @@ class GameProgress:
     def __init__(self, quiet: bool) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._quiet = quiet
+        self._quiet, self._has_bar = quiet, console.is_terminal and not quiet
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -90,17 +90,19 @@ class GameProgress:
             TimeElapsedColumn(),
             console=console,
             transient=True,
-            disable=quiet or not console.is_terminal,
         )
         self._task = self._bar.add_task("", total=None, note="")
         self._next_line = time.monotonic() + SECONDS_PER_LINE
 
     def __enter__(self) -> "Listener":
-        self._bar.start()
+        if self._has_bar:
+            self._bar.start()
         return self._show
 
     def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        # Stopping a bar that was not started prints an empty line.
+        if self._has_bar:
+            self._bar.stop()
 
     def _show(self, event: "Games | VerdictReport") -> None:
         if self._quiet:
@@ -112,9 +114,10 @@ class GameProgress:
             return
         note = _note(event)
         self._bar.update(self._task, description=event.what, completed=event.played, total=event.of, note=note)
-        if not console.is_terminal and time.monotonic() >= self._next_line:
+        if not self._has_bar and time.monotonic() >= self._next_line:
             self._next_line = time.monotonic() + SECONDS_PER_LINE
-            console.print(f"{event.what}: {event.played}/{event.of} matches  {note}", markup=False, soft_wrap=True)
+            line = f"{event.what}: {event.played}/{event.of} matches  {note}"
+            console.print(line.rstrip(), markup=False, soft_wrap=True)
 
 
 def _note(event: "Games") -> str:
