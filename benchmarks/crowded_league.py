@@ -156,7 +156,7 @@ class _Crowd:
         for match in matches:
             admit(match, schedule)
         began = self._evening(night) + timedelta(hours=hour)
-        rows = [row(match) | {"played_at": began + timedelta(seconds=number)} for number, match in enumerate(matches)]
+        rows = [row(match, began + timedelta(seconds=number)) for number, match in enumerate(matches)]
         with self._registry.database.write() as session:
             self._written += insert(session, tables.MatchTable, rows)
 

@@ -1,10 +1,12 @@
-"""How fast are matches played, and do more workers help? Connect four with the networks of configs/connect_four.yaml.
+"""How fast are matches played, and do more workers help? Connect four, on one core unless workers are compared.
 
-Parts: throughput (on one core, in CPU time, from the schedule to the Match records, with ONNX policies on both sides;
-compared with the unmodified `env()` with random legal moves and without networks, and with the unmodified `env()` whose
-moves are computed by the same networks as RLModules, `forward_inference` for each single move), workers (a tournament,
-including the ledger, with two Ray workers and with one, in wall time). Compared measurements alternate within a round;
-a rate is the median over the rounds. Networks are untrained, which does not change their inference time.
+Parts: throughput (in CPU time, from the schedule to the Match records, with ONNX policies on both sides: MLPs of 2×256
+and the convolutional networks of configs/connect_four.yaml; compared with the unmodified `env()` with random legal
+moves and without networks, and with the unmodified `env()` whose moves are computed by the same networks as RLModules,
+`forward_inference` for each single move), verdict (4,000 games with MLPs of 2×256: schedule, games, sequential test,
+ledger, gate result and report; in wall and in CPU time), workers (a tournament, including the ledger, with two Ray
+workers and with one, in wall time). Compared measurements alternate within a round; a rate is the median over the
+rounds. Networks are untrained, which does not change their inference time.
 """
 
 import argparse
@@ -26,25 +28,36 @@ import torch
 from pettingzoo.classic import connect_four_v3
 from ray.rllib.core.columns import Columns
 
-from benchmarks.leagues.evaluated_league import CONFIG, publish
+from benchmarks.leagues.evaluated_league import CONFIG, publish, with_mlp
 from benchmarks.tournaments import adaptive_ranking, rating_speed, tournament_kills
+from evaluation.gating.verdicts import conclude, open_verdict
 from evaluation.matches.tournament import play_schedule
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
+from league.config import LeagueConfig
+from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.results.records import Match, Schedule
 from league.spaces import ACTION_MASK
 from training.modules.actor_critic import ActorCritic
 
 VERSIONS = [f"{CONFIG.league}@{number}" for number in (1, 2)]
+MLP = with_mlp(CONFIG)
+VERDICT_BLOCKS = 2000
+VERDICT_SECONDS = 0.5
+"""Most seconds for a verdict of so many blocks of two games."""
 
 
 def throughput(quick: bool) -> bool:
-    """At least 0.75 times the unmodified environment, and 3 times the loop with a forward pass for each move."""
+    """With MLPs at least 12 times the unmodified environment; 3 times the loop with a forward pass for each move."""
+    return all([_throughput("MLP 2×256", MLP, quick, 12.0), _throughput("convolutional", CONFIG, quick, None)])
+
+
+def _throughput(name: str, config: LeagueConfig, quick: bool, target: float | None) -> bool:
     seconds, rounds = (0.7, 3) if quick else (2.0, 9)
     with tempfile.TemporaryDirectory() as home:
-        registry, modules = publish(Path(home), 2)
-        worker, schedules = MatchWorker(CONFIG, registry), _schedules(registry, blocks=64)
+        registry, modules = publish(Path(home), 2, config)
+        worker, schedules = MatchWorker(config, registry), _schedules(registry, blocks=1024)
         stock, networks = connect_four_v3.env(), connect_four_v3.env()
         rates = _in_rounds(
             {
@@ -55,14 +68,42 @@ def throughput(quick: bool) -> bool:
             rounds,
         )
         registry.close()
-    print(f"ours {rates['ours']:,.0f}, the stock environment with random legal moves {rates['stock']:,.0f},")
+    print(f"{name}: ours {rates['ours']:,.0f}, the stock environment with random legal moves {rates['stock']:,.0f},")
     print(f"with RLModule.forward_inference for each move {rates['forward']:,.0f} moves/s of one core")
     return all(
         [
-            _report("ours against the stock environment alone", rates["ours"] / rates["stock"], 0.75),
+            _report("ours against the stock environment alone", rates["ours"] / rates["stock"], target),
             _report("ours against a forward pass for each move", rates["ours"] / rates["forward"], 3.0),
         ]
     )
+
+
+def verdict(quick: bool) -> bool:
+    """A verdict of 4,000 games in at most 0.5 s."""
+    # Bounds that no test reaches, so that each verdict plays all of its games.
+    unbounded = {"alpha": 1e-200, "beta": 1e-200, "max_blocks": VERDICT_BLOCKS, "nights": None}
+    config = MLP.model_copy(update={"gate": MLP.gate.model_copy(update=unbounded)})
+    with tempfile.TemporaryDirectory() as home:
+        registry, _ = publish(Path(home), 2, config)
+        registry.aliases.set(config.league, CHAMPION, 1, expected=None, actor="benchmark", reason="first")
+        # One before the measurements, which loads the policies.
+        times = [_verdict_times(registry, config) for _ in range(1 + (3 if quick else 11))][1:]
+        registry.close()
+    wall, cpu = (statistics.median(column) for column in zip(*times, strict=True))
+    print(
+        f"a verdict of {2 * VERDICT_BLOCKS:,} games: {wall:.3f} s, in CPU time {cpu:.3f} s; target {VERDICT_SECONDS} s"
+    )
+    return cpu <= VERDICT_SECONDS
+
+
+def _verdict_times(registry: Registry, config: LeagueConfig) -> tuple[float, float]:
+    """Wall and CPU seconds of one verdict."""
+    began = time.perf_counter(), time.process_time()
+    opened = open_verdict(registry, registry.leagues.get(config.league), 2, VERSIONS[0])
+    report = conclude(registry, opened)
+    ended = time.perf_counter(), time.process_time()
+    assert (report.outcome, report.blocks) == ("inconclusive", VERDICT_BLOCKS)
+    return ended[0] - began[0], ended[1] - began[1]
 
 
 def workers(quick: bool) -> bool:
@@ -159,14 +200,18 @@ def _in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int, warm_up
     return {key: statistics.median(values[warm_up:]) for key, values in found.items()}
 
 
-def _report(what: str, ratio: float, target: float) -> bool:
+def _report(what: str, ratio: float, target: float | None) -> bool:
     """Print a ratio with its target; returns whether it is met."""
+    if target is None:
+        print(f"{what}: {ratio:.2f}x", flush=True)
+        return True
     print(f"{what}: {ratio:.2f}x (target {target:g}x){'' if ratio >= target else '  BELOW TARGET'}", flush=True)
     return ratio >= target
 
 
 PARTS: dict[str, Callable[[bool], bool]] = {
     "throughput": throughput,
+    "verdict": verdict,
     "workers": workers,
     "ratings": lambda quick: not rating_speed.run(quick),
     "adaptive": lambda quick: not adaptive_ranking.run(quick),

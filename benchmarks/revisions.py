@@ -72,14 +72,19 @@ def rate(seconds):
 """
 TOURNAMENT = """
 from benchmarks import evaluation
-from benchmarks.leagues.evaluated_league import publish
+from benchmarks.leagues import evaluated_league
 
-registry, _ = publish(home, 2)
-schedules = evaluation._schedules(registry, blocks=16)
+config = evaluated_league.CONFIG
+if {mlp}:
+    training = config.training.model_copy(update={{"convolutions": (), "hidden": (256, 256)}})
+    config = config.model_copy(update={{"training": training}})
+evaluated_league.CONFIG = config
+registry, _ = evaluated_league.publish(home, 2)
+schedules = evaluation._schedules(registry, blocks=512)
 
 
 def rate(seconds):
-    return repeat(lambda: evaluation._tournament(next(schedules), registry, 0) and 1, seconds)
+    return repeat(lambda: evaluation._tournament(next(schedules), registry, 0) and 1024, seconds)
 """
 SERVING = """
 from benchmarks.load.http import measure
@@ -98,7 +103,8 @@ PARTS = {
     "stepping simple_spread": STEPPING.format(case="simple_spread"),
     "sampling connect_four": SAMPLING.format(environment="FOUR"),
     "sampling simple_spread": SAMPLING.format(environment="SPREAD"),
-    "tournament": TOURNAMENT,
+    "tournament MLP": TOURNAMENT.format(mlp=True),
+    "tournament convolutional": TOURNAMENT.format(mlp=False),
     "serving": SERVING,
 }
 

@@ -1,6 +1,7 @@
 """Output of the commands: text, tables, progress bars and JSON."""
 
 import re
+import time
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
@@ -68,13 +69,19 @@ def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:
     return f"{rating:+.0f}{span}"
 
 
+SECONDS_PER_LINE = 10.0
+"""Seconds between two lines of progress, where there is no bar."""
+
+
 class GameProgress:
-    """Context manager that returns a listener, which prints verdicts and shows a progress bar on a terminal."""
+    """Context manager that returns a listener, which prints verdicts and the progress: a bar in a terminal, plain lines
+    elsewhere.
+    """
 
     def __init__(self, quiet: bool) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._quiet = quiet
+        self._quiet, self._has_bar = quiet, console.is_terminal and not quiet
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -83,16 +90,19 @@ class GameProgress:
             TimeElapsedColumn(),
             console=console,
             transient=True,
-            disable=quiet or not console.is_terminal,
         )
         self._task = self._bar.add_task("", total=None, note="")
+        self._next_line = time.monotonic() + SECONDS_PER_LINE
 
     def __enter__(self) -> "Listener":
-        self._bar.start()
+        if self._has_bar:
+            self._bar.start()
         return self._show
 
     def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        # Stopping a bar that was not started prints an empty line.
+        if self._has_bar:
+            self._bar.stop()
 
     def _show(self, event: "Games | VerdictReport") -> None:
         if self._quiet:
@@ -102,8 +112,19 @@ class GameProgress:
         if isinstance(event, VerdictReport):
             console.print(f"  {verdict(event)}", markup=False, soft_wrap=True)
             return
-        note = "" if event.llr is None else f"LLR {event.llr:+.2f}"
+        note = _note(event)
         self._bar.update(self._task, description=event.what, completed=event.played, total=event.of, note=note)
+        if not self._has_bar and time.monotonic() >= self._next_line:
+            self._next_line = time.monotonic() + SECONDS_PER_LINE
+            line = f"{event.what}: {event.played}/{event.of} matches  {note}"
+            console.print(line.rstrip(), markup=False, soft_wrap=True)
+
+
+def _note(event: "Games") -> str:
+    """`25,000 moves/s  LLR +1.20`"""
+    speed = None if event.moves_per_second is None else f"{event.moves_per_second:,.0f} moves/s"
+    llr = None if event.llr is None else f"LLR {event.llr:+.2f}"
+    return "  ".join(filter(None, (speed, llr)))
 
 
 def show_leaderboard(leaderboard: "tuple[Standing, ...]") -> None:

@@ -258,12 +258,14 @@ class Progress(Document):
 
     what: for people, such as `connect_four@3 against connect_four@2`.
     played, of: matches (blocks) so far and at most.
+    moves_per_second: actions of all games since the start of the schedule in this process; None before the first match.
     llr, bounds: state of the sequential test, for verdicts.
     """
 
     what: str
     played: int
     of: int
+    moves_per_second: float | None = None
     llr: float | None = None
     bounds: tuple[float, float] | None = None
 

@@ -6,7 +6,7 @@ All models are frozen and reject unknown keys. Errors name the file, the key and
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Self, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
@@ -31,8 +31,9 @@ class PlayConfig(Part):
     """What a contestant's return is compared with. game: the returns of its opponents in the same game. side: the
     return of the other contestant on the same side in the block's other game. By default `game` if there are several
     equivalent sides, else `side`."""
-    num_envs: int = Field(default=32, ge=1)
-    """Games stepped in parallel in one worker. Does not influence results."""
+    num_envs: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    """Games stepped in parallel in one worker. auto: 512 in a vectorised environment, else 32. Does not influence
+    results."""
     max_moves: int = Field(default=10_000, ge=1)
     """Environment steps after which a game counts as hung and its match fails. Simultaneous actions of several agents
     are one step."""

@@ -1,5 +1,6 @@
 """Verified and installed versions of the packages that affect training, export and serving."""
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 VERIFIED = {
@@ -28,10 +29,14 @@ OPTIONAL = ("rlcard",)
 
 def installed() -> dict[str, str]:
     """Return the versions of the installed packages in VERIFIED, with local build tags (`+cpu`)."""
-    found = {}
-    for package in VERIFIED:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
+    found = {package: _installed_version(package) for package in VERIFIED}
+    return {package: number for package, number in found.items() if number is not None}
+
+
+@cache
+def _installed_version(package: str) -> str | None:
+    """Reading the metadata of a package takes about a millisecond, and it does not change while a process runs."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

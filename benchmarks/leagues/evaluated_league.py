@@ -19,14 +19,21 @@ from training.modules.actor_critic import ActorCritic
 CONFIG = LeagueConfig.load(Path(__file__).parents[2] / "configs" / "connect_four.yaml")
 
 
-def publish(home: Path, versions: int) -> tuple[Registry, list[ActorCritic]]:
+def with_mlp(config: LeagueConfig) -> LeagueConfig:
+    """The same league with an MLP of 2×256 instead of the convolutional network."""
+    training = config.training.model_copy(update={"convolutions": (), "hidden": (256, 256)})
+    return config.model_copy(update={"training": training})
+
+
+def publish(home: Path, versions: int, config: LeagueConfig | None = None) -> tuple[Registry, list[ActorCritic]]:
     """A registry in `home` with this number of versions, and the modules that they were exported from."""
+    config = config or CONFIG
     registry = Registry.open(Storage.at(home))
-    registry.leagues.register(CONFIG, interface(CONFIG))
-    row = registry.leagues.get(CONFIG.league)
+    registry.leagues.register(config, interface(config))
+    row = registry.leagues.get(config.league)
     modules = [_module(row, seed) for seed in range(versions)]
     for seed, module in enumerate(modules):
-        registry.publisher.publish(CONFIG.league, _builder(row, module, seed), source=f"untrained/{seed}", parent=None)
+        registry.publisher.publish(config.league, _builder(row, module, seed), source=f"untrained/{seed}", parent=None)
     return registry, modules
 
 

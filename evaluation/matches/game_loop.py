@@ -1,6 +1,6 @@
 """The game loop: plays games in parallel environments, with the actions of each policy batched over all games.
 
-A game depends on its plan alone. Openings and scripts use random generators of the game, recurrent states belong to
+A game depends on its plan alone. Openings and scripts use random numbers of the game, recurrent states belong to
 agents, and a policy's output for a row does not depend on its batch. The number of parallel environments and the other
 games therefore do not change a result. This includes forfeits: a contestant without a legal action loses that game
 immediately, and the other games continue.
@@ -9,33 +9,27 @@ immediately, and the other games continue.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.game_state import ActionLog, AgentStates, RunningGame, State, contestant_returns
-from evaluation.matches.policy_calls import Generators, PolicyFault, PolicyOutput, call_policy
+from evaluation.matches.game_state import AgentGenerators, AgentStates
+from evaluation.matches.match_recorder import MatchRecorder
+from evaluation.matches.openings import Openings
+from evaluation.matches.policy_calls import PolicyFault, call_policy
+from evaluation.matches.returns import agent_sides
+from evaluation.matches.seating import Roster, Seating
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
-from evaluation.schedules.builders import GamePlan, game_plans
+from evaluation.schedules.builders import GamePlans, game_plans
 from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts, Turn
 from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError, one_line
 from league.interface import Interface
 from league.policies.policy import Policy
-from league.policies.scripted import script
-from league.results.records import Forfeit, Game, Match, Reason, Schedule
-from league.results.scoring import scores
+from league.results.records import Match, Reason, Schedule
 from league.spaces import DictSpace, Leaf, Space
 
 logger = logging.getLogger(__name__)
-
-Roster = Mapping[str, Mapping[str, tuple[str, Policy]]]
-"""reference → agent → (policy id, policy)"""
-
-OPENING = "opening"
-"""Stands for the reference in a group (reference, policy id) during random opening moves."""
 
 NO_GAME = -1
 MAX_OPENINGS = 1000
@@ -68,8 +62,8 @@ def play_matches(
         IllegalMask: The environment allows an agent no action.
         EnvironmentMismatch: Openings of `schedule.opening_plies` steps always end the game.
     """
-    positions = list(positions)
-    loop = _GameLoop(schedule, positions, environment, interface, roster, max_moves, deadline.seconds)
+    plans = game_plans(schedule, list(positions))
+    loop = _GameLoop(schedule, plans, environment, interface, roster, max_moves, deadline.seconds)
     try:
         with enforce_deadline(loop.check_deadline, deadline):
             loop.run()
@@ -79,74 +73,43 @@ def play_matches(
         if isinstance(error, LeagueError) or not len(environment.busy):
             raise
         raise loop.crashed(int(environment.busy[0]), error) from error
-    blocks = loop.blocks()
-    return [schedule.match(position, blocks[position]) for position in positions]
-
-
-@dataclass(frozen=True, slots=True)
-class _PolicyCaller:
-    """The policy that acts for the rows of one group."""
-
-    ref: str
-    policy: Policy
-
-    @property
-    def draws(self) -> bool:
-        """Whether the policy gets one generator per row; checkpoints play greedily."""
-        return self.ref == OPENING or self.ref.startswith("script:")
-
-    def answer(self, batch: Batch, space: Leaf, state: State | None, generators: Generators | None) -> PolicyOutput:
-        """Call the policy on a batch. Openings cannot be forfeited."""
-        if self.ref == OPENING:
-            return PolicyOutput(self.policy.act(batch.observations, rng=generators).actions, None)
-        return call_policy(self.policy, batch, space, state, generators)
-
-
-@dataclass(frozen=True, slots=True)
-class _EndedGame:
-    """A recorded game. number: of the game in the action log. returns: of the agents. steps: those that count."""
-
-    number: int
-    game: RunningGame
-    returns: list[float]
-    steps: int
+    return loop.recorder.matches()
 
 
 class _GameLoop:
     """Assigns games to parallel environments and policies to agents.
 
-    Games are numbered in the order of their starts, including those that end in their opening and are replaced.
+    A game is a row of `plans`. An episode is an attempt at a game: one that ends in its opening is replaced. Episodes
+    are numbered in the order of their starts.
     """
 
     def __init__(
         self,
         schedule: Schedule,
-        positions: Sequence[int],
+        plans: GamePlans,
         environment: BatchedEnvironment,
         interface: Interface,
         roster: Roster,
         max_moves: int,
         max_seconds: float,
     ) -> None:
-        self._environment, self._max_moves, self._max_seconds = environment, max_moves, max_seconds
-        self._plies, self._scoring = schedule.opening_plies, schedule.scoring
-        self._match_id = schedule.match_id
-        self._agents, self._side_of = environment.agents, agent_sides(environment.agents, interface)
+        self._schedule, self._plans, self._environment = schedule, plans, environment
+        self._max_moves, self._max_seconds, self._plies = max_moves, max_seconds, schedule.opening_plies
+        self._agents, side_of = environment.agents, agent_sides(environment.agents, interface)
         self._spaces = [_leaf(interface.agents[agent].action) for agent in self._agents]
-        callers = _callers(interface, roster, opening=self._plies > 0)
-        self._callers = list(callers.values())
-        self._seating = _Seating(list(callers), interface, roster, self._agents, self._side_of)
-        self._positions = tuple(positions)
-        self._waiting = (game for position in positions for game in game_plans(schedule, position))
+        self._seating = Seating(schedule, plans, interface, roster, self._agents, side_of)
+        self.recorder = MatchRecorder(schedule, plans, self._agents, side_of)
+        self._next_game = 0
+        # Of each episode: its game, and the number of earlier attempts at it.
+        self._games, self._attempts = np.zeros(0, np.int64), np.zeros(0, np.int64)
         num_envs = environment.num_envs
-        self._games: list[RunningGame] = []
-        # Of each environment: the number of its game, and that of the game that it began last.
+        shape = num_envs, len(self._agents)
+        # Of each environment: its episode, and the one that it began last.
         self._running, self._begun = np.full(num_envs, NO_GAME), np.full(num_envs, NO_GAME)
-        self._steps = np.zeros(num_envs, np.int64)
-        self._returns = np.zeros((num_envs, len(self._agents)))
+        self._steps, self._returns = np.zeros(num_envs, np.int64), np.zeros(shape)
+        self._openings = Openings(interface, len(self._agents), plans.seeds, self._plies)
+        self._generators = AgentGenerators(*shape)
         self._states: dict[int, AgentStates] = {}
-        self._log = ActionLog()
-        self._ended: list[_EndedGame] = []
         self._faulty: set[int] = set()
         self._logged: set[tuple[str, Reason]] = set()
 
@@ -170,90 +133,79 @@ class _GameLoop:
         if len(slow := busy[self._environment.seconds()[busy] > self._max_seconds]):
             raise GameTimeout(self._hung(slow))
 
-    def blocks(self) -> dict[int, list[Game]]:
-        """Position → its scored games, in order."""
-        actions = self._log.by_game({ended.number: ended.steps for ended in self._ended}, self._plies)
-        games: dict[int, dict[int, Game]] = {position: {} for position in self._positions}
-        for ended in self._ended:
-            plan = ended.game.plan
-            games[plan.position][plan.index] = self._record(ended, *actions[ended.number])
-        return {position: self._scored([own[index] for index in sorted(own)]) for position, own in games.items()}
-
-    def _scored(self, games: Sequence[Game]) -> list[Game]:
-        forfeits = [{forfeit.contestant for forfeit in game.forfeits} for game in games]
-        points = scores([game.returns for game in games], self._scoring, forfeits)
-        return [replace(game, scores=own) for game, own in zip(games, points, strict=True)]
-
     def _next_episodes(self, envs: Indices) -> Starts:
-        starting: list[tuple[int, RunningGame]] = []
-        for env in envs.tolist():
-            game = self._next_game(env)
-            self._begun[env] = NO_GAME if game is None else len(self._games)
-            if game is not None:
-                self._games.append(game)
-                starting.append((env, game))
-        return Starts(
-            np.array([env for env, _ in starting], dtype=np.int64),
-            np.array([game.plan.seed for _, game in starting]),
-            self._groups([game for _, game in starting], in_opening=self._plies > 0),
-        )
+        games, attempts = self._next_games(envs)
+        starting = np.flatnonzero(games != NO_GAME)
+        games, attempts = games[starting], attempts[starting]
+        self._begun[envs] = NO_GAME
+        self._begun[envs[starting]] = len(self._games) + np.arange(len(starting))
+        self._games, self._attempts = np.append(self._games, games), np.append(self._attempts, attempts)
+        seating = self._seating
+        groups = np.tile(seating.in_opening, (len(games), 1)) if self._plies else seating.after_opening[games]
+        return Starts(envs[starting], self._plans.seeds[games], groups)
 
-    def _next_game(self, env: int) -> RunningGame | None:
-        if self._running[env] != NO_GAME and self._in_opening(env):
-            return self._redraw(self._game(env))
-        plan = next(self._waiting, None)
-        return None if plan is None else RunningGame(plan)
-
-    def _redraw(self, ended: RunningGame) -> RunningGame:
-        if ended.attempt + 1 == MAX_OPENINGS:
+    def _next_games(self, envs: Indices) -> tuple[Indices, Indices]:
+        """The next game of each environment, or NO_GAME, and the number of earlier attempts at it."""
+        games, attempts = np.full(len(envs), NO_GAME), np.zeros(len(envs), np.int64)
+        again = np.flatnonzero((self._running[envs] != NO_GAME) & self._in_opening(envs))
+        ended = self._running[envs[again]]
+        games[again], attempts[again] = self._games[ended], self._attempts[ended] + 1
+        if attempts.max(initial=0) == MAX_OPENINGS:
             raise EnvironmentMismatch(
                 f"play.opening_plies: {MAX_OPENINGS} openings of {self._plies} random steps all ended the game;"
                 " fewer are needed"
             )
-        return RunningGame(ended.plan, ended.attempt + 1)
+        if len(again):
+            self._openings.restart(games[again], attempts[again])
+        free = np.flatnonzero(games == NO_GAME)[: len(self._plans) - self._next_game]
+        games[free] = self._next_game + np.arange(len(free))
+        self._next_game += len(free)
+        return games, attempts
 
-    def _in_opening(self, env: int) -> bool:
-        """Whether a game is in its opening. A game that ends there is replaced."""
-        return 0 < self._plies >= int(self._steps[env])
-
-    def _groups(self, games: Sequence[RunningGame], in_opening: bool) -> Indices:
-        """Groups of all agents in some games, (games, agents)."""
-        return np.array(
-            [self._seating.opening if in_opening else self._seating.groups(game.plan) for game in games], dtype=np.int64
-        ).reshape(len(games), len(self._agents))
+    def _in_opening(self, envs: Indices) -> NDArray[np.bool_]:
+        """Whether games are in their openings. A game that ends there is replaced."""
+        return (self._steps[envs] <= self._plies) & (self._plies > 0)
 
     def _begin(self, envs: Indices) -> None:
-        """The episodes that these environments began last are their current games now."""
+        """The episodes that these environments began last are their current ones now."""
+        if not len(envs):
+            return
         self._running[envs] = self._begun[envs]
         self._steps[envs] = 0
         self._returns[envs] = 0.0
+        self._generators.forget(envs)
         for states in self._states.values():
             states.forget(envs)
 
     def _act(self, group: int, batch: Batch) -> NDArray:
-        caller = self._callers[group]
+        """Return the actions of a group's rows."""
+        seated, episodes = self._seating.policies[group], self._running[batch.envs]
         self._returns[batch.envs, batch.agents] += batch.rewards
+        if seated.policy is None or seated.ref is None:
+            actions = self._openings.act(seated.policy_id, batch, self._games[episodes])
+        else:
+            actions = self._call(group, seated.ref, seated.policy, batch)
+        self.recorder.actions.add(episodes, self._steps[batch.envs], batch.agents, actions)
+        return actions
+
+    def _call(self, group: int, ref: str, policy: Policy, batch: Batch) -> NDArray:
+        """Return a contestant's actions, keep its recurrent states, and note the games that it forfeits."""
+        games = self._games[self._running[batch.envs]]
         state = self._states[group].get(batch) if group in self._states else None
-        generators = self._generators(batch) if caller.draws else None
-        answer = caller.answer(batch, self._spaces[batch.agents[0]], state, generators)
-        self._log.add(self._running[batch.envs], self._steps[batch.envs], batch.agents, answer.actions)
+        draws = ref.startswith("script:")  # checkpoints play greedily
+        generators = (
+            self._generators.get(batch, self._plans.seeds[games], self._plans.indices[games]) if draws else None
+        )
+        answer = call_policy(policy, batch, self._spaces[batch.agents[0]], state, generators)
         if answer.states is not None:
             if group not in self._states:
                 self._states[group] = AgentStates(*self._returns.shape)
             self._states[group].update(batch, answer.states)
         for row, fault in answer.faults.items():
-            env, agent = int(batch.envs[row]), int(batch.agents[row])
-            self._game(env).faults[agent] = fault.reason
-            self._faulty.add(env)
-            self._log_forfeit(caller.ref, fault)
+            self.recorder.add_fault(int(games[row]), int(batch.agents[row]), fault.reason)
+            self._faulty.add(int(batch.envs[row]))
+            self._log_forfeit(ref, fault)
         return answer.actions
-
-    def _generators(self, batch: Batch) -> list[np.random.Generator]:
-        games, in_opening = self._running[batch.envs].tolist(), (self._steps[batch.envs] < self._plies).tolist()
-        return [
-            self._games[game].generator(agent, opens)
-            for game, agent, opens in zip(games, batch.agents.tolist(), in_opening, strict=True)
-        ]
 
     def _log_forfeit(self, ref: str, fault: PolicyFault) -> None:
         """Log the details of a forfeit once. The record contains only the reason."""
@@ -264,16 +216,33 @@ class _GameLoop:
     def _forfeited(self) -> Indices:
         """Record games that end by forfeit and return their environments."""
         envs = np.array(sorted(self._faulty), dtype=np.int64)
-        self._faulty.clear()
-        self._end(envs)
-        self._running[envs] = NO_GAME
+        if len(envs):
+            self._faulty.clear()
+            self._end(envs)
+            self._running[envs] = NO_GAME
         return envs
 
     def _end(self, envs: Indices) -> None:
         """Record the games in some environments."""
-        numbers, steps = self._running[envs].tolist(), self._steps[envs].tolist()
-        for number, returns, played in zip(numbers, self._returns[envs].tolist(), steps, strict=True):
-            self._ended.append(_EndedGame(number, self._games[number], returns, played))
+        episodes = self._running[envs]
+        self.recorder.end(self._games[episodes], episodes, self._returns[envs], self._steps[envs])
+
+    def _end_step(self) -> None:
+        playing = np.flatnonzero(self._running != NO_GAME)
+        self._steps[playing] += 1
+        steps = self._steps[playing]
+        if self._plies and len(opened := playing[steps == self._plies]):
+            self._environment.assign(opened, self._seating.after_opening[self._games[self._running[opened]]])
+        if len(endless := playing[steps > self._max_moves]):
+            raise GameHung(f"{self._describe(int(endless[0]))} has not ended after {self._max_moves} moves")
+        if len(slow := playing[self._environment.seconds()[playing] > self._max_seconds]):
+            raise self._hung(slow[:1])
+
+    def _settle(self, turn: Turn) -> None:
+        for rows in turn.endings:
+            self._returns[rows.envs, rows.agents] += rows.rewards
+        if len(turn.finished):
+            self._end(turn.finished[~self._in_opening(turn.finished)])
 
     def crashed(self, env: int, error: Exception) -> GameCrashed:
         """The error for an environment that raised."""
@@ -290,74 +259,10 @@ class _GameLoop:
 
     def _describe(self, env: int) -> str:
         """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)` for the last game that an environment began."""
-        plan = self._games[self._begun[env]].plan
-        players = " and ".join(plan.contestants)
-        return f"a game of {players} (game {plan.index} of match {self._match_id(plan.position)})"
-
-    def _end_step(self) -> None:
-        playing = np.flatnonzero(self._running != NO_GAME)
-        self._steps[playing] += 1
-        steps = self._steps[playing]
-        if len(opened := playing[steps == self._plies]) and self._plies:
-            games = [self._game(env) for env in opened.tolist()]
-            self._environment.assign(opened, self._groups(games, in_opening=False))
-        if len(endless := playing[steps > self._max_moves]):
-            raise GameHung(f"{self._describe(int(endless[0]))} has not ended after {self._max_moves} moves")
-        if len(slow := playing[self._environment.seconds()[playing] > self._max_seconds]):
-            raise self._hung(slow[:1])
-
-    def _settle(self, turn: Turn) -> None:
-        for rows in turn.endings:
-            self._returns[rows.envs, rows.agents] += rows.rewards
-        finished = turn.finished
-        self._end(finished[self._steps[finished] > self._plies] if self._plies else finished)
-
-    def _game(self, env: int) -> RunningGame:
-        return self._games[self._running[env]]
-
-    def _record(self, ended: _EndedGame, opening: tuple[Any, ...], actions: tuple[Any, ...]) -> Game:
-        plan, faults = ended.game.plan, ended.game.faults
-        forfeits: dict[int, Forfeit] = {}
-        for agent in sorted(faults):
-            contestant = plan.sides[self._side_of[agent]]
-            forfeits.setdefault(contestant, Forfeit(contestant, self._agents[agent], faults[agent]))
-        return Game(
-            sides=plan.sides,
-            seed=plan.seed,
-            opening=opening,
-            actions=actions,
-            returns=contestant_returns(ended.returns, self._side_of, plan.sides),
-            scores=(),
-            forfeits=tuple(forfeits.values()),
-        )
-
-
-class _Seating:
-    """The groups of agents: numbers of the policies that act for them, given as (reference, policy id)."""
-
-    def __init__(
-        self,
-        groups: Sequence[tuple[str, str]],
-        interface: Interface,
-        roster: Roster,
-        agents: Sequence[str],
-        side_of: Sequence[int],
-    ) -> None:
-        number = {group: i for i, group in enumerate(groups)}
-        self._side_of = side_of
-        self._of_ref = {ref: [number[ref, policies[agent][0]] for agent in agents] for ref, policies in roster.items()}
-        self.opening = [number.get((OPENING, interface.policies[agent]), 0) for agent in agents]
-
-    def groups(self, plan: GamePlan) -> list[int]:
-        """Return the group of each agent in a game after its opening."""
-        refs = [self._of_ref[plan.contestants[contestant]] for contestant in plan.sides]
-        return [refs[side][agent] for agent, side in enumerate(self._side_of)]
-
-
-def agent_sides(agents: Sequence[str], interface: Interface) -> list[int]:
-    """The number of each agent's side."""
-    side = {agent: i for i, members in enumerate(interface.sides.values()) for agent in members}
-    return [side[agent] for agent in agents]
+        game = int(self._games[self._begun[env]])
+        position, index = int(self._plans.positions[game]), int(self._plans.indices[game])
+        players = " and ".join(self._schedule.contestants_at(position))
+        return f"a game of {players} (game {index} of match {self._schedule.match_id(position)})"
 
 
 def _without(turn: Turn, actions: Mapping[int, NDArray], envs: Indices) -> dict[int, NDArray]:
@@ -369,15 +274,3 @@ def _without(turn: Turn, actions: Mapping[int, NDArray], envs: Indices) -> dict[
 def _leaf(space: Space) -> Leaf:
     assert not isinstance(space, DictSpace), "action spaces are not dictionaries"
     return space
-
-
-def _callers(interface: Interface, roster: Roster, opening: bool) -> dict[tuple[str, str], _PolicyCaller]:
-    actors: dict[tuple[str, str], _PolicyCaller] = {
-        (ref, policy_id): _PolicyCaller(ref, policy)
-        for ref, agents in roster.items()
-        for policy_id, policy in agents.values()
-    }
-    for policy_id in interface.policy_ids if opening else ():
-        spaces = interface.of_policy(policy_id)
-        actors[OPENING, policy_id] = _PolicyCaller(OPENING, script("random", spaces.observation, spaces.action))
-    return actors

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 
 from evaluation.statistics.sequential import score_of
-from league.results.records import Action, Game, Match
+from league.results.records import Game, Match
 
 
 def forfeits(matches: Iterable[Match], contestant: str) -> int:
@@ -49,16 +49,14 @@ def unique_games(matches: Iterable[Match], contestant: str | None = None) -> int
 
 def identity(match: Match, game: Game) -> bytes:
     """Hash of a game (16 bytes, so that a million fit into memory). Equal games have equal hashes."""
-    moves, returns = (_frozen(game.opening), _frozen(game.actions)), sorted(map(repr, game.returns))
-    return blake2b(repr((sorted(match.contestants), moves, returns)).encode(), digest_size=16).digest()
+    returns = sorted(map(repr, game.returns))
+    return blake2b(
+        repr((sorted(match.contestants), game.opening, game.actions, returns)).encode(), digest_size=16
+    ).digest()
 
 
 def _took_part(match: Match, game: Game, contestant: str) -> bool:
     return contestant in (match.contestants[number] for number in game.sides)
-
-
-def _frozen(actions: Sequence[Action]) -> tuple[Hashable, ...]:
-    return tuple(_frozen(action) if isinstance(action, list) else action for action in actions)
 
 
 MIN_UPSET = 0.4

@@ -1,77 +1,38 @@
-"""State of games in progress: generators, recurrent states, recorded actions; and the returns of contestants."""
+"""State of games in progress: the random generators and recurrent states of their agents."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from statistics import mean
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.schedules.builders import GamePlan
 from league.environments.stepping import Batch, Indices
-from league.results.records import Reason
+from league.seeds import generators
 
 State = dict[str, NDArray]
 """name of a recurrent input → array (k, …)"""
 
 
-@dataclass(slots=True)
-class RunningGame:
-    """A game in one of the parallel environments, or one that has ended.
+class AgentGenerators:
+    """The random generators of scripts, by environment and agent. They are created when their agents first act."""
 
-    attempt: number of earlier openings that ended the game. faults: agent → why it has no playable action in the
-    current step.
-    """
+    def __init__(self, num_envs: int, agents: int) -> None:
+        self._kept = np.full((num_envs, agents), None, dtype=object)
 
-    plan: GamePlan
-    attempt: int = 0
-    faults: dict[int, Reason] = field(default_factory=dict)
-    _generators: dict[tuple[bool, int], np.random.Generator] = field(default_factory=dict)
+    def get(self, batch: Batch, seeds: Indices, indices: Indices) -> list[np.random.Generator]:
+        """Return a generator for each row of a batch.
 
-    def generator(self, agent: int, in_opening: bool) -> np.random.Generator:
-        """Random generator of an agent's policy, or of its opening moves."""
-        key = in_opening, agent
-        if key not in self._generators:
-            plan = self.plan
-            self._generators[key] = plan.opening(self.attempt, agent) if in_opening else plan.policy(agent)
-        return self._generators[key]
-
-
-class ActionLog:
-    """The actions of all games, in columns."""
-
-    def __init__(self) -> None:
-        self._places: list[tuple[Indices, Indices, Indices]] = []
-        self._actions: list[Any] = []
-
-    def add(self, games: Indices, steps: Indices, agents: Indices, actions: NDArray) -> None:
-        """Add one action each of k agents. games: numbers of their games. steps: in the games, from 0."""
-        self._places.append((games, steps, agents))
-        self._actions += actions.tolist()
-
-    def by_game(self, steps: Mapping[int, int], opening: int) -> dict[int, tuple[tuple[Any, ...], tuple[Any, ...]]]:
-        """Return the actions of some games: those of the first `opening` steps, and the others.
-
-        They are ordered by step, then by agent. steps: number of a game → how many of its steps count.
+        seeds, indices: of the games, and their numbers in their blocks, (k,).
         """
-        if not self._places:
-            return dict.fromkeys(steps, ((), ()))
-        games, at, agents = (np.concatenate(column) for column in zip(*self._places, strict=True))
-        order = np.lexsort((agents, at, games))
-        games, at = games[order], at[order]
-        actions = [self._actions[i] for i in order.tolist()]
-        numbers = np.array(list(steps), dtype=np.int64)
-        firsts, lasts = np.searchsorted(games, numbers), np.searchsorted(games, numbers, "right")
-        found = {}
-        for game, first, last in zip(steps, firsts.tolist(), lasts.tolist(), strict=True):
-            own = at[first:last]
-            middle = first + int(np.searchsorted(own, opening))
-            stop = first + int(np.searchsorted(own, steps[game]))
-            found[game] = tuple(actions[first:middle]), tuple(actions[middle:stop])
-        return found
+        found = self._kept[batch.envs, batch.agents]
+        if len(missing := np.flatnonzero(found == None)):  # noqa: E711  elementwise
+            agents = batch.agents[missing]
+            found[missing] = generators(seeds[missing], "policy", indices[missing], agents)
+            self._kept[batch.envs[missing], agents] = found[missing]
+        return found.tolist()
+
+    def forget(self, envs: Indices) -> None:
+        """The games in `envs` are over."""
+        self._kept[envs] = None
 
 
 class AgentStates:
@@ -106,24 +67,3 @@ class AgentStates:
         self._known[envs] = False
         for kept in self._kept.values():
             kept[envs] = 0
-
-
-def contestant_returns(
-    returns: Sequence[float], side_of: Sequence[int], sides: Sequence[int], contestants: int = 2
-) -> tuple[float | None, ...]:
-    """Return of each contestant: the mean over the agents of a side, then over its sides; None without sides.
-
-    returns, side_of: of each agent. sides: the contestant of each side.
-    Means are rounded once (`statistics.mean` adds fractions), so that sides with equal returns tie exactly.
-    """
-    of_side: list[list[float]] = [[] for _ in sides]
-    for value, side in zip(returns, side_of, strict=True):
-        of_side[side].append(value)
-    own: list[list[float]] = [[] for _ in range(contestants)]
-    for values, contestant in zip(of_side, sides, strict=True):
-        own[contestant].append(_mean(values))
-    return tuple(_mean(values) if values else None for values in own)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return values[0] if len(values) == 1 else float(mean(values))

@@ -1,9 +1,12 @@
 """Plays schedules and evaluations: matches run in chunks, here or as Ray tasks, and are appended in schedule order.
 
-Chunks are aligned ranges of consecutive positions. A chunk that finishes early waits for all earlier chunks, and is
-appended as a whole or not at all. The ledger therefore always holds a prefix of the schedule, independent of the number
-of workers, and an interrupted run resumes after it. At most one chunk per worker is in flight or waiting, which limits
-the loss of an interruption.
+Chunks are ranges of consecutive positions with fixed bounds. A chunk that finishes early waits for all earlier chunks,
+and is appended as a whole or not at all. The ledger therefore always holds a prefix of the schedule, independent of the
+number of workers, and an interrupted run resumes after it. At most one chunk per worker is in flight or waiting, which
+limits the loss of an interruption.
+
+A test may stop after any match, but is only looked at between chunks. Matches after its stopping match stay in the
+ledger and do not count (evaluation/gating/gate.py), so chunks influence no decision.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice, pairwise
+from time import perf_counter
 from typing import Generic, TypeVar, get_args
 
 import ray
@@ -20,7 +24,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from evaluation.matches.game_records import forfeits, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
-from evaluation.matches.worker import baselines, match_worker
+from evaluation.matches.worker import baselines, match_worker, num_envs
 from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
 from evaluation.schedules.builders import ANCHOR, scoring
 from evaluation.schedules.tournament_plan import (
@@ -74,8 +78,8 @@ class ReorderBuffer(Generic[T]):
 
 
 GAMES_PER_ENV = 4
-"""Games of a chunk per parallel environment: enough that handing chunks out costs little, few enough that little is
-played in vain when a test stops or a worker dies."""
+"""Most games of a chunk per parallel environment: enough that handing chunks out costs little, few enough that little
+is played in vain when a test stops or a worker dies."""
 
 RETRIES = 5
 """How often a chunk is retried after its worker died."""
@@ -114,23 +118,26 @@ def play_schedule(
     config = registry.leagues.get(schedule.league).config
     matches = ledger.matches(league=schedule.league, schedule=schedule.id)
     end = schedule.length if until is None else min(until, schedule.length)
-    chunks = chunks_of(end, len(matches), config.play.num_envs)
+    chunks = chunks_of(end, len(matches), num_envs(config))
     document = config.model_dump_json(by_alias=True)
     played = (
         _in_ray(schedule, chunks, registry.storage, document, workers)
         if workers and chunks
         else _here(schedule, chunks, registry.storage, document)
     )
+    began, moves = perf_counter(), 0
     with closing(played):
         while True:
             ended = enough is not None and enough(matches)
             if listener:
-                listener(Progress(_describe(schedule), len(matches), schedule.length))
+                speed = moves / (perf_counter() - began) if moves else None
+                listener(Progress(_describe(schedule), len(matches), schedule.length, speed))
             chunk = None if ended else next(played, None)
             if chunk is None:
                 return matches
             ledger.extend(chunk)
             matches += chunk
+            moves += sum(len(game.opening) + len(game.actions) for match in chunk for game in match.games)
 
 
 def evaluate(
@@ -251,13 +258,16 @@ def _report(
 
 
 def chunks_of(length: int, played: int, num_envs: int) -> list[range]:
-    """The positions from `played` to `length`, cut at multiples of the chunk size.
+    """The positions from `played` to `length`, in chunks.
 
-    A chunk keeps all parallel environments busy for a few games each.
+    A chunk is as long as all earlier ones together, so that a test that stops after a few matches has played at most
+    twice as many. It has at least one game for each parallel environment and at most GAMES_PER_ENV.
     """
-    size = math.ceil(GAMES_PER_ENV * num_envs / GAMES_PER_BLOCK)
-    cuts = [played, *range((played // size + 1) * size, length, size), length]
-    return [range(start, end) for start, end in pairwise(cuts) if start < end]
+    least, most = (math.ceil(games * num_envs / GAMES_PER_BLOCK) for games in (1, GAMES_PER_ENV))
+    cuts = [0]
+    while cuts[-1] < length:
+        cuts.append(min(cuts[-1] + min(max(cuts[-1], least), most), length))
+    return [range(max(start, played), end) for start, end in pairwise(cuts) if end > played]
 
 
 def _describe(schedule: Schedule) -> str:

@@ -7,12 +7,13 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from functools import lru_cache
 
-from evaluation.matches.game_loop import Roster, play_matches
+from evaluation.matches.game_loop import play_matches
+from evaluation.matches.seating import Roster
 from evaluation.matches.watchdog import Deadline
 from evaluation.schedules.builders import ANCHOR
 from league.config import LeagueConfig
 from league.environments.building import interface
-from league.environments.implementation import stepping
+from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation, stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
 from league.interface import Interface
@@ -56,7 +57,7 @@ class MatchWorker:
         seated = self.interface.apart() if schedule.scoring == "team" else self.interface
         settings = self.config.play
         deadline = Deadline(settings.game_seconds, expendable)
-        environment = self._environment or stepping(self.config.environment, settings.num_envs)
+        environment = self._environment or stepping(self.config.environment, num_envs(self.config))
         # An interrupted environment is neither reused nor closed, because closing may hang.
         self._environment = None
         matches = play_matches(schedule, positions, environment, seated, roster, settings.max_moves, deadline)
@@ -75,6 +76,13 @@ class MatchWorker:
         if len(self._contestants) > MOST_CONTESTANTS:
             self._contestants.popitem(last=False)
         return self._contestants[ref]
+
+
+def num_envs(config: LeagueConfig) -> int:
+    """Return the number of games that a worker steps in parallel."""
+    if config.play.num_envs != "auto":
+        return config.play.num_envs
+    return STOCK_ENVS if implementation(config.environment).vector is None else VECTOR_ENVS
 
 
 @lru_cache(maxsize=4)

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.game_loop import agent_sides
-from evaluation.matches.game_state import contestant_returns
 from evaluation.matches.policy_calls import PolicyFault, action_fault
+from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.matches.worker import baselines
 from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of
 from evaluation.playback.single_game import GameStep, Move, play_game, policy_output

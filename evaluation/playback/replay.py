@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evaluation.matches.game_loop import agent_sides
-from evaluation.matches.game_state import contestant_returns
+from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.single_game import GameStep, play_game, policy_output
 from league.config import LeagueConfig
 from league.environments.stepping import BatchedEnvironment

@@ -24,6 +24,7 @@ from itertools import combinations, combinations_with_replacement
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evaluation.schedules import adaptive_pairing
 from league.config import GateConfig, LeagueConfig
@@ -31,42 +32,48 @@ from league.errors import ConfigError, EnvironmentMismatch
 from league.interface import Interface, digest
 from league.refs import ScriptRef
 from league.results.records import GAMES_PER_BLOCK, BlockResult, Schedule, Scoring
-from league.seeds import derive, generator
+from league.seeds import derive
 
 ANCHOR = str(ScriptRef("random"))
 """The contestant whose rating is 0."""
 
 
 @dataclass(frozen=True, slots=True)
-class GamePlan:
-    """One game of a schedule.
+class GamePlans:
+    """Games of a schedule, in columns. A game is identified by its row.
 
-    index: number of the game in its block. sides[s]: who controls side s, as an index into the match's contestants.
-    seed: of the environment, equal in both games of a block.
+    Attributes:
+        positions: Position of the match of each game, (g,).
+        indices: Number of the game in its block, (g,).
+        seeds: Seed of the environment, equal in both games of a block, (g,).
+        contestants: The match's contestants, as indices into those of the schedule, (g, 2).
+        sides: Who controls each side, as an index into the match's contestants, (g, sides).
     """
 
-    position: int
-    index: int
-    sides: tuple[int, ...]
-    seed: int
-    contestants: tuple[str, ...]
+    positions: NDArray[np.int64]
+    indices: NDArray[np.int64]
+    seeds: NDArray[np.int64]
+    contestants: NDArray[np.int64]
+    sides: NDArray[np.int64]
 
-    def opening(self, attempt: int, agent: int) -> np.random.Generator:
-        """Random generator of an agent's opening moves: equal in both games, different for each attempt."""
-        return generator(self.seed, "opening", attempt, agent)
-
-    def policy(self, agent: int) -> np.random.Generator:
-        """Random generator of the policy that controls an agent in this game."""
-        return generator(self.seed, "policy", self.index, agent)
+    def __len__(self) -> int:
+        return len(self.positions)
 
 
-def game_plans(schedule: Schedule, position: int) -> list[GamePlan]:
-    """The games of match `position` of `schedule`, in order."""
-    seed, contestants = schedule.seed_at(position), schedule.contestants_at(position)
-    return [
-        GamePlan(position, index, schedule.seating_at(position, index), seed, contestants)
-        for index in range(GAMES_PER_BLOCK)
-    ]
+def game_plans(schedule: Schedule, positions: Sequence[int]) -> GamePlans:
+    """Return the games of the matches at `positions` of `schedule`, in order."""
+    each = np.repeat(np.asarray(positions, dtype=np.int64), GAMES_PER_BLOCK)
+    indices = np.tile(np.arange(GAMES_PER_BLOCK), len(positions))
+    pairings = np.array(schedule.pairings, dtype=np.int64)
+    seats = np.repeat([schedule.seat_at(position) for position in positions], GAMES_PER_BLOCK)
+    has_seat = np.arange(len(schedule.sides)) == seats[:, np.newaxis]
+    return GamePlans(
+        positions=each,
+        indices=indices,
+        seeds=np.repeat(np.array(schedule.seeds_at(positions), dtype=np.int64), GAMES_PER_BLOCK),
+        contestants=pairings[each % len(pairings)],
+        sides=np.where(has_seat, indices[:, np.newaxis], 1 - indices[:, np.newaxis]),
+    )
 
 
 Pairing = tuple[int, ...]

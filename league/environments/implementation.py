@@ -17,6 +17,10 @@ from league.stack import VERIFIED, installed
 
 logger = logging.getLogger(__name__)
 
+STOCK_ENVS, VECTOR_ENVS = 32, 512
+"""Parallel environments in lockstep and, at most, in a vectorised environment, if their number is chosen
+automatically."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verified:

@@ -1,5 +1,6 @@
 """Samples actions from the outputs of a policy graph, and computes action probabilities."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
@@ -14,8 +15,18 @@ from league.spaces import Box, Discrete, MultiDiscrete, Space
 Generators = Sequence[np.random.Generator]
 
 
-def draw(rng: Generators | None, rows: int, shape: tuple[int, ...] = ()) -> NDArray:
+class UniformNumbers(ABC):
+    """A source of uniform numbers for k rows, which are drawn together."""
+
+    @abstractmethod
+    def draw(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return the next numbers in [0, 1), (k, *shape)."""
+
+
+def draw(rng: Generators | UniformNumbers | None, rows: int, shape: tuple[int, ...] = ()) -> NDArray:
     """Return uniform numbers in [0, 1), (rows, *shape) float64. Raises InvalidInput unless each row has a generator."""
+    if isinstance(rng, UniformNumbers):
+        return rng.draw(shape)
     generators = _each(rng, rows)
     if not shape:
         return np.array([generator.random() for generator in generators])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from league.errors import EnvironmentMismatch, IllegalMask, UnknownPolicy
 from league.policies.actions import bounds, to_environment
-from league.policies.draws import Generators, choose, draw, elements
+from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
 from league.policies.policy import Actions, Arrays, Policy
 from league.spaces import (
     ACTION_MASK,
@@ -57,13 +57,18 @@ class Random:
         if isinstance(action, Box) and not all(np.isfinite(bound).all() for bound in bounds(action)):
             raise EnvironmentMismatch(f"script:random does not support unbounded actions: {action!r}")
 
+    @property
+    def numbers_per_action(self) -> int:
+        """How many random numbers an action takes."""
+        return int(np.prod(self._action.shape, dtype=int))
+
     def act(
         self,
         observations: Arrays,
         *,
         state: Arrays | None = None,  # noqa: ARG002
         explore: bool = False,  # noqa: ARG002
-        rng: Generators | None = None,
+        rng: Generators | UniformNumbers | None = None,
     ) -> Actions:
         """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
         if self._masked:

@@ -2,6 +2,8 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
+from itertools import groupby
+from operator import attrgetter
 from typing import Any, TypeVarTuple
 
 from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
@@ -82,9 +84,12 @@ class Ledger:
         """
         with self._database.write() as session:
             schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
-            for match in matches:
-                admit(match, schedules[match.schedule])
-            return insert(session, tables.MatchTable, [row(match) for match in matches])
+            for schedule in schedules.values():
+                own = [match for match in matches if match.schedule == schedule.id]
+                for match, seed in zip(own, schedule.seeds_at([match.position for match in own]), strict=True):
+                    admit(match, schedule, seed)
+            now = datetime.now(UTC)
+            return insert(session, tables.MatchTable, [row(match, now) for match in matches])
 
     def matches(self, *, league: str, schedule: str | None = None, after: int | None = None) -> list[Match]:
         """Return the matches of a league, or of one of its schedules, in schedule order.
@@ -100,8 +105,8 @@ class Ledger:
                 query = query.where(tables.MatchTable.schedule == schedule)
             if after is not None:
                 query = query.where(tables.MatchTable.position > after)
-            found = session.execute(query)
-            return [schedules[of].match(position, load_games(moves)) for of, position, moves in found]
+            found = groupby(session.execute(query), key=attrgetter("schedule"))
+            return [match for name, rows in found for match in _matches(schedules[name], list(rows))]
 
     def walk(self, schedule: Schedule) -> Iterator[Match]:
         """Iterate over the matches of a schedule in order, with at most STRIDE of them in memory."""
@@ -110,7 +115,7 @@ class Ledger:
         while True:
             with self._database.read() as session:
                 found = session.execute(query.where(table.position > last).limit(STRIDE)).all()
-            yield from (schedule.match(position, load_games(moves)) for position, moves in found)
+            yield from _matches(schedule, found)
             if len(found) < STRIDE:
                 return
             last = found[-1].position
@@ -215,6 +220,12 @@ def _schedule(session: Session, name: str) -> Schedule:
     return load_schedule(document)
 
 
+def _matches(schedule: Schedule, rows: Sequence[Any]) -> list[Match]:
+    """Return the matches of some rows of one schedule, which have its positions and moves."""
+    seeds = schedule.seeds_at([row.position for row in rows])
+    return [schedule.match(row.position, load_games(row.moves), seed) for row, seed in zip(rows, seeds, strict=True)]
+
+
 def _place(match: str) -> tuple[str, int]:
     """Schedule and position of a match id; position -1, which no match has, if the id is invalid."""
     schedule, _, position = match.rpartition("/")
@@ -260,7 +271,7 @@ def _in_order(query: Select[*Columns], league: str) -> Select[*Columns]:
     return query.order_by(tables.ScheduleTable.sequence, tables.MatchTable.position)
 
 
-def row(match: Match) -> dict[str, Any]:
+def row(match: Match, played_at: datetime) -> dict[str, Any]:
     """Return the row of a match."""
     result = match.result()
     first, second = match.contestants
@@ -274,5 +285,5 @@ def row(match: Match) -> dict[str, Any]:
         "scores": dump_numbers(result.scores),
         "returns": dump_numbers(result.returns or ()),
         "moves": dump_games(match.games),
-        "played_at": datetime.now(UTC),
+        "played_at": played_at,
     }

@@ -20,6 +20,8 @@ other game of the block, or nothing if both are one `team`. See scoring.py."""
 
 GAMES_PER_BLOCK = 2
 
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+
 Reason = Literal["illegal_action", "not_finite", "malformed", "crashed"]
 """Why a game was forfeited: an action outside the space or its mask; an action with NaN or infinity; an output that is
 not an array of the space's shape and kind; a policy that raised."""
@@ -59,6 +61,12 @@ class Schedule:
 
         return derive(self.seed, position)
 
+    def seeds_at(self, positions: Sequence[int]) -> list[int]:
+        """Return the seeds of some matches."""
+        from league.seeds import derive_each  # NumPy takes 0.1 s to import.
+
+        return derive_each(self.seed, positions).tolist()
+
     def seat_at(self, position: int) -> int:
         """Return the side that one contestant controls in each game of match `position`; the other has all other sides.
 
@@ -75,15 +83,18 @@ class Schedule:
         """Return the id of match `position`."""
         return f"{self.id}/{position}"
 
-    def match(self, position: int, games: "Sequence[Game]") -> "Match":
-        """Return the record of match `position` with these games."""
+    def match(self, position: int, games: "Sequence[Game]", seed: int | None = None) -> "Match":
+        """Return the record of match `position` with these games.
+
+        seed: `seed_at(position)`, if it is known.
+        """
         return Match(
             id=self.match_id(position),
             league=self.league,
             schedule=self.id,
             position=position,
             contestants=self.contestants_at(position),
-            seed=self.seed_at(position),
+            seed=self.seed_at(position) if seed is None else seed,
             environment_digest=self.environment_digest,
             games=tuple(games),
         )
@@ -170,33 +181,45 @@ class Match:
 
     def score(self, contestant: int) -> float:
         """Return the mean score of a contestant (index) over its games, in [0, 1]."""
-        result = self.result()
-        return result.scores[contestant] / result.games
+        return _sum([game.scores[contestant] for game in self.games]) / self._games_each
 
     def mean_return(self, contestant: int) -> float | None:
         """Return the mean return of a contestant (index) over its games; None if a game of the block was forfeited."""
-        result = self.result()
-        return None if result.returns is None else result.returns[contestant] / result.games
+        if self._has_forfeit:
+            return None
+        return _sum([game.returns[contestant] for game in self.games]) / self._games_each
 
     def result(self) -> BlockResult:
         """Return the match without its moves."""
-        contestants = range(len(self.contestants))
-        scores = [[game.scores[c] for game in self.games] for c in contestants]
-        returns = [[game.returns[c] for game in self.games] for c in contestants]
-        is_whole = not any(game.forfeits for game in self.games)
+        contestants, games = range(len(self.contestants)), self.games
+        returns = tuple([_sum([game.returns[c] for game in games]) for c in contestants])
         return BlockResult(
             schedule=self.schedule,
             position=self.position,
             contestants=self.contestants,
-            games=sum(value is not None for value in returns[0]),
-            scores=tuple(sum(score for score in own if score is not None) for own in scores),
-            returns=tuple(sum(value for value in own if value is not None) for own in returns) if is_whole else None,
+            games=self._games_each,
+            scores=tuple([_sum([game.scores[c] for game in games]) for c in contestants]),
+            returns=None if self._has_forfeit else returns,
         )
+
+    @property
+    def _games_each(self) -> int:
+        """Number of games of each contestant."""
+        return len([game for game in self.games if game.returns[0] is not None])
+
+    @property
+    def _has_forfeit(self) -> bool:
+        return any(game.forfeits for game in self.games)
+
+
+def _sum(values: Sequence[float | None]) -> float:
+    """Return the sum of the numbers among `values`."""
+    return sum([value for value in values if value is not None])
 
 
 def dump_schedule(schedule: Schedule) -> str:
     """Return a schedule as JSON, by field names."""
-    return _dump({name: getattr(schedule, name) for name in Schedule.__slots__})
+    return _ENCODER.encode({name: getattr(schedule, name) for name in Schedule.__slots__})
 
 
 def load_schedule(text: str) -> Schedule:
@@ -210,7 +233,7 @@ def dump_games(games: Sequence[Game]) -> str:
     """Return a block as JSON: the common seed and opening, and [sides, actions, returns, scores] of each game, followed
     by [contestant, agent, reason] of each forfeit."""
     first = games[0]
-    return _dump([first.seed, first.opening, [_game(game) for game in games]])
+    return _ENCODER.encode([first.seed, first.opening, [_game(game) for game in games]])
 
 
 def load_games(text: str) -> tuple[Game, ...]:
@@ -242,14 +265,10 @@ def _game(game: Game) -> list[Any]:
 
 def dump_numbers(numbers: Sequence[float]) -> str:
     """Return a list of numbers as JSON."""
-    return _dump(numbers)
+    return _ENCODER.encode(numbers)
 
 
 @lru_cache(maxsize=4096)
 def load_numbers(text: str) -> tuple[float, ...]:
     """Return the list that `dump_numbers` wrote. Cached, because few of these texts are different."""
     return tuple(json.loads(text))
-
-
-def _dump(document: Any) -> str:
-    return json.dumps(document, separators=(",", ":"), allow_nan=False)

@@ -13,6 +13,7 @@ The scores of a block sum to half their number and swap with the contestants, so
 
 import math
 from collections.abc import Collection, Sequence
+from functools import lru_cache
 from typing import get_args
 
 from league.errors import LedgerConflict
@@ -32,13 +33,19 @@ def scores(returns: Sequence[Values], scoring: Scoring, forfeits: Sequence[Colle
     Returns:
         Scores in {0, ½, 1}, indexed like `returns`; None where nothing is compared.
     """
-    broken = [set(by) for by in forfeits] or [set[int]() for _ in returns]
+    broken = [frozenset(by) for by in forfeits] or [frozenset[int]() for _ in returns]
     if scoring == "side":
-        broken = [set().union(*broken)] * len(returns)
-    return [
+        broken = [frozenset[int]().union(*broken)] * len(returns)
+    return list(_scores(tuple(returns), scoring, tuple(broken)))
+
+
+# Many blocks of a game have the same returns.
+@lru_cache(maxsize=4096)
+def _scores(returns: tuple[Values, ...], scoring: Scoring, broken: tuple[frozenset[int], ...]) -> tuple[Values, ...]:
+    return tuple(
         tuple(_score(returns, game, contestant, scoring, broken[game]) for contestant in range(len(returns[game])))
         for game in range(len(returns))
-    ]
+    )
 
 
 def _score(
@@ -53,21 +60,19 @@ def _score(
     return 1.0 if mine > other else 0.5 if mine == other else 0.0
 
 
-def admit(match: Match, schedule: Schedule) -> None:
-    """Raise LedgerConflict, which names the difference, unless `match` conforms to `schedule`."""
+def admit(match: Match, schedule: Schedule, seed: int | None = None) -> None:
+    """Raise LedgerConflict, which names the difference, unless `match` conforms to `schedule`.
+
+    seed: that of the match by the schedule, if it is known.
+    """
     if not 0 <= match.position < schedule.length:
         raise _refusal(match, f"its schedule ends before position {schedule.length}")
-    expected = {
-        "id": schedule.match_id(match.position),
-        "league": schedule.league,
-        "schedule": schedule.id,
-        "contestants": schedule.contestants_at(match.position),
-        "seed": schedule.seed_at(match.position),
-        "environment_digest": schedule.environment_digest,
-    }
-    for name, value in expected.items():
-        if getattr(match, name) != value:
-            raise _refusal(match, f"its {name} is {getattr(match, name)!r}, but {value!r} in its schedule")
+    expected = schedule.match(match.position, match.games, seed)
+    if match != expected:
+        for name in Match.__slots__:
+            given, value = getattr(match, name), getattr(expected, name)
+            if given != value:
+                raise _refusal(match, f"its {name} is {given!r}, but {value!r} in its schedule")
     if len(match.games) != GAMES_PER_BLOCK:
         raise _refusal(match, f"it has {len(match.games)} games, expected {GAMES_PER_BLOCK}")
     for index, game in enumerate(match.games):

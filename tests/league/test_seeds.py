@@ -1,7 +1,8 @@
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.seeds import derive, generator
+from league.seeds import derive, derive_each, generator, generators
 
 seeds = st.integers(0, 2**63 - 1)
 paths = st.lists(st.integers(0, 2**31) | st.text(max_size=8), min_size=1, max_size=4)
@@ -22,3 +23,15 @@ def test_adjacent_seeds_and_paths_differ() -> None:
 def test_known_values_are_stable_for_old_ledgers() -> None:
     assert derive(0, 0) == 4334430513956379144
     assert derive(42, "game", 3) == 1465044601826300333
+
+
+@given(seeds, st.lists(st.integers(0, 2**32 - 1), max_size=5))
+def test_many_seeds_are_derived_at_once(seed: int, numbers: list[int]) -> None:
+    assert derive_each(seed, numbers).tolist() == [derive(seed, number) for number in numbers]
+
+
+@given(st.lists(st.tuples(seeds, st.integers(0, 2**31)), max_size=4), st.text(max_size=8))
+def test_many_generators_are_created_at_once(rows: list[tuple[int, int]], name: str) -> None:
+    own, numbers = np.array(rows, dtype=np.int64).reshape(-1, 2).T
+    expected = [generator(seed, name, number, 3).bit_generator.state for seed, number in rows]
+    assert [each.bit_generator.state for each in generators(own, name, numbers, 3)] == expected

@@ -14,7 +14,7 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.env_runner import EnvRunner
 
 from league.config import LeagueConfig
-from league.environments.implementation import implementation
+from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
@@ -115,8 +115,6 @@ def configure(
     config.reporting(min_time_s_per_iteration=0)
 
 
-STOCK_ENVS, MOST_ENVS = 32, 512
-"""Parallel environments of a runner, if their number is chosen automatically."""
 STEPS_PER_BATCH = 16
 """Minimum number of steps of an agent in each environment per batch: advantages of shorter chunks are mostly guesses of
 the value function."""
@@ -130,7 +128,7 @@ def num_envs(league: LeagueConfig, agents: int) -> int:
     if not isinstance(settings, PPOConfig) or implementation(league.environment).vector is None:
         return STOCK_ENVS
     fitting = settings.train_batch_size // (max(settings.runners, 1) * agents * STEPS_PER_BATCH)
-    return min(max(fitting, STOCK_ENVS), MOST_ENVS)
+    return min(max(fitting, STOCK_ENVS), VECTOR_ENVS)
 
 
 def rl_module_specs(

@@ -4,27 +4,33 @@
 return the same numbers, 20 times faster for a thousand seeds.
 """
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+
+from league.seed_sequence import generate_state
 
 MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
 """Of PCG64's linear congruential generator with 128-bit states."""
 LOW = 2**32 - 1
 
 
-def outputs(seeds: NDArray[np.int64], count: int) -> NDArray[np.uint64]:
+def outputs(
+    seeds: NDArray[np.int64], count: int, spawn_key: Sequence[int | NDArray[np.int64]] = ()
+) -> NDArray[np.uint64]:
     """Return the first 64-bit outputs of PCG64 for each seed.
 
     Args:
-        seeds: Seeds from 0 to 2³² - 1, (m,).
+        seeds: Seeds from 0 to 2⁶³ - 1, (m,).
         count: Number of outputs.
+        spawn_key: Spawn key of the SeedSequence, from numbers for all seeds or arrays (m,).
 
     Returns:
         (count, m) uint64.
     """
-    words = _seed_sequence(seeds)
+    words = generate_state(seeds, spawn_key)
     # Rows: the initial state and the increment, each of them with its high and low 64 bits.
     high, low = words[[0, 2], np.newaxis], words[[1, 3], np.newaxis]
     high[1], low[1] = (high[1] << 1) | (low[1] >> 63), (low[1] << 1) | 1
@@ -55,38 +61,6 @@ def integers(halves: NDArray[np.uint64], high: int) -> tuple[NDArray[np.int64], 
     return (product >> 32).astype(np.int64), (product & LOW) >= 2**32 % high
 
 
-def _seed_sequence(seeds: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Return `SeedSequence(seed).generate_state(4, numpy.uint64)` for each seed, (4, m)."""
-    pool = np.zeros((4, len(seeds)), dtype=np.uint32)
-    pool[0] = seeds
-    constants = _powers(0x43B0D7E5, 0x931E8875, 17)
-    pool = _hashed(pool, constants[:5])
-    for source in range(4):
-        others = [row for row in range(4) if row != source]
-        first = 4 + 3 * source
-        pool[others] = _mixed(pool[others], _hashed(pool[source], constants[first : first + 4]))
-    words = _hashed(np.concatenate([pool, pool]), _powers(0x8B51F9DD, 0x58F38DED, 9)).astype(np.uint64)
-    return words[0::2] | (words[1::2] << np.uint64(32))
-
-
-def _hashed(values: NDArray[np.uint32], constants: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """SeedSequence's `hashmix`. Each value uses a constant and the next one."""
-    values = (values ^ constants[:-1]) * constants[1:]
-    return values ^ (values >> np.uint32(16))
-
-
-def _mixed(x: NDArray[np.uint32], y: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """SeedSequence's `mix`."""
-    mixed = x * np.uint32(0xCA01F9DD) - y * np.uint32(0x4973F715)
-    return mixed ^ (mixed >> np.uint32(16))
-
-
-@cache
-def _powers(first: int, factor: int, count: int) -> NDArray[np.uint32]:
-    """Return first · factorⁱ mod 2³², (count, 1)."""
-    return np.array([[first * pow(factor, i, 2**32) % 2**32] for i in range(count)], dtype=np.uint32)
-
-
 @cache
 def _factors(count: int) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
     """Return the high and low 64 bits of the factors of the initial state and of the increment, (2, count, 1) each.
@@ -98,8 +72,9 @@ def _factors(count: int) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
     powers = [pow(MULTIPLIER, i, 2**128) for i in range(count + 2)]
     sums = [sum(powers[: i + 1]) % 2**128 for i in range(count + 2)]
     factors = [powers[2:], sums[2:]]
-    high, low = ([[[f(factor)] for factor in row] for row in factors] for f in (lambda x: x >> 64, lambda x: x % 2**64))
-    return np.array(high, dtype=np.uint64), np.array(low, dtype=np.uint64)
+    high, low = ([[f(factor) for factor in row] for row in factors] for f in (lambda x: x >> 64, lambda x: x % 2**64))
+    shape = 2, count, 1
+    return np.array(high, dtype=np.uint64).reshape(shape), np.array(low, dtype=np.uint64).reshape(shape)
 
 
 def _multiply(

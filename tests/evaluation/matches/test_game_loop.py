@@ -10,6 +10,7 @@ from evaluation.schedules.builders import round_robin
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, GameHung
 from league.results.records import Match, Schedule
+from league.seeds import generator
 from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, WINNER, build_roster
 from tests.support.leagues import tictactoe
 
@@ -119,3 +120,18 @@ def test_a_game_that_does_not_end_is_reported() -> None:
             build_roster(),
             max_moves=4,
         )
+
+
+def test_openings_and_scripts_draw_from_the_generators_of_their_game() -> None:
+    """These draws are part of recorded games and must never change."""
+    for match in play(schedule(contestants=["script:random", "tictactoe@1"])):
+        for index, game in enumerate(match.games):
+            squares = list(range(9))
+            openings = [generator(match.seed, "opening", 0, agent) for agent in (0, 1)]
+            assert game.opening == tuple(squares.pop(int(len(squares) * each.random())) for each in openings)
+            agent = game.sides.index(0)
+            script = generator(match.seed, "policy", index, agent)
+            for ply, action in enumerate(game.actions):
+                if ply % 2 == agent:
+                    assert action == squares[int(len(squares) * script.random())]
+                squares.remove(action)

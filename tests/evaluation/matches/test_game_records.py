@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.matches.game_loop import Roster, play_matches
+from evaluation.matches.game_loop import play_matches
 from evaluation.matches.game_records import forfeit_difference, forfeits
 from evaluation.matches.leaderboard import compute_leaderboard, rank_contestants
+from evaluation.matches.seating import Roster
 from evaluation.matches.tournament import evaluate
 from evaluation.playback.replay import recorded_game, replay
 from evaluation.schedules.builders import round_robin

@@ -76,8 +76,10 @@ def test_progress_is_reported(registry: Registry) -> None:
     events: list[Progress | VerdictReport] = []
     schedule = tournament_schedule(registry)
     play_schedule(schedule, registry=registry, listener=events.append)
-    played = [progress.played for progress in events if isinstance(progress, Progress)]
-    assert played == [*range(0, schedule.length, 4), schedule.length]
+    reports = [event for event in events if isinstance(event, Progress)]
+    assert [report.played for report in reports] == [0, 1, 2, *range(4, schedule.length, 4), schedule.length]
+    assert reports[0].moves_per_second is None
+    assert all(report.moves_per_second > 0 for report in reports[1:])
 
 
 def test_a_schedule_of_another_environment_is_rejected(registry: Registry) -> None:
@@ -92,12 +94,19 @@ def test_a_schedule_of_another_environment_is_rejected(registry: Registry) -> No
 
 @settings(deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60), st.integers(1, 40))
-def test_chunks_are_aligned_and_cover_the_missing_matches(played: int, length: int, num_envs: int) -> None:
+def test_chunks_cover_the_missing_matches_and_keep_their_bounds(played: int, length: int, num_envs: int) -> None:
+    """Bounds do not depend on the matches that were already played, nor on the length of the schedule."""
     chunks = chunks_of(length, played, num_envs)
     assert [position for chunk in chunks for position in chunk] == list(range(played, length))
-    size = tournament.GAMES_PER_ENV * num_envs // 2
-    assert {position // size for chunk in chunks for position in chunk[:1]} == {c.start // size for c in chunks}
-    assert all(len(chunk) <= size and (chunk.stop % size == 0 or chunk.stop == length) for chunk in chunks)
+    bounds = {chunk.stop for chunk in chunks_of(1000, 0, num_envs)}
+    assert all(chunk.stop in bounds or chunk.stop == length for chunk in chunks)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "bounds"), [(2, [1, 2, 4, 8, 12, 16]), (3, [2, 4, 8, 14, 20]), (512, [256, 512, 1024, 2048, 3072])]
+)
+def test_a_chunk_is_as_long_as_all_earlier_ones_within_limits(num_envs: int, bounds: list[int]) -> None:
+    assert [chunk.stop for chunk in chunks_of(bounds[-1], 0, num_envs)] == bounds
 
 
 @pytest.mark.usefixtures("ray_session")

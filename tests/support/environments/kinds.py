@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from evaluation.matches.game_loop import Roster, play_matches
+from evaluation.matches.game_loop import play_matches
+from evaluation.matches.seating import Roster
 from evaluation.schedules.builders import round_robin
 from league.config import LeagueConfig
 from league.environments.building import interface

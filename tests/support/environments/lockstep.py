@@ -1,6 +1,6 @@
 """Tic-tac-toe between scripts and graphs, for tests of the match loop."""
 
-from evaluation.matches.game_loop import Roster
+from evaluation.matches.seating import Roster
 from league.environments.building import interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy

@@ -1,0 +1,69 @@
+"""Records games while they are played, and turns them into Match records."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.matches.action_log import ActionLog
+from evaluation.matches.returns import returns_of_games
+from evaluation.schedules.builders import GamePlans
+from league.environments.stepping import Indices
+from league.results.records import GAMES_PER_BLOCK, Forfeit, Game, Match, Reason, Schedule
+from league.results.scoring import scores
+
+
+class MatchRecorder:
+    """Collects the actions, forfeits and results of the games of some matches.
+
+    An episode is an attempt at a game. Each game has one recorded episode; those that ended in their opening are not
+    recorded.
+    """
+
+    def __init__(self, schedule: Schedule, plans: GamePlans, agents: Sequence[str], side_of: Sequence[int]) -> None:
+        self._schedule, self._plans = schedule, plans
+        self._agents, self._side_of = agents, side_of
+        self.actions = ActionLog()
+        self._faults: defaultdict[int, dict[int, Reason]] = defaultdict(dict)
+        self._ended: list[tuple[Indices, Indices, NDArray[np.float64], Indices]] = []
+
+    def add_fault(self, game: int, agent: int, reason: Reason) -> None:
+        """A game ends because an agent has no playable action."""
+        self._faults[game][agent] = reason
+
+    def end(self, games: Indices, episodes: Indices, returns: NDArray[np.float64], steps: Indices) -> None:
+        """Record k ended games. returns: of the agents, (k, agents). steps: those that count, (k,)."""
+        self._ended.append((games, episodes, returns, steps))
+
+    def matches(self) -> list[Match]:
+        """Return the matches, in the order of their games."""
+        if not self._ended:
+            return []
+        games, episodes, returns, steps = (np.concatenate(column) for column in zip(*self._ended, strict=True))
+        order = np.argsort(games)
+        plans, schedule = self._plans, self._schedule
+        sides, seeds = list(map(tuple, plans.sides.tolist())), plans.seeds.tolist()
+        actions = self.actions.of(episodes[order], steps[order], schedule.opening_plies)
+        values = returns_of_games(returns[order], self._side_of, plans.sides)
+        forfeits = [self._forfeits(game) if game in self._faults else () for game in range(len(plans))]
+        matches = []
+        for first in range(0, len(plans), GAMES_PER_BLOCK):
+            block = range(first, first + GAMES_PER_BLOCK)
+            losers = [{forfeit.contestant for forfeit in forfeits[game]} for game in block]
+            points = scores([values[game] for game in block], schedule.scoring, losers)
+            records = [
+                Game(sides[game], seeds[game], *actions[game], values[game], own, forfeits[game])
+                for game, own in zip(block, points, strict=True)
+            ]
+            matches.append(schedule.match(int(plans.positions[first]), records, seeds[first]))
+        return matches
+
+    def _forfeits(self, game: int) -> tuple[Forfeit, ...]:
+        found: dict[int, Forfeit] = {}
+        for agent, reason in sorted(self._faults[game].items()):
+            contestant = int(self._plans.sides[game, self._side_of[agent]])
+            found.setdefault(contestant, Forfeit(contestant, self._agents[agent], reason))
+        return tuple(found.values())
