@@ -65,10 +65,36 @@ from benchmarks import sampling
 
 torch.set_num_threads(1)
 runner = sampling.ours(sampling.{environment}, 32)
+# Earlier revisions have only `sample`.
+sample = getattr(runner, "sample_chunks", runner.sample)
 
 
 def rate(seconds):
-    return repeat(lambda: runner.sample(num_timesteps=2000) and 2000, seconds)
+    return repeat(lambda: sample(num_timesteps=2000) and 2000, seconds)
+"""
+LEDUC = """
+import torch
+from benchmarks import sampling
+from league.environments.building import interface
+from training.algorithms.{algorithm} import algorithm_config
+
+torch.set_num_threads(1)
+league = sampling.league(sampling.LEDUC, algorithm="{algorithm}", num_envs=256, hidden=(128, 128))
+config = algorithm_config(league, interface(league))
+runner = config.env_runner_cls(config, worker_index=0)
+sample = getattr(runner, "sample_chunks", runner.sample)
+actions = 4096
+
+
+def play():
+    if "{algorithm}" == "dqn":
+        return runner.transitions(actions, exploration=0.3)[0]
+    sample(num_timesteps=actions)
+    return actions
+
+
+def rate(seconds):
+    return repeat(play, seconds)
 """
 TOURNAMENT = """
 from benchmarks import evaluation
@@ -103,6 +129,8 @@ PARTS = {
     "stepping simple_spread": STEPPING.format(case="simple_spread"),
     "sampling connect_four": SAMPLING.format(environment="FOUR"),
     "sampling simple_spread": SAMPLING.format(environment="SPREAD"),
+    "sampling leduc by PPO": LEDUC.format(algorithm="ppo"),
+    "sampling leduc by DQN": LEDUC.format(algorithm="dqn"),
     "tournament MLP": TOURNAMENT.format(mlp=True),
     "tournament convolutional": TOURNAMENT.format(mlp=False),
     "serving": SERVING,

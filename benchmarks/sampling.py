@@ -39,7 +39,7 @@ from league.environments.building import interface
 from training.algorithms.ppo import PPO, algorithm_config
 from training.modules.actor_critic import ActorCritic
 from training.runs.trial import build_algorithm
-from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.env_runner import BatchedEnvRunner
 
 NUM_ENVS = (1, 4, 8, 16, 32, 64)
 MANY_ENVS = (256, 1024)
@@ -176,9 +176,9 @@ def league(entry_point: str, **training: Any) -> LeagueConfig:
 
 
 def ours(entry_point: str, num_envs: int) -> EnvRunner:
-    """LockstepEnvRunner as created by training."""
+    """BatchedEnvRunner as created by training."""
     config = league(entry_point, num_envs=num_envs)
-    return LockstepEnvRunner(algorithm_config(config, interface(config)), worker_index=0)
+    return BatchedEnvRunner(algorithm_config(config, interface(config)), worker_index=0)
 
 
 def rllib(entry_point: str, num_envs: int) -> EnvRunner:
@@ -232,7 +232,7 @@ def in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int) -> Any:
 
 def sampling_rate(runner: EnvRunner, entry_point: str, seconds: float) -> float:
     """Environment steps per second, including episodes for a learner. RLlib counts steps, our runner counts actions."""
-    is_ours = isinstance(runner, LockstepEnvRunner)
+    is_ours = isinstance(runner, BatchedEnvRunner)
     sample, share = (runner.sample_chunks, AGENTS[entry_point]) if is_ours else (runner.sample, 1)
     size = max(1024, 16 * runner.config.num_envs_per_env_runner)
     steps, began = 0, time.perf_counter()

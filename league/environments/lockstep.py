@@ -1,7 +1,6 @@
 """Steps n environments of any API in lockstep and batches their observations."""
 
 import contextlib
-import logging
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from league.environment_config import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
 from league.environments.building import action_space, build, observation_space
+from league.environments.crash_limit import CrashLimit
 from league.environments.stepping import (
     Batch,
     BatchedEnvironment,
@@ -26,11 +26,9 @@ from league.environments.stepping import (
     no_envs,
 )
 from league.environments.vector.vector_env import AgentRows
-from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError, one_line
+from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError
 from league.spaces import Leaf, inputs
 from league.spaces.conversion import from_gymnasium
-
-logger = logging.getLogger(__name__)
 
 Given = TypeVar("Given")
 
@@ -65,7 +63,7 @@ class Lockstep:
     """
 
     def __init__(self, make: Callable[[], Any], num_envs: int, crashes: int = 0, states: bool = False) -> None:
-        self._make, self._most_crashes, self._gives_states = make, crashes, states
+        self._make, self._gives_states = make, states
         envs = [make() for _ in range(num_envs)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
         spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.agents]
@@ -75,7 +73,7 @@ class Lockstep:
         self._actions = [from_gymnasium(action_space(envs[0], agent)) for agent in self.agents]
         self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
         self._seeds = np.zeros(num_envs, np.int64)
-        self._crashes = [0] * num_envs
+        self._crashes = CrashLimit(num_envs, crashes)
         self._groups = np.zeros((num_envs, len(self.agents)), np.int64)
         self._pending: dict[int, Batch] = {}
         self._abandoned = no_envs()
@@ -116,8 +114,7 @@ class Lockstep:
             else:
                 self._check_rewards(env, reports[env])
         finished = [env for env, own in reports.items() if not any(map(_must_act, own))]
-        for env in finished:
-            self._crashes[env] = 0
+        self._crashes.finish(_envs(finished))
         turn = Turn(finished=_envs(finished), crashed=_envs(crashed), last_states=self._states(finished))
         free = np.union1d(_envs([*finished, *crashed]), self._abandoned)
         self._abandoned = no_envs()
@@ -202,16 +199,7 @@ class Lockstep:
 
     def _crash(self, env: int, error: Exception) -> None:
         """Recreate an environment, or raise the error after too many crashes."""
-        self._crashes[env] += 1
-        if self._crashes[env] > self._most_crashes:
-            raise error
-        logger.warning(
-            "The environment raised in the episode with seed %d and is recreated (%d of %d consecutive times): %s",
-            self._seeds[env],
-            self._crashes[env],
-            self._most_crashes,
-            one_line(error, with_type=True),
-        )
+        self._crashes.count(env, int(self._seeds[env]), error)
         self._busy = None
         with contextlib.suppress(Exception):
             self._envs[env].close()

@@ -1,6 +1,5 @@
 """Steps a vectorised environment, with the results of its stock environment in lockstep."""
 
-import logging
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -12,14 +11,13 @@ from numpy.typing import NDArray
 
 from league.environment_config import EnvironmentConfig
 from league.environments.building import action_space, build, observation_space
+from league.environments.crash_limit import CrashLimit
 from league.environments.episode_replay import EpisodeActions, StepActions
 from league.environments.stepping import Batch, Indices, NextEpisodes, States, Turn, check_actions, no_envs
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, one_line
 from league.spaces import inputs
 from league.spaces.conversion import from_gymnasium
-
-logger = logging.getLogger(__name__)
 
 
 class VectorStepping:
@@ -41,7 +39,7 @@ class VectorStepping:
 
         Raises EnvironmentMismatch if it has other agents than the stock environment.
         """
-        self._config, self._make, self._most_crashes, self._gives_states = config, make, crashes, states
+        self._config, self._make, self._gives_states = config, make, states
         self._vector = make(num_envs)
         self.num_envs = num_envs
         with closing(build(config)) as stock:
@@ -58,7 +56,7 @@ class VectorStepping:
         self._plays = np.zeros(num_envs, dtype=bool)
         """Which environments have an episode."""
         self._groups = np.zeros((num_envs, len(self.agents)), np.int64)
-        self._crashes = np.zeros(num_envs, np.int64)
+        self._crashes = CrashLimit(num_envs, crashes)
         self._seconds = np.zeros(num_envs)
         self._busy, self._since = no_envs(), 0.0
         self._pending: dict[int, Batch] = {}
@@ -83,7 +81,7 @@ class VectorStepping:
         finished = np.flatnonzero(self._plays & ~self._acts(rows))
         if len(crashed):
             finished = np.setdiff1d(finished, crashed)
-        self._crashes[finished] = 0
+        self._crashes.finish(finished)
         turn = Turn(finished=finished, crashed=crashed, last_states=self._states(finished))
         turn.endings = [_rows(block, ended) for block in rows if len(ended := np.flatnonzero(_has_ended(block)))]
         self._plays[finished] = self._plays[crashed] = False
@@ -191,7 +189,7 @@ class VectorStepping:
             except LeagueError:
                 raise
             except Exception as stock_error:
-                self._count_crash(env, stock_error)
+                self._crashes.count(env, self._episodes.seed(env), stock_error)
                 crashed.append(env)
         self._busy = no_envs()
         if not crashed:
@@ -200,18 +198,6 @@ class VectorStepping:
                 f" {one_line(error, with_type=True)}"
             ) from error
         return np.array(crashed)
-
-    def _count_crash(self, env: int, error: Exception) -> None:
-        self._crashes[env] += 1
-        if self._crashes[env] > self._most_crashes:
-            raise error
-        logger.warning(
-            "The environment raised in the episode with seed %d and is recreated (%d of %d consecutive times): %s",
-            self._episodes.seed(env),
-            self._crashes[env],
-            self._most_crashes,
-            one_line(error, with_type=True),
-        )
 
     def _renew(self, envs: Indices) -> None:
         """Replace the vectorised environment by a new one in which these environments continue their episodes."""

@@ -36,7 +36,7 @@ from training.learners.train_batch import minibatches, train_batch
 from training.modules.actor_critic import ActorCritic
 from training.rllib_compat import EpisodeChunk
 from training.runs.trial import build_algorithm
-from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.rllib_env import LeagueEnv
 
 pytestmark = pytest.mark.usefixtures("ray_session")
@@ -66,8 +66,8 @@ def meeting(**kwargs: Any) -> LeagueConfig:
     )
 
 
-def our_runner(league: LeagueConfig, index: int = 0) -> LockstepEnvRunner:
-    return LockstepEnvRunner(algorithm_config(league, interface(league)), worker_index=index)
+def our_runner(league: LeagueConfig, index: int = 0) -> BatchedEnvRunner:
+    return BatchedEnvRunner(algorithm_config(league, interface(league)), worker_index=index)
 
 
 def rllib_runner(make: Any, agents: list[str], **env_runners: Any) -> MultiAgentEnvRunner:

@@ -1,7 +1,7 @@
 """PPO by self-play: Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347.
 
 An iteration: `PPO.training_step` here, `PPOLearner.update` in training/learners/ppo.py with train_batch.py, and
-`LockstepEnvRunner.sample` in training/sampling/env_runner.py.
+`BatchedEnvRunner.sample` in training/sampling/env_runner.py.
 
 All agents of a policy share one network and learn from their own steps. Illegal actions are masked in the logits, which
 keeps the policy gradient valid (Huang and Ontañón, 2020, arXiv 2006.14171). Advantages are generalised advantage
@@ -34,7 +34,7 @@ from training.algorithms.setup import configure, reset_episodes, rl_module_specs
 from training.learners.ppo import PPOLearner, hyperparameters
 from training.modules.actor_critic import ActorCritic, SharedEncoder
 from training.rllib_compat import NoResultsDirectory
-from training.sampling.env_runner import LEAGUE, LockstepEnvRunner
+from training.sampling.env_runner import LEAGUE, BatchedEnvRunner
 from training.sampling.episode_chunks import EpisodeChunks
 
 
@@ -86,7 +86,7 @@ class PPO(NoResultsDirectory, ppo.PPO):
         return setup.learning_policies(settings, tuple(self.config.policies), self.iteration)
 
 
-def _sample_chunks(runner: LockstepEnvRunner) -> tuple[list[EpisodeChunks], dict[str, Any]]:
+def _sample_chunks(runner: BatchedEnvRunner) -> tuple[list[EpisodeChunks], dict[str, Any]]:
     return runner.sample_chunks(), runner.get_metrics()
 
 
@@ -102,7 +102,7 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
         interface,
         storage,
         modules=module_spec(settings, interface),
-        runner=LockstepEnvRunner,
+        runner=BatchedEnvRunner,
         learner=PPOLearner,
     )
     config.training(

@@ -22,7 +22,7 @@ from league.seeds import derive
 from league.settings import Storage
 from league.training_config import AnyTraining, PhaseConfig, PPOConfig, TrainingSettings
 from training.modules.policy_module import PolicyModule
-from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, LockstepEnvRunner, module_spaces
+from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner, module_spaces
 
 
 def learning_policies(settings: TrainingSettings, policies: tuple[str, ...], iteration: int) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ def configure(
     storage: Storage | None,
     *,
     modules: MultiRLModuleSpec,
-    runner: type[LockstepEnvRunner],
+    runner: type[BatchedEnvRunner],
     learner: type[Learner],
 ) -> None:
     """Set everything in `config` except the algorithm's own hyperparameters.

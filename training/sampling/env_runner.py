@@ -1,4 +1,4 @@
-"""Samples episodes: an RLlib EnvRunner on the league's lockstep stepping."""
+"""Samples episodes: an RLlib EnvRunner on the batched stepping of environments."""
 
 import gc
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -41,7 +41,7 @@ STORAGE = "storage"
 Spaces = dict[str, tuple[gymnasium.Space, gymnasium.Space]]
 
 
-class LockstepEnvRunner(RaisingEnvRunner):
+class BatchedEnvRunner(RaisingEnvRunner):
     """Samples `num_envs_per_env_runner` environments, stepped together.
 
     `sample_chunks` returns columns for the league's learners. `sample` returns SingleAgentEpisode chunks of one agent

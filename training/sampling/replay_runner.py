@@ -10,11 +10,11 @@ from training.modules.distributions import TorchGaussian
 from training.replay_buffer import TransitionBlock
 from training.sampling.closed_transitions import JointTransitions, JointTransitionsWithoutState, PolicyTransitions
 from training.sampling.distributions import OrnsteinUhlenbeck
-from training.sampling.env_runner import LockstepEnvRunner, initial_states, one_thread
+from training.sampling.env_runner import BatchedEnvRunner, initial_states, one_thread
 from training.sampling.episode_chunks import EpisodeChunks
 
 
-class ReplayRunner(LockstepEnvRunner):
+class ReplayRunner(BatchedEnvRunner):
     """Samples each policy's own transitions, for independent learners; turn-based games are supported."""
 
     recorders: type[PolicyTransitions] | type[JointTransitions] = PolicyTransitions

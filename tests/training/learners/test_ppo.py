@@ -17,7 +17,7 @@ from training.algorithms.ppo import algorithm_config
 from training.learners import ppo
 from training.learners.ppo import PPOLearner
 from training.learners.train_batch import train_batch
-from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.episode_chunks import EpisodeChunks
 
 TWO: dict[str, Any] = {"kwargs": {"agents": 2}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
@@ -34,7 +34,7 @@ def learner_of(league: LeagueConfig) -> PPOLearner:
 
 
 def sample_episodes(league: LeagueConfig, steps: int = 256) -> list[EpisodeChunks]:
-    runner = LockstepEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
+    runner = BatchedEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
     try:
         return runner.sample_chunks(num_timesteps=steps)
     finally:

@@ -28,7 +28,7 @@ from tests.support.leagues.training_leagues import counting, tictactoe
 from training.algorithms.ppo import algorithm_config
 from training.learners.train_batch import train_batch
 from training.runs.trial import build_algorithm
-from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.episode_chunks import as_episodes
 from training.sampling.play_metrics import ENTROPY
 
@@ -36,9 +36,9 @@ LIVES = [4, 6]
 CASES = ([], [0], [1], [0, 1])
 
 
-def runner_of(league: LeagueConfig) -> LockstepEnvRunner:
+def runner_of(league: LeagueConfig) -> BatchedEnvRunner:
     config = algorithm_config(league, interface(league))
-    return LockstepEnvRunner(config, worker_index=0)
+    return BatchedEnvRunner(config, worker_index=0)
 
 
 def by_episode(chunks: Iterable[SingleAgentEpisode]) -> dict[tuple[int, int], list[SingleAgentEpisode]]:
@@ -146,7 +146,7 @@ def test_each_reset_has_its_own_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     league = counting(LIVES, [], runners=2)
     config = algorithm_config(league, interface(league))
     for index in (1, 2):
-        runner = LockstepEnvRunner(config, worker_index=index)
+        runner = BatchedEnvRunner(config, worker_index=index)
         for _ in range(3):
             runner.sample(num_timesteps=300, force_reset=True)
     assert len(seeds) > 180

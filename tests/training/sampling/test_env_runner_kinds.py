@@ -34,7 +34,7 @@ from tests.support.leagues import registries
 from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from tests.support.policies.graphs import masked_mlp
 from training.algorithms.ppo import algorithm_config
-from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import CRASHES, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 from training.sampling.reset_seeds import ResetSeeds
@@ -67,9 +67,9 @@ def spread(**training: Any) -> LeagueConfig:
     )
 
 
-def runner_of(league: LeagueConfig, storage: Storage | None = None) -> LockstepEnvRunner:
+def runner_of(league: LeagueConfig, storage: Storage | None = None) -> BatchedEnvRunner:
     torch.manual_seed(0)
-    return LockstepEnvRunner(algorithm_config(league, interface(league), storage), worker_index=0)
+    return BatchedEnvRunner(algorithm_config(league, interface(league), storage), worker_index=0)
 
 
 def columns(chunk: SingleAgentEpisode) -> dict[str, Any]:
@@ -271,7 +271,7 @@ def test_a_fault_at_setup_names_the_league_once() -> None:
     config.env_config["league"]["training"]["opponents"] = [{"ref": "script:random", "share": 1.0}]
     config.env_config["interface"]["sides"] = {"team": ["agent_0", "agent_1", "agent_2"]}
     with pytest.raises(ConfigError, match=r"^league spread: training\.opponents: the league has one side only"):
-        LockstepEnvRunner(config, worker_index=0)
+        BatchedEnvRunner(config, worker_index=0)
 
 
 def test_environments_are_closed_and_rebuilt(monkeypatch: pytest.MonkeyPatch) -> None:

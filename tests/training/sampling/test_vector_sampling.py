@@ -14,7 +14,7 @@ from training.algorithms.ppo import algorithm_config
 from training.learners.ppo import PPOLearner
 from training.rllib_compat import TrainingData
 from training.sampling import env_runner
-from training.sampling.env_runner import LockstepEnvRunner
+from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.episode_chunks import EpisodeChunks
 
 OPPONENT = {"ref": "script:random", "share": 0.5}
@@ -34,7 +34,7 @@ def trained(league: LeagueConfig) -> tuple[list[list[EpisodeChunks]], dict[str, 
     """Three samples with an update after each, and the final weights."""
     config = algorithm_config(league, interface(league))
     torch.manual_seed(0)
-    runner = LockstepEnvRunner(config, worker_index=0)
+    runner = BatchedEnvRunner(config, worker_index=0)
     learner = PPOLearner(config=config, module_spec=config.rl_module_spec)
     learner.build()
     samples = []

@@ -5,6 +5,11 @@ from typing import Any
 
 from league.environments.vector.vector_env import UnsupportedArguments
 
+COMMON = {"render_mode": None, "dynamic_rescaling": True, "benchmark_data": False}
+NEIGHBORS = {"num_agent_neighbors": None, "num_landmark_neighbors": None}
+CURRICULUM = {"curriculum": False, "terminate_on_success": False}
+"""Arguments that are not implemented, with their defaults: of all environments, and of some."""
+
 
 def reject_changed(arguments: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
     """Raise UnsupportedArguments unless these arguments exist and have their defaults."""

@@ -72,6 +72,11 @@ class ParticleEnv(VectorEnv):
         """Return the positions of the goals, (goals, 2, n)."""
         return particles.positions[self.landmarks][particles.goals, :, np.arange(len(particles.steps))].swapaxes(1, 2)
 
+    def relative_positions(self, particles: Particles, agent: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the positions of landmarks and of other agents relative to an agent, (2 · entities, n) each."""
+        positions = particles.positions
+        return relative(positions, agent, self.landmarks), relative(positions, agent, self.others[agent])
+
     def _controls(self, actions: NDArray[Any]) -> NDArray[np.float64]:
         """Return horizontal and vertical controls in [-1, 1], (agents, 2, n)."""
         if not self._continuous:

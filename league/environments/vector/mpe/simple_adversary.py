@@ -6,18 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector.mpe.arguments import check_counts, reject_changed
+from league.environments.vector.mpe.arguments import COMMON, NEIGHBORS, check_counts, reject_changed
 from league.environments.vector.mpe.initial_states import goals_and_positions
-from league.environments.vector.mpe.particle_env import ParticleEnv, relative
+from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
-
-NOT_IMPLEMENTED = {
-    "render_mode": None,
-    "dynamic_rescaling": True,
-    "benchmark_data": False,
-    "num_agent_neighbors": None,
-    "num_landmark_neighbors": None,
-}
 
 
 class SimpleAdversary(ParticleEnv):
@@ -31,7 +23,7 @@ class SimpleAdversary(ParticleEnv):
         continuous_actions: bool = False,
         **others: Any,
     ) -> None:
-        reject_changed(others, NOT_IMPLEMENTED)
+        reject_changed(others, COMMON | NEIGHBORS)
         check_counts(1, N=N)
         agents = ["adversary_0", *(f"agent_{i}" for i in range(N))]
         world = World(num_agents=N + 1, num_landmarks=N, sizes=(), accelerations=[5.0] * (N + 1))
@@ -44,9 +36,10 @@ class SimpleAdversary(ParticleEnv):
 
     def observation(self, particles: Particles, agent: int) -> Sequence[NDArray[Any]]:
         """See ParticleEnv."""
-        positions = particles.positions
-        entities = relative(positions, agent, self.landmarks), relative(positions, agent, self.others[agent])
-        return entities if agent == 0 else (self.goal_positions(particles)[0] - positions[agent], *entities)
+        entities = self.relative_positions(particles, agent)
+        if agent == 0:
+            return entities
+        return self.goal_positions(particles)[0] - particles.positions[agent], *entities
 
     def rewards(self, particles: Particles) -> NDArray[np.float64]:
         """Reward the adversary for its own distance from the goal, and the agents for both sides' distances."""

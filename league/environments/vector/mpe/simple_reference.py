@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector.mpe.arguments import check_ratio, reject_changed
+from league.environments.vector.mpe.arguments import COMMON, check_ratio, reject_changed
 from league.environments.vector.mpe.initial_states import goals_and_positions
 from league.environments.vector.mpe.particle_env import ParticleEnv, relative
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
 
 COLORS = np.array([[0.75, 0.25, 0.25], [0.25, 0.75, 0.25], [0.25, 0.25, 0.75]])
 """Of the landmarks, in rows: red, green, blue."""
-NOT_IMPLEMENTED = {"render_mode": None, "dynamic_rescaling": True, "benchmark_data": False}
 
 
 class SimpleReference(ParticleEnv):
@@ -30,7 +29,7 @@ class SimpleReference(ParticleEnv):
         continuous_actions: bool = False,
         **others: Any,
     ) -> None:
-        reject_changed(others, NOT_IMPLEMENTED)
+        reject_changed(others, COMMON)
         check_ratio(local_ratio)
         self._local_ratio = local_ratio
         world = World(num_agents=2, num_landmarks=3, sizes=(), accelerations=[5.0, 5.0], num_symbols=10)

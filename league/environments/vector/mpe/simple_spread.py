@@ -6,21 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector.mpe.arguments import check_counts, check_ratio, reject_changed
+from league.environments.vector.mpe.arguments import (
+    COMMON,
+    CURRICULUM,
+    NEIGHBORS,
+    check_counts,
+    check_ratio,
+    reject_changed,
+)
 from league.environments.vector.mpe.initial_states import positions_only
-from league.environments.vector.mpe.particle_env import ParticleEnv, relative
+from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
 
 SIZE = 0.15
-NOT_IMPLEMENTED = {
-    "render_mode": None,
-    "dynamic_rescaling": True,
-    "benchmark_data": False,
-    "curriculum": False,
-    "terminate_on_success": False,
-    "num_agent_neighbors": None,
-    "num_landmark_neighbors": None,
-}
 
 
 class SimpleSpread(ParticleEnv):
@@ -35,7 +33,7 @@ class SimpleSpread(ParticleEnv):
         continuous_actions: bool = False,
         **others: Any,
     ) -> None:
-        reject_changed(others, NOT_IMPLEMENTED)
+        reject_changed(others, COMMON | NEIGHBORS | CURRICULUM)
         check_counts(1, N=N)
         check_ratio(local_ratio)
         self._local_ratio = local_ratio
@@ -49,13 +47,12 @@ class SimpleSpread(ParticleEnv):
 
     def observation(self, particles: Particles, agent: int) -> Sequence[NDArray[Any]]:
         """See ParticleEnv."""
-        positions, others = particles.positions, self.others[agent]
+        silence = np.zeros((2 * len(self.others[agent]), len(particles.steps)), dtype=np.float32)
         return (
             particles.velocities[agent],
-            positions[agent],
-            relative(positions, agent, self.landmarks),
-            relative(positions, agent, others),
-            np.zeros((2 * len(others), positions.shape[-1]), dtype=np.float32),
+            particles.positions[agent],
+            *self.relative_positions(particles, agent),
+            silence,
         )
 
     def rewards(self, particles: Particles) -> NDArray[np.float64]:

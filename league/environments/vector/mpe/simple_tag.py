@@ -7,22 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.vector import pcg64
-from league.environments.vector.mpe.arguments import check_counts, reject_changed
-from league.environments.vector.mpe.particle_env import ParticleEnv, relative
+from league.environments.vector.mpe.arguments import COMMON, CURRICULUM, NEIGHBORS, check_counts, reject_changed
+from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
 
 ADVERSARY_SIZE, GOOD_SIZE, OBSTACLE_SIZE = 0.075, 0.05, 0.2
 ADVERSARY_ACCELERATION, GOOD_ACCELERATION = 3.0, 4.0
 ADVERSARY_SPEED, GOOD_SPEED = 1.0, 1.3
-NOT_IMPLEMENTED = {
-    "render_mode": None,
-    "dynamic_rescaling": True,
-    "benchmark_data": False,
-    "curriculum": False,
-    "terminate_on_success": False,
-    "num_agent_neighbors": None,
-    "num_landmark_neighbors": None,
-}
 
 
 class SimpleTag(ParticleEnv):
@@ -38,7 +29,7 @@ class SimpleTag(ParticleEnv):
         continuous_actions: bool = False,
         **others: Any,
     ) -> None:
-        reject_changed(others, NOT_IMPLEMENTED)
+        reject_changed(others, COMMON | NEIGHBORS | CURRICULUM)
         check_counts(1, num_good=num_good, num_adversaries=num_adversaries)
         check_counts(0, num_obstacles=num_obstacles)
         self._adversaries = num_adversaries
@@ -61,13 +52,12 @@ class SimpleTag(ParticleEnv):
 
     def observation(self, particles: Particles, agent: int) -> Sequence[NDArray[Any]]:
         """See ParticleEnv."""
-        positions, velocities, others = particles.positions, particles.velocities, self.others[agent]
+        velocities, others = particles.velocities, self.others[agent]
         good = others[others >= self._adversaries]
         return (
             velocities[agent],
-            positions[agent],
-            relative(positions, agent, self.landmarks),
-            relative(positions, agent, others),
+            particles.positions[agent],
+            *self.relative_positions(particles, agent),
             velocities[good].reshape(2 * len(good), velocities.shape[-1]),
         )
 

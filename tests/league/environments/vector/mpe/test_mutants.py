@@ -76,6 +76,7 @@ PARTICLE_ENV = [
     Fault("particle_env", "particles.steps >= self._max_cycles", "particles.steps > self._max_cycles"),
     Fault("particle_env", "[0.0, -1.0, 1.0, 0.0, 0.0]", "[0.0, 1.0, -1.0, 0.0, 0.0]"),
     Fault("particle_env", "np.tile(np.array(agents), len(env_ids))", "np.array(agents).repeat(len(env_ids))"),
+    Fault("particle_env", "agent, self.others[agent])", "agent, self.others[agent][::-1])"),
     Fault("particle_env", "env_ids.repeat(len(agents))", "np.tile(env_ids, len(agents))"),
     Fault("particle_env", "dtype=np.float32, casting", "dtype=np.float64, casting"),
     Fault(
@@ -110,15 +111,14 @@ SPREAD = [
     Fault("simple_spread", ".min(axis=0):", ".min(axis=0)[::-1]:"),
     Fault("simple_spread", "< SIZE + SIZE", "< SIZE"),
     Fault("simple_spread", "collisions[b] -= hits", "collisions[b] += hits"),
-    Fault("simple_spread", "np.zeros((2 * len(others)", "np.ones((2 * len(others)"),
-    Fault("simple_spread", "relative(positions, agent, others)", "relative(positions, agent, others[::-1])"),
+    Fault("simple_spread", "silence = np.zeros(", "silence = np.ones("),
 ]
 ADVERSARY = [
-    Fault("simple_adversary", "[0] - positions[agent]", "[0] + positions[agent]", "simple_adversary"),
+    Fault("simple_adversary", "[0] - particles.", "[0] + particles.", "simple_adversary"),
     Fault("simple_adversary", "+ distances[0]", "- distances[0]", "simple_adversary"),
     Fault("simple_adversary", "-distances[1:].min", "-distances.min", "simple_adversary"),
     Fault("simple_adversary", "[-distances[0], *", "[distances[0], *", "simple_adversary"),
-    Fault("simple_adversary", "entities if agent == 0", "entities if agent == 1", "simple_adversary"),
+    Fault("simple_adversary", "if agent == 0:", "if agent == 1:", "simple_adversary"),
     Fault(
         "simple_adversary",
         "draw(self, seeds: NDArray[np.int64]) -> Particles:",

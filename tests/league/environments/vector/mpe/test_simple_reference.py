@@ -2,42 +2,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from league.environment_config import EnvironmentConfig
-from league.environments.vector.equality import DifferentialTest, compare
+from league.environments.vector.equality import DifferentialTest
 from league.environments.vector.mpe.simple_reference import SimpleReference
-from league.environments.vector.vector_env import UnsupportedArguments
-from tests.support.environments.plans import Plan, assert_equal, plans
-
-arguments = st.fixed_dictionaries(
-    {},
-    optional={
-        "local_ratio": st.sampled_from([0, 0.25, 0.5, 0.9, 1]),
-        "max_cycles": st.integers(1, 12),
-        "continuous_actions": st.booleans(),
-    },
-)
 
 
 def config(**kwargs: Any) -> EnvironmentConfig:
     return EnvironmentConfig(entry_point="mpe2.simple_reference_v3", kwargs=kwargs)
-
-
-@settings(max_examples=12)
-@given(plans, arguments)
-def test_all_reports_equal_those_of_the_stock_environment(plan: Plan, kwargs: dict[str, Any]) -> None:
-    assert_equal(config(**kwargs), SimpleReference(plan.num_envs, **kwargs), plan)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("kwargs", [{}, {"continuous_actions": True}], ids=str)
-def test_a_million_agent_steps_equal_those_of_the_stock_environment(kwargs: dict[str, Any]) -> None:
-    found = compare(config(**kwargs), SimpleReference(64, **kwargs), 250_000, seed=1)
-    assert found.difference is None
-    assert found.episodes > 9_000
 
 
 def test_each_of_the_fifty_actions_moves_and_speaks() -> None:
@@ -60,9 +32,3 @@ def test_continuous_messages_are_clipped(dtype: Any) -> None:
         test.step(copy, np.full((2, 15), value, dtype=dtype))
         assert test.rows[0].observations["observation"][0, 11:].tolist() == [np.float32(np.clip(value, 0, 1))] * 10
     test.close()
-
-
-@pytest.mark.parametrize("kwargs", [{"local_ratio": -1}, {"benchmark_data": True}, {"N": 3}], ids=str)
-def test_other_arguments_are_left_to_the_stock_environment(kwargs: dict[str, Any]) -> None:
-    with pytest.raises(UnsupportedArguments, match=next(iter(kwargs))):
-        SimpleReference(1, **kwargs)

@@ -2,46 +2,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from league.environment_config import EnvironmentConfig
-from league.environments.vector.equality import DifferentialTest, compare
+from league.environments.vector.equality import DifferentialTest
 from league.environments.vector.mpe.initial_states import positions_only
 from league.environments.vector.mpe.particles import lengths
 from league.environments.vector.mpe.simple_spread import SIZE, SimpleSpread
-from league.environments.vector.vector_env import UnsupportedArguments
-from tests.support.environments.plans import Plan, assert_equal, plans
 
 STAY, LEFT, RIGHT, DOWN, UP = range(5)
-arguments = st.fixed_dictionaries(
-    {},
-    optional={
-        "N": st.integers(1, 4),
-        "local_ratio": st.sampled_from([0, 0.25, 0.5, 0.9, 1]),
-        "max_cycles": st.integers(0, 12),
-        "continuous_actions": st.booleans(),
-    },
-)
 
 
 def config(**kwargs: Any) -> EnvironmentConfig:
     return EnvironmentConfig(entry_point="mpe2.simple_spread_v3", kwargs=kwargs)
-
-
-@settings(max_examples=12)
-@given(plans, arguments)
-def test_all_reports_equal_those_of_the_stock_environment(plan: Plan, kwargs: dict[str, Any]) -> None:
-    assert_equal(config(**kwargs), SimpleSpread(plan.num_envs, **kwargs), plan)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("kwargs", [{}, {"continuous_actions": True}], ids=str)
-def test_a_million_agent_steps_equal_those_of_the_stock_environment(kwargs: dict[str, Any]) -> None:
-    found = compare(config(**kwargs), SimpleSpread(64, **kwargs), 170_000, seed=1)
-    assert found.difference is None
-    assert found.episodes > 6_000
 
 
 def touching_agents(agents: int) -> int:
@@ -98,29 +70,6 @@ def test_continuous_actions_are_clipped(dtype: Any) -> None:
     ):
         test.step(copy, np.array([action, action[::-1]], dtype=dtype))
     test.close()
-
-
-@pytest.mark.parametrize(
-    "kwargs",
-    [
-        {"N": 0},
-        {"N": 2.0},
-        {"local_ratio": 1.5},
-        {"local_ratio": None},
-        {"dynamic_rescaling": False},
-        {"benchmark_data": True},
-        {"curriculum": True},
-        {"terminate_on_success": True},
-        {"num_agent_neighbors": 1},
-        {"num_landmark_neighbors": 1},
-        {"render_mode": "rgb_array"},
-        {"unknown": 1},
-    ],
-    ids=str,
-)
-def test_other_arguments_are_left_to_the_stock_environment(kwargs: dict[str, Any]) -> None:
-    with pytest.raises(UnsupportedArguments, match=next(iter(kwargs))):
-        SimpleSpread(1, **kwargs)
 
 
 def test_default_values_of_other_arguments_are_accepted() -> None:

@@ -2,47 +2,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from league.environment_config import EnvironmentConfig
-from league.environments.vector.equality import DifferentialTest, compare
+from league.environments.vector.equality import DifferentialTest
 from league.environments.vector.mpe.simple_tag import SimpleTag, bound_penalties
-from league.environments.vector.vector_env import AgentRows, UnsupportedArguments
-from tests.support.environments.plans import Plan, assert_equal, plans
+from league.environments.vector.vector_env import AgentRows
 
 STAY, LEFT, RIGHT, DOWN, UP = range(5)
 CENTRAL = (85, 93, 133, 137)
 """Seeds with which a good agent starts near the centre, far from its adversary."""
-arguments = st.fixed_dictionaries(
-    {},
-    optional={
-        "num_good": st.integers(1, 2),
-        "num_adversaries": st.integers(1, 3),
-        "num_obstacles": st.integers(0, 2),
-        "max_cycles": st.integers(1, 12),
-        "continuous_actions": st.booleans(),
-    },
-)
 
 
 def config(**kwargs: Any) -> EnvironmentConfig:
     return EnvironmentConfig(entry_point="mpe2.simple_tag_v3", kwargs=kwargs)
-
-
-@settings(max_examples=12)
-@given(plans, arguments)
-def test_all_reports_equal_those_of_the_stock_environment(plan: Plan, kwargs: dict[str, Any]) -> None:
-    assert_equal(config(**kwargs), SimpleTag(plan.num_envs, **kwargs), plan)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("kwargs", [{}, {"continuous_actions": True}], ids=str)
-def test_a_million_agent_steps_equal_those_of_the_stock_environment(kwargs: dict[str, Any]) -> None:
-    found = compare(config(**kwargs), SimpleTag(64, **kwargs), 125_000, seed=1)
-    assert found.difference is None
-    assert found.episodes > 4_500
 
 
 def played(seed: int, actions: list[list[int]], **kwargs: Any) -> list[list[AgentRows]]:
@@ -105,11 +77,3 @@ def test_penalties_at_their_limits() -> None:
     assert found[6] == np.exp(2.0)
     assert found[7:].tolist() == [10, 10]
     assert (np.diff(found) >= 0).all()
-
-
-@pytest.mark.parametrize(
-    "kwargs", [{"num_good": 0}, {"num_adversaries": 0}, {"num_obstacles": -1}, {"terminate_on_success": True}], ids=str
-)
-def test_other_arguments_are_left_to_the_stock_environment(kwargs: dict[str, Any]) -> None:
-    with pytest.raises(UnsupportedArguments, match=next(iter(kwargs))):
-        SimpleTag(1, **kwargs)
