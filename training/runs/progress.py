@@ -51,7 +51,7 @@ class TrainingProgress(ProgressDisplay):
 
     def update(self, metrics: Mapping[str, Any]) -> None:
         """Show a trial's latest metrics."""
-        done = fraction(metrics, self._settings)
+        done = self._settings.budget_spent(metrics["steps"], metrics["seconds"])
         steps, pace = f"{metrics['steps']:,} steps", _pace(metrics, done)
         doing = policy_summaries(metrics, self._policies)
         if self._console.is_terminal:
@@ -68,14 +68,6 @@ class TrainingProgress(ProgressDisplay):
             f"Published {version.ref} after {version.steps:,} steps: matches the trained policy on "
             f"{observations:,} observations."
         )
-
-
-def fraction(metrics: Mapping[str, Any], settings: TrainingSettings) -> float:
-    """Return the fraction of the budget spent: of steps or of time, whichever is larger."""
-    spent = metrics["steps"] / settings.steps
-    if settings.minutes is not None:
-        spent = max(spent, metrics["seconds"] / (60 * settings.minutes))
-    return min(spent, 1.0)
 
 
 def policy_summaries(metrics: Mapping[str, Any], policies: tuple[str, ...]) -> str:
