@@ -2,8 +2,8 @@
 
 docs/training.md explains the curves. In addition: `episodes` and `crashes`, the episodes that ended and that were lost
 because the environment raised; `agents/<agent>/return` and `length` of one agent; `time/<phase>`, wall time since the
-last report in seconds; with a GPU, `gpu/memory_gb`, the learner's peak memory, and `gpu/utilization`. A centralised
-off-policy learner reports under `joint`.
+last report in seconds, with `time/other` for the rest; with a GPU, `gpu/memory_gb`, the learner's peak memory, and
+`gpu/utilization`. A centralised off-policy learner reports under `joint`.
 """
 
 import math
@@ -39,6 +39,8 @@ PHASES = {
     "time/weights": SYNCH_WORKER_WEIGHTS_TIMER,
 }
 CHECKPOINT_TIME = "time/checkpoint"
+OTHER_TIME = "time/other"
+"""Wall time of updates outside of the phases: RLlib's bookkeeping and metrics."""
 PPO_METRICS = {
     "policy_loss": "policy_loss",
     "value_loss": "vf_loss",

@@ -26,7 +26,15 @@ from league.files import move_durably
 from league.interface import Interface
 from league.settings import Storage
 from league.training_config import ScheduleProgress
-from training.algorithms.metrics import CHECKPOINT_TIME, gpu_use, time_each_update, totals, training_metrics
+from training.algorithms.metrics import (
+    CHECKPOINT_TIME,
+    OTHER_TIME,
+    PHASES,
+    gpu_use,
+    time_each_update,
+    totals,
+    training_metrics,
+)
 from training.algorithms.setup import algorithm_config
 from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
@@ -109,7 +117,8 @@ class Trial(tune.Trainable):
             sums.update(totals(result))
         elapsed = time.monotonic() - began
         if self.steps > steps:
-            metrics |= sums | gpu_use() | {"steps_per_second": (self.steps - steps) / elapsed}
+            other = elapsed - sum(sums[phase] for phase in PHASES)
+            metrics |= sums | gpu_use() | {OTHER_TIME: other, "steps_per_second": (self.steps - steps) / elapsed}
         done = self._spent() or self._stop_requested()
         if (done or self._due()) and self.steps > self.saved_steps:
             saving = time.monotonic()

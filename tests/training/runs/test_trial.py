@@ -84,6 +84,7 @@ def test_checkpoints_are_saved_at_their_interval_with_the_curves(tmp_path: Path)
         assert metric_names(interface(complete.league)) <= result.keys()
         assert result["time/sampling"] > 0
         assert result["time/learning"] > 0
+        assert result["time/other"] > 0
         assert result["episodes"] > 0
         assert result["crashes"] == 0
         assert result["shared/return"] == 0, "the game is zero-sum"
