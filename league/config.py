@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from league.environment_config import JSON, EnvironmentConfig, Part
 from league.errors import ConfigError, InvalidReference, one_line
 from league.refs import check_slug
-from league.training_config import ALGORITHMS, PPOConfig, TrainingConfig
+from league.training_config import ALGORITHMS, SCHEDULE_FORMS, PPOConfig, TrainingConfig
 
 RENAMED_KEYS = {"copies": "num_envs"}
 """Former key → current key."""
@@ -242,6 +242,7 @@ def _describe_one(model: type[BaseModel], detail: Any) -> str:
     if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
         # Pydantic includes the member of the union in the path.
         known_by = ALGORITHMS[path.pop(1)]
+        path = [part for part in path if part not in SCHEDULE_FORMS]
     key = ".".join(path) or "file"
     match detail["type"]:
         case "missing":

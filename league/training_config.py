@@ -1,9 +1,11 @@
 """The `training` section of a league's configuration: common settings and one class per algorithm."""
 
+import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from itertools import pairwise
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from league.environment_config import Part
 
@@ -47,14 +49,91 @@ class PhaseConfig(Part):
     """Number of updates. The phases are repeated in order."""
 
 
+class ScheduleProgress(NamedTuple):
+    """How far training is."""
+
+    steps: int
+    """Actions of all agents, including those of parent versions."""
+    budget: float
+    """Fraction of the run's budget that is spent, 0 to 1."""
+
+
+class AnnealingConfig(Part):
+    """A schedule from `initial` to `final`."""
+
+    schedule: Literal["linear", "cosine"] = "linear"
+    """cosine: half a period, slow at both ends (Loshchilov and Hutter, 2017, arXiv 1608.03983, equation 5)."""
+    initial: float = Field(ge=0)
+    final: float = Field(ge=0)
+    steps: int | None = Field(default=None, ge=1)
+    """Number of actions of all agents, including those of parent versions; null: the budget of the run, of steps or of
+    time, whichever is spent first."""
+
+    def at(self, progress: ScheduleProgress) -> float:
+        """Return the current value."""
+        done = progress.budget if self.steps is None else min(progress.steps / self.steps, 1.0)
+        share = (1 - math.cos(math.pi * done)) / 2 if self.schedule == "cosine" else done
+        return (1 - share) * self.initial + share * self.final
+
+
+Points = tuple[tuple[Annotated[int, Field(ge=0)], Annotated[float, Field(ge=0)]], ...]
+"""A piecewise linear schedule: pairs of a number of actions, including those of parent versions, and a value. Constant
+before the first and after the last pair."""
+
+
+def _check_points(points: Points) -> Points:
+    steps = [step for step, _ in points]
+    if not steps or any(first >= second for first, second in pairwise(steps)):
+        raise ValueError(f"expected [step, value] pairs with increasing steps, got {[list(pair) for pair in points]}")
+    return points
+
+
+def _schedule_form(value: Any) -> str:
+    if isinstance(value, Mapping | AnnealingConfig):
+        return "annealing"
+    return "points" if isinstance(value, list | tuple) else "constant"
+
+
+SCHEDULE_FORMS = ("annealing", "points", "constant")
+"""Pydantic includes them in the paths of errors."""
+_Annealing = Annotated[AnnealingConfig, Tag("annealing")]
+_Points = Annotated[Points, AfterValidator(_check_points), Tag("points")]
+Scheduled = Annotated[
+    _Annealing | _Points | Annotated[float, Field(ge=0), Tag("constant")], Discriminator(_schedule_form)
+]
+"""A number, or a schedule of it."""
+ScheduledPositive = Annotated[
+    _Annealing | _Points | Annotated[float, Field(gt=0), Tag("constant")], Discriminator(_schedule_form)
+]
+
+
+def scheduled_value(value: Scheduled, progress: ScheduleProgress) -> float:
+    """Return the current value of a setting that is a number or a schedule."""
+    if isinstance(value, AnnealingConfig):
+        return value.at(progress)
+    if isinstance(value, tuple):
+        return _interpolated(value, progress.steps)
+    return value
+
+
+def _interpolated(points: Points, steps: int) -> float:
+    before = [point for point in points if point[0] <= steps]
+    after = [point for point in points if point[0] > steps]
+    if not before or not after:
+        return (before[-1] if before else after[0])[1]
+    (first, low), (second, high) = before[-1], after[0]
+    share = (steps - first) / (second - first)
+    return (1 - share) * low + share * high
+
+
 class PolicySettings(Part):
     """Settings of PPO for one policy; null for the common value. See PPOConfig."""
 
-    lr: float | None = Field(default=None, gt=0)
+    lr: ScheduledPositive | None = None
     gamma: float | None = Field(default=None, ge=0, le=1)
     lambda_: float | None = Field(default=None, ge=0, le=1, alias="lambda")
-    clip: float | None = Field(default=None, gt=0)
-    entropy: float | None = Field(default=None, ge=0)
+    clip: ScheduledPositive | None = None
+    entropy: Scheduled | None = None
 
 
 class TrainingSettings(Part):
@@ -75,8 +154,6 @@ class TrainingSettings(Part):
     num_envs: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Environments stepped in parallel in each runner. auto: 32; with PPO and a vectorised environment up to 512, as
     long as each agent gets 16 steps of each environment per batch."""
-    lr: float = Field(default=3e-4, gt=0)
-    """Learning rate of Adam."""
     gamma: float = Field(default=0.99, ge=0, le=1)
     """Discount factor per turn of an agent."""
     grad_clip: float = Field(default=0.5, gt=0)
@@ -108,11 +185,23 @@ class TrainingSettings(Part):
             raise ValueError(f"the shares of opponents must sum to at most 1, got {total:g}")
         return self
 
+    def budget_spent(self, steps: int, seconds: float) -> float:
+        """Return the fraction of the budget that a run has spent, of steps or of time, whichever is larger; at most 1.
+
+        Args:
+            steps: Actions of the run, without those of parent versions.
+            seconds: Training time of the run.
+        """
+        of_time = seconds / (60 * self.minutes) if self.minutes is not None else 0.0
+        return min(max(steps / self.steps, of_time), 1.0)
+
 
 class PPOConfig(TrainingSettings):
     """Proximal policy optimisation (Schulman et al., 2017, arXiv 1707.06347)."""
 
     algorithm: Literal["ppo"] = "ppo"
+    lr: ScheduledPositive = 3e-4
+    """Learning rate of Adam."""
     train_batch_size: int = Field(default=2048, ge=1)
     """Actions per update."""
     minibatch_size: int = Field(default=256, ge=1)
@@ -121,9 +210,9 @@ class PPOConfig(TrainingSettings):
     """Passes over each train batch."""
     lambda_: float = Field(default=0.95, ge=0, le=1, alias="lambda")
     """λ of generalised advantage estimation."""
-    clip: float = Field(default=0.2, gt=0)
+    clip: ScheduledPositive = 0.2
     """Clipping range of the probability ratio."""
-    entropy: float = Field(default=0.05, ge=0)
+    entropy: Scheduled = 0.05
     """Coefficient of the entropy bonus."""
     value_loss: float = Field(default=0.5, ge=0)
     """Coefficient of the value loss."""
@@ -172,6 +261,8 @@ class ExplorationConfig(Part):
 class OffPolicyConfig(TrainingSettings):
     """Settings common to algorithms with a replay buffer."""
 
+    lr: float = Field(default=3e-4, gt=0)
+    """Learning rate of Adam."""
     grad_clip: float = Field(default=10.0, gt=0)
     replay_capacity: int = Field(default=100_000, ge=1)
     """Capacity of the replay buffer: transitions of each policy, or joint transitions of all agents."""

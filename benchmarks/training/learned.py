@@ -25,6 +25,7 @@ from ray.rllib.utils.metrics import (
 
 from league.config import LeagueConfig
 from league.environments.building import interface
+from league.training_config import ScheduleProgress
 from training.runs.trial import build_algorithm
 
 Work, Result = TypeVar("Work"), TypeVar("Result")
@@ -99,6 +100,7 @@ def learn(
 def _updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[CurvePoint]:
     taken, spent = 0, 0.0
     while spent < seconds and taken < steps:
+        algorithm.progress = ScheduleProgress(taken, max(spent / seconds, taken / steps))
         began = time.perf_counter()
         play = algorithm.train()[ENV_RUNNER_RESULTS]
         spent += time.perf_counter() - began

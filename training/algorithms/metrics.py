@@ -2,8 +2,8 @@
 
 docs/training.md explains the curves. In addition: `episodes` and `crashes`, the episodes that ended and that were lost
 because the environment raised; `agents/<agent>/return` and `length` of one agent; `time/<phase>`, wall time since the
-last report in seconds; with a GPU, `gpu/memory_gb`, the learner's peak memory, and `gpu/utilization`. A centralised
-off-policy learner reports under `joint`.
+last report in seconds, with `time/other` for the rest; with a GPU, `gpu/memory_gb`, the learner's peak memory, and
+`gpu/utilization`. A centralised off-policy learner reports under `joint`.
 """
 
 import math
@@ -28,6 +28,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.interface import Interface
+from training.learners.ppo import SCHEDULES
 from training.sampling.closed_transitions import JOINT
 from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 
@@ -38,6 +39,8 @@ PHASES = {
     "time/weights": SYNCH_WORKER_WEIGHTS_TIMER,
 }
 CHECKPOINT_TIME = "time/checkpoint"
+OTHER_TIME = "time/other"
+"""Wall time of updates outside of the phases: RLlib's bookkeeping and metrics."""
 PPO_METRICS = {
     "policy_loss": "policy_loss",
     "value_loss": "vf_loss",
@@ -92,6 +95,7 @@ def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[st
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
         found |= {f"{key}/{name}": learned.get(metric) for name, metric in PPO_METRICS.items()}
+        found |= {f"{key}/{name}": learned.get(name) for name in SCHEDULES.values()}
         found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
     return {name: float(value) for name, value in found.items() if value is not None}
 

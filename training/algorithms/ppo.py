@@ -28,7 +28,7 @@ from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
-from league.training_config import PPOConfig
+from league.training_config import PPOConfig, ScheduleProgress
 from training.algorithms import setup
 from training.algorithms.setup import configure, reset_episodes, rl_module_specs
 from training.learners.ppo import PPOLearner, hyperparameters
@@ -41,6 +41,9 @@ from training.sampling.episode_chunks import EpisodeChunks
 class PPO(NoResultsDirectory, ppo.PPO):
     """RLlib's PPO with updates restricted to the policies that currently learn."""
 
+    progress = ScheduleProgress(steps=0, budget=0.0)
+    """Where the schedules are in the next iteration. Set before each iteration."""
+
     def training_step(self) -> None:
         """Sample a batch, update the learning policies, and send changed weights to the runners."""
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
@@ -50,6 +53,7 @@ class PPO(NoResultsDirectory, ppo.PPO):
             learned = self.learner_group.update(
                 episodes=chunks,
                 policies=self._learning(),
+                progress=self.progress,
                 num_epochs=self.config.num_epochs,
                 minibatch_size=self.config.minibatch_size,
             )
@@ -109,11 +113,8 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
         train_batch_size_per_learner=settings.train_batch_size,
         minibatch_size=settings.minibatch_size,
         num_epochs=settings.epochs,
-        lr=settings.lr,
         gamma=settings.gamma,
         lambda_=settings.lambda_,
-        clip_param=settings.clip,
-        entropy_coeff=settings.entropy,
         vf_loss_coeff=settings.value_loss,
         vf_clip_param=float("inf"),
         use_kl_loss=False,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from league.config import LeagueConfig
 from league.errors import ConfigError
-from league.training_config import PPOConfig
+from league.training_config import PPOConfig, Scheduled, ScheduleProgress, scheduled_value
 from training.learners.train_batch import (
     Bootstraps,
     Minibatch,
@@ -29,10 +29,12 @@ from training.rllib_compat import FixedPoliciesLearner, TrainingData
 from training.sampling.env_runner import LEAGUE
 from training.sampling.episode_chunks import EpisodeChunks
 
+NOT_STARTED = ScheduleProgress(steps=0, budget=0.0)
+
 
 @dataclass(frozen=True, slots=True)
 class Hyperparameters:
-    """The hyperparameters that each policy may override. See PPOConfig."""
+    """The current values of the hyperparameters that each policy may override. See PPOConfig."""
 
     lr: float
     gamma: float
@@ -41,20 +43,28 @@ class Hyperparameters:
     entropy: float
 
 
-def hyperparameters(settings: PPOConfig, policies: tuple[str, ...]) -> dict[str, Hyperparameters]:
+def hyperparameters(
+    settings: PPOConfig, policies: tuple[str, ...], progress: ScheduleProgress = NOT_STARTED
+) -> dict[str, Hyperparameters]:
     """Return policy id → its hyperparameters. Raises ConfigError if `per_policy` names an unknown policy."""
     for policy in settings.per_policy:
         if policy not in policies:
             raise ConfigError(f"training.per_policy.{policy}: unknown policy; the league has {', '.join(policies)}")
-    return {policy: _policy_hyperparameters(settings, policy) for policy in policies}
+    names = [field.name for field in fields(Hyperparameters)]
+    return {
+        policy: Hyperparameters(**{name: scheduled_value(_setting(settings, policy, name), progress) for name in names})
+        for policy in policies
+    }
 
 
-def _policy_hyperparameters(settings: PPOConfig, policy: str) -> Hyperparameters:
-    own = settings.per_policy.get(policy)
-    values = {field.name: getattr(settings, field.name) for field in fields(Hyperparameters)}
-    if own is not None:
-        values |= own.model_dump(exclude_none=True)
-    return Hyperparameters(**values)
+def scheduled_hyperparameters(settings: PPOConfig, policy: str) -> tuple[str, ...]:
+    """Return the names of a policy's hyperparameters that have a schedule."""
+    return tuple(name for name in SCHEDULES if not isinstance(_setting(settings, policy, name), float))
+
+
+def _setting(settings: PPOConfig, policy: str, name: str) -> Scheduled:
+    own = getattr(settings.per_policy.get(policy), name, None)
+    return getattr(settings, name) if own is None else own
 
 
 class PPOLoss(NamedTuple):
@@ -110,6 +120,8 @@ STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", "gradient_no
 EXPLAINED_VARIANCE = "vf_explained_var"
 KL = "kl"
 """Mean Kullback–Leibler divergence between the policies before and after an update."""
+SCHEDULES = {"lr": "lr", "clip": "clip", "entropy": "entropy_coefficient"}
+"""Hyperparameters that can have a schedule → their metrics, which are logged only then."""
 KL_STEPS = 1024
 """Number of steps for estimating the divergence."""
 ADAM_EPSILON = 1e-5
@@ -136,7 +148,7 @@ class PPOLearner(FixedPoliciesLearner):
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         assert isinstance(settings, PPOConfig)
         self.settings = settings
-        self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies))
+        self._set_hyperparameters(NOT_STARTED)
         super().build()
 
     @classmethod
@@ -150,15 +162,16 @@ class PPOLearner(FixedPoliciesLearner):
         self._parameters: dict[str, list[torch.nn.Parameter]] = {}
         for policy, module in self.module.items():
             own = [parameter for parameter in module.parameters() if not any(parameter is other for other in common)]
-            self._add_optimizer(policy, own, self.hyperparameters[policy].lr)
+            self._add_optimizer(policy, own)
         if common:
-            self._add_optimizer(ALL_MODULES, common, self.settings.lr)
+            self._add_optimizer(ALL_MODULES, common)
 
     def update(
         self,
         *,
         training_data: TrainingData,
         policies: Collection[str] | None = None,
+        progress: ScheduleProgress = NOT_STARTED,
         num_epochs: int = 1,
         minibatch_size: int | None = None,
         **_: Any,
@@ -168,6 +181,7 @@ class PPOLearner(FixedPoliciesLearner):
         Args:
             training_data: Contains the EpisodeChunks of a sample in place of episodes.
             policies: The policies to update; by default all.
+            progress: Where the schedules are.
             num_epochs: Passes over the data.
             minibatch_size: Steps per minibatch of the policy with the most steps.
 
@@ -175,6 +189,7 @@ class PPOLearner(FixedPoliciesLearner):
             Policy id → metrics, for the policies that were updated.
         """
         self.weights_version += 1
+        self._set_hyperparameters(progress)
         batches = self._batches(training_data.episodes, self.module.keys() if policies is None else policies)
         if batches:
             size = minibatch_size or max(len(batch) for batch in batches.values())
@@ -186,6 +201,10 @@ class PPOLearner(FixedPoliciesLearner):
         metrics = self.metrics.reduce()
         # RLlib reports NaN for policies that were logged earlier but not in this update.
         return {policy: metrics[policy] for policy in batches}
+
+    def _set_hyperparameters(self, progress: ScheduleProgress) -> None:
+        self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies), progress)
+        self._common_lr = scheduled_value(self.settings.lr, progress)
 
     def _batches(self, sampled: Iterable[EpisodeChunks], policies: Collection[str]) -> dict[str, TrainBatch]:
         chunks = defaultdict(list)
@@ -240,13 +259,19 @@ class PPOLearner(FixedPoliciesLearner):
         """Clip the gradients of one optimiser by their global norm, and step unless they are not finite."""
         norm = torch.nn.utils.clip_grad_norm_(self._parameters[name], self.settings.grad_clip)
         if torch.isfinite(norm):
-            self.get_optimizer(module_id=name).step()
+            optimizer = self.get_optimizer(module_id=name)
+            optimizer.param_groups[0]["lr"] = self._lr(name)
+            optimizer.step()
         else:
             logger.warning("Dropped a non-finite gradient of %s.", name)
         return norm
 
-    def _add_optimizer(self, name: str, parameters: list[torch.nn.Parameter], lr: float) -> None:
-        optimizer = torch.optim.Adam(parameters, lr=lr, eps=ADAM_EPSILON, fused=True)
+    def _lr(self, name: str) -> float:
+        """Return the current learning rate of a policy, or of a shared encoder."""
+        return self._common_lr if name == ALL_MODULES else self.hyperparameters[name].lr
+
+    def _add_optimizer(self, name: str, parameters: list[torch.nn.Parameter]) -> None:
+        optimizer = torch.optim.Adam(parameters, lr=self._lr(name), eps=ADAM_EPSILON, fused=True)
         self.register_optimizer(module_id=name, optimizer=optimizer, params=parameters)
         self._parameters[name] = parameters
 
@@ -256,6 +281,8 @@ class PPOLearner(FixedPoliciesLearner):
             means = torch.stack(statistics[policy]).mean(0).tolist()
             logged = dict(zip(STATISTICS, means, strict=True))
             logged |= {EXPLAINED_VARIANCE: batch.explained_variance, KL: divergences[policy]}
+            scheduled = scheduled_hyperparameters(self.settings, policy)
+            logged |= {SCHEDULES[name]: getattr(self.hyperparameters[policy], name) for name in scheduled}
             self.metrics.log_dict(logged, key=policy, window=1)
             self.metrics.log_value((policy, NUM_MODULE_STEPS_TRAINED), len(batch), reduce="sum")
 

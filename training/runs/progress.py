@@ -1,4 +1,5 @@
-"""Displays a run's progress: a bar with return, steps/s and remaining time in a terminal, plain lines elsewhere."""
+"""Displays a run's progress: a bar with steps/s, the shares of the phases, remaining time and returns in a terminal,
+plain lines elsewhere."""
 
 import time
 from collections.abc import Mapping
@@ -10,10 +11,12 @@ from rich.progress import Progress as Bars
 
 from league.registry.storage.rows import VersionRow
 from league.training_config import TrainingSettings
+from training.algorithms.metrics import OTHER_TIME, PHASES
 
 SECONDS_PER_LINE = 10.0
 MAX_POLICIES = 3
 """Policies shown individually; TensorBoard has all."""
+SHOWN_PHASES = ("time/sampling", "time/learning")
 
 
 class ProgressDisplay:
@@ -51,7 +54,7 @@ class TrainingProgress(ProgressDisplay):
 
     def update(self, metrics: Mapping[str, Any]) -> None:
         """Show a trial's latest metrics."""
-        done = fraction(metrics, self._settings)
+        done = self._settings.budget_spent(metrics["steps"], metrics["seconds"])
         steps, pace = f"{metrics['steps']:,} steps", _pace(metrics, done)
         doing = policy_summaries(metrics, self._policies)
         if self._console.is_terminal:
@@ -70,14 +73,6 @@ class TrainingProgress(ProgressDisplay):
         )
 
 
-def fraction(metrics: Mapping[str, Any], settings: TrainingSettings) -> float:
-    """Return the fraction of the budget spent: of steps or of time, whichever is larger."""
-    spent = metrics["steps"] / settings.steps
-    if settings.minutes is not None:
-        spent = max(spent, metrics["seconds"] / (60 * settings.minutes))
-    return min(spent, 1.0)
-
-
 def policy_summaries(metrics: Mapping[str, Any], policies: tuple[str, ...]) -> str:
     """Return a summary of the first few policies' metrics."""
     shown = "; ".join(_policy_summary(policy, metrics) for policy in policies[:MAX_POLICIES])
@@ -93,8 +88,16 @@ def _policy_summary(policy: str, metrics: Mapping[str, Any]) -> str:
 
 def _pace(metrics: Mapping[str, Any], done: float) -> str:
     left = metrics["seconds"] * (1 - done) / done if done else 0.0
-    speed = f"{metrics['steps_per_second']:,.0f} steps/s  " if "steps_per_second" in metrics else ""
+    speed = f"{metrics['steps_per_second']:,.0f} steps/s{_shares(metrics)}  " if "steps_per_second" in metrics else ""
     return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(left)} left"
+
+
+def _shares(metrics: Mapping[str, Any]) -> str:
+    """Return the shares of sampling and learning in the wall time since the last report."""
+    seconds = {name: metrics[name] for name in (*PHASES, OTHER_TIME) if name in metrics}
+    total = sum(seconds.values())
+    shown = [f"{seconds[name] / total:.0%} {name.removeprefix('time/')}" for name in SHOWN_PHASES if name in seconds]
+    return f" ({', '.join(shown)})" if shown else ""
 
 
 def clock(seconds: float) -> str:

@@ -20,7 +20,7 @@ from league.registry.storage.manifest import TRAINING
 from league.registry.storage.rows import VersionRow
 from league.training_config import AnyTraining, TrainingConfig
 from training.algorithms.off_policy import starts_with_empty_replay
-from training.algorithms.setup import algorithm_config, module_spec
+from training.algorithms.setup import algorithm_config, module_spec, num_envs
 from training.export.publish import git_commit
 from training.rllib_compat import NotPickled, silence_tune
 from training.runs.error_messages import training_error
@@ -92,10 +92,18 @@ def train(
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
         with run.locked(), progress, RunReporter(registry, run) as reporter:
             progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
+            progress.say(_parallel_environments(config, interface))
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
             _train_and_publish(run, registry, interface, progress, reporter)
     return published_versions(registry, run)
+
+
+def _parallel_environments(config: LeagueConfig, interface: Interface) -> str:
+    """Describe how many environments are sampled in parallel, and where."""
+    count, runners = num_envs(config, len(interface.agents)), config.training.runners
+    where = f"each of {runners} runners" if runners > 1 else "one runner" if runners else "the learner's process"
+    return f"Environments: {count} in {where}."
 
 
 def check(config: LeagueConfig, interface: Interface) -> None:

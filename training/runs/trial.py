@@ -25,7 +25,16 @@ from league.config import LeagueConfig
 from league.files import move_durably
 from league.interface import Interface
 from league.settings import Storage
-from training.algorithms.metrics import CHECKPOINT_TIME, gpu_use, time_each_update, totals, training_metrics
+from league.training_config import ScheduleProgress
+from training.algorithms.metrics import (
+    CHECKPOINT_TIME,
+    OTHER_TIME,
+    PHASES,
+    gpu_use,
+    time_each_update,
+    totals,
+    training_metrics,
+)
 from training.algorithms.setup import algorithm_config
 from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
@@ -99,6 +108,7 @@ class Trial(tune.Trainable):
         sums: Counter[str] = Counter()
         began, steps = time.monotonic(), self.steps
         while time.monotonic() - began < REPORT_SECONDS and not self._due():
+            self.algorithm.progress = ScheduleProgress(self.steps, self._budget_spent())
             updated = time.monotonic()
             result = self.algorithm.train()
             self.seconds += time.monotonic() - updated
@@ -107,7 +117,8 @@ class Trial(tune.Trainable):
             sums.update(totals(result))
         elapsed = time.monotonic() - began
         if self.steps > steps:
-            metrics |= sums | gpu_use() | {"steps_per_second": (self.steps - steps) / elapsed}
+            other = elapsed - sum(sums[phase] for phase in PHASES)
+            metrics |= sums | gpu_use() | {OTHER_TIME: other, "steps_per_second": (self.steps - steps) / elapsed}
         done = self._spent() or self._stop_requested()
         if (done or self._due()) and self.steps > self.saved_steps:
             saving = time.monotonic()
@@ -129,9 +140,10 @@ class Trial(tune.Trainable):
         return reached or self._spent() or self._stop_requested()
 
     def _spent(self) -> bool:
-        settings = self.league.training
-        out_of_time = settings.minutes is not None and self.seconds >= 60 * settings.minutes
-        return out_of_time or self.steps - self.plan.start.steps_before_run >= settings.steps
+        return self._budget_spent() >= 1
+
+    def _budget_spent(self) -> float:
+        return self.league.training.budget_spent(self.steps - self.plan.start.steps_before_run, self.seconds)
 
     def _stop_requested(self) -> bool:
         return self.plan.stop_file.exists()

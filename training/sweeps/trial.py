@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import TextColumn, TimeRemainingColumn
 
 from training.rllib_compat import NotPickled
-from training.runs.progress import ProgressDisplay, clock, fraction
+from training.runs.progress import ProgressDisplay, clock
 from training.runs.trial import Trial
 from training.sweeps.search_space import Settings
 from training.sweeps.sweep_directory import SweepDirectory, TrialOutcome
@@ -133,7 +133,8 @@ class SweepCallback(NotPickled, tune.Callback):
         outcome = TrialOutcome(
             score=score, steps=result["steps"], seconds=result["seconds"], ended_early=not result["spent"]
         )
-        self._progress.update(number, outcome, fraction(result, self._sweep.league(number).training))
+        training = self._sweep.league(number).training
+        self._progress.update(number, outcome, training.budget_spent(outcome.steps, outcome.seconds))
         if result["done"]:
             self._running.discard(number)
             if result["spent"] or self._awaited is None:

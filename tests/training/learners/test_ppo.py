@@ -12,6 +12,7 @@ from ray.rllib.utils.metrics import ALL_MODULES
 from league.config import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
+from league.training_config import ScheduleProgress
 from tests.support.leagues.training_leagues import solvable
 from training.algorithms.ppo import algorithm_config
 from training.learners import ppo
@@ -148,6 +149,34 @@ def test_each_policy_learns_with_its_own_settings(two: tuple, monkeypatch: pytes
     assert used["loss True"] == (0.4, 0.6)
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in learner._named_optimizers.items()}
     assert rates == {"a_default_optimizer": settings.lr, "b_default_optimizer": 0.5}
+
+
+@pytest.mark.parametrize("shared_encoder", [False, True], ids=["separate", "shared encoder"])
+def test_schedules_hold_in_each_update_and_are_logged(shared_encoder: bool) -> None:
+    own = {"b": {"lr": 0.5, "entropy": [[0, 0.2], [1000, 0.1]]}}
+    league = solvable(
+        "discrete", **TWO, shared_encoder=shared_encoder, lr={"initial": 0.01, "final": 0}, per_policy=own
+    )
+    learner, episodes = learner_of(league), sample_episodes(league)
+    metrics = learn(learner, episodes, progress=ScheduleProgress(steps=500, budget=0.75))
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in learner._named_optimizers.items()}
+    expected = {"a_default_optimizer": 0.0025, "b_default_optimizer": 0.5}
+    if shared_encoder:
+        expected |= {f"{ALL_MODULES}_default_optimizer": 0.0025}
+    assert rates == pytest.approx(expected)
+    logged = {policy: {name: stats.peek() for name, stats in metrics[policy].items()} for policy in ("a", "b")}
+    assert (logged["a"]["lr"], logged["b"]["entropy_coefficient"]) == pytest.approx((0.0025, 0.15))
+    assert not {"clip", "entropy_coefficient"} & logged["a"].keys(), "constants are not logged"
+    assert "lr" not in logged["b"]
+
+
+def test_a_learning_rate_of_zero_keeps_the_weights(two: tuple) -> None:
+    learner = learner_of(two[0].with_training(lr={"initial": 0.01, "final": 0}))
+    before = weights(learner)
+    learn(learner, two[1], progress=ScheduleProgress(steps=0, budget=1.0))
+    assert equal(before, weights(learner))
+    learn(learner, two[1], progress=ScheduleProgress(steps=0, budget=0.9))
+    assert not equal(before, weights(learner))
 
 
 def test_a_shared_encoder_has_one_optimizer_for_the_losses_of_all_policies(two: tuple) -> None:

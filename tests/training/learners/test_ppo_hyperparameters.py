@@ -1,8 +1,9 @@
 import pytest
 
 from league.errors import ConfigError
+from league.training_config import ScheduleProgress
 from tests.support.leagues.training_leagues import tictactoe
-from training.learners.ppo import Hyperparameters, hyperparameters
+from training.learners.ppo import Hyperparameters, hyperparameters, scheduled_hyperparameters
 
 SETTINGS = tictactoe(gamma=0.9, per_policy={"b": {"lambda": 0.5, "lr": 0.01}}, **{"lambda": 0.8}).training
 
@@ -13,6 +14,21 @@ def test_a_policy_has_the_common_settings_except_its_own() -> None:
         "a": Hyperparameters(lr=SETTINGS.lr, lambda_=0.8, **common),
         "b": Hyperparameters(lr=0.01, lambda_=0.5, **common),
     }
+
+
+def test_each_policy_follows_its_own_schedule() -> None:
+    """One of the policy, one that all share, and one that a constant replaces."""
+    settings = tictactoe(
+        lr={"initial": 0.4, "final": 0},
+        clip={"initial": 0.3, "final": 0.1, "steps": 100},
+        per_policy={"b": {"lr": [[0, 0.2], [200, 0.1]], "clip": 0.2}},
+    ).training
+    current = hyperparameters(settings, ("a", "b"), ScheduleProgress(steps=50, budget=0.75))
+    assert {policy: (values.lr, values.clip) for policy, values in current.items()} == {
+        "a": pytest.approx((0.1, 0.2)),
+        "b": pytest.approx((0.175, 0.2)),
+    }
+    assert [scheduled_hyperparameters(settings, policy) for policy in ("a", "b")] == [("lr", "clip"), ("lr",)]
 
 
 def test_an_unknown_policy_is_reported() -> None:

@@ -50,5 +50,17 @@ def test_a_report_without_an_update_has_no_speed() -> None:
     assert "steps/s" not in line
 
 
+def test_shares_of_sampling_and_learning_are_of_all_phases() -> None:
+    phases = {
+        "time/sampling": 0.5,
+        "time/learning": 1.25,
+        "time/weights": 0.15,
+        "time/other": 0.1,
+        "time/checkpoint": 9.0,
+    }
+    (line,) = output_of(METRICS | phases).splitlines()
+    assert "12 steps/s (25% sampling, 62% learning)  1:00 elapsed" in line
+
+
 def test_durations_are_formatted_as_a_clock() -> None:
     assert [clock(seconds) for seconds in (0, 61.9, 3600, 36_061)] == ["0:00", "1:01", "1:00:00", "10:01:01"]

@@ -11,6 +11,7 @@ from tests.support.leagues.training_leagues import counting, tictactoe
 from training.algorithms.metrics import metric_names
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, build_algorithm, read_progress
 
+SCHEDULED = ("shared/lr", "shared/entropy_coefficient", "shared/clip")
 LEAGUE = counting([4, 6], [1], train_batch_size=120, minibatch_size=60, epochs=1, runners=0)
 
 
@@ -83,6 +84,7 @@ def test_checkpoints_are_saved_at_their_interval_with_the_curves(tmp_path: Path)
         assert metric_names(interface(complete.league)) <= result.keys()
         assert result["time/sampling"] > 0
         assert result["time/learning"] > 0
+        assert result["time/other"] > 0
         assert result["episodes"] > 0
         assert result["crashes"] == 0
         assert result["shared/return"] == 0, "the game is zero-sum"
@@ -92,8 +94,15 @@ def test_checkpoints_are_saved_at_their_interval_with_the_curves(tmp_path: Path)
 
 @pytest.mark.usefixtures("ray_session")
 def test_restored_training_equals_uninterrupted_training(tmp_path: Path) -> None:
-    """Weights and actions are identical."""
-    settings = {"steps": 768, "checkpoint_every": 256, "opening_plies": 2}
+    """Weights, actions and schedules are identical."""
+    settings: dict[str, Any] = {
+        "steps": 768,
+        "checkpoint_every": 256,
+        "opening_plies": 2,
+        "lr": {"initial": 0.01, "final": 0},
+        "entropy": {"schedule": "cosine", "initial": 0.05, "final": 0.01, "steps": 600},
+        "clip": [[0, 0.3], [700, 0.1]],
+    }
     uninterrupted = trial(tmp_path / "whole", **settings)
     expected = run(uninterrupted)
     steps, seconds = read_progress(tmp_path / "whole" / "checkpoints" / "256")
@@ -103,7 +112,9 @@ def test_restored_training_equals_uninterrupted_training(tmp_path: Path) -> None
     results = run(resumed)
     for name, value in weights(uninterrupted).items():
         assert torch.equal(weights(resumed)[name], value)
-    learned = ("shared/length", "shared/policy_loss", "agents/player_1/return", "shared/kl", "steps")
+    learned = ("shared/length", "shared/policy_loss", "agents/player_1/return", "shared/kl", "steps", *SCHEDULED)
+    rates = [result["shared/lr"] for result in expected]
+    assert rates == pytest.approx([0.01 * (1 - steps / 768) for steps in (128, 384, 640)])
     assert [[result[name] for name in learned] for result in results] == [
         [result[name] for name in learned] for result in expected[1:]
     ]
