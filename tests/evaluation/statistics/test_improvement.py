@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.special import stdtrit
 
 from evaluation.statistics.improvement import iqm, probability_of_improvement, stratified_bootstrap
 from tests.support.closeness import close
@@ -41,6 +42,16 @@ def test_the_interval_has_its_coverage() -> None:
         found = stratified_bootstrap(lambda resample: float(resample.mean()), scores, resamples=300, seed=seed)
         covered += found.low <= truth <= found.high
     assert 178 <= covered <= 199, "95 % of 200, within 3.5 standard deviations"
+
+
+def test_the_interval_of_few_runs_is_as_wide_as_students() -> None:
+    """Unexpanded percentiles of three runs are about a quarter too narrow."""
+    runs, tasks = 3, 10
+    scores = np.random.default_rng(0).normal(size=(runs, tasks))
+    found = stratified_bootstrap(lambda resample: float(resample.mean()), scores)
+    error = np.sqrt(scores.var(axis=0, ddof=1).sum() / runs) / tasks
+    expected = 2 * stdtrit(tasks * (runs - 1), 0.975) * error
+    assert found.high - found.low == pytest.approx(expected, rel=0.1)
 
 
 def test_intervals_are_reproducible_and_stratified_by_task() -> None:

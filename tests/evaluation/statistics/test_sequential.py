@@ -280,6 +280,13 @@ def test_a_bet_wins_under_the_alternative() -> None:
     assert np.median([number for _, number in ends]) < 120, "a fixed-sample test of the same power takes 78"
 
 
+def test_losses_are_no_evidence_of_an_improvement() -> None:
+    """The wealth against H0 does not grow with them: a bettor never bets on the hypothesis that it tests."""
+    test, losses = BettingTest(1.0, alpha=0.05, beta=0.05), np.full(40, -1.0)
+    np.testing.assert_allclose(test.curves(losses)[1], 0.0, atol=1e-12)
+    assert test.decide(losses)[0] == "H0"
+
+
 def test_with_separated_hypotheses_h0_can_be_accepted() -> None:
     rng, test = np.random.default_rng(0), BettingTest(10.0, alpha=0.05, beta=0.05, low=0.0, high=1.0)
     equal = rng.normal(0, 2, (200, 2000)).clip(-10, 10)

@@ -150,6 +150,12 @@ def test_rolling_back_returns_to_the_previous_champion(registry: Registry) -> No
     assert len(registry.aliases.history(LEAGUE)) == 3
 
 
+def test_two_rollbacks_go_two_versions_back(registry: Registry) -> None:
+    for version, expected in ((1, None), (2, 1), (3, 2)):
+        promote(registry, version, expected=expected)
+    assert [registry.aliases.rollback(LEAGUE, actor="bob", reason="").version for _ in range(2)] == [2, 1]
+
+
 def test_rolling_back_requires_a_previous_version(registry: Registry) -> None:
     with pytest.raises(NothingToRollBack, match="was never set"):
         registry.aliases.rollback(LEAGUE, actor="bob", reason="")
