@@ -129,6 +129,8 @@ FILE = "file"
 """Key in a connection's `info`: its open file by device and inode."""
 DEADLOCKS = ("40P01", "40001")
 """Codes of PostgreSQL for deadlock_detected and serialization_failure."""
+DEADLOCK_PAUSE = 0.05
+"""Seconds."""
 STORAGE_ERRORS = (OperationalError, DatabaseError, InterfaceError, InternalError)
 """Disk full, read-only, locked, not a database, no server. Other errors, such as constraints, are not translated."""
 
@@ -279,13 +281,18 @@ def translate_errors(engine: Engine) -> Iterator[None]:
 
 
 def repeat_after_deadlock(method: Callable[P, T]) -> Callable[P, T]:
-    """Call a method, which is one transaction, once more if PostgreSQL has ended it to resolve a deadlock."""
+    """Call a method, which is one transaction, once more if PostgreSQL has ended it to resolve a deadlock.
+
+    The other transaction gets DEADLOCK_PAUSE to take the locks that this one has lost. Without it, both could end in
+    the same deadlock again.
+    """
 
     @wraps(method)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return method(*args, **kwargs)
         except Deadlock:
+            time.sleep(DEADLOCK_PAUSE)
             return method(*args, **kwargs)
 
     return call
