@@ -137,9 +137,10 @@ class _GameLoop:
         games, attempts = self._next_games(envs)
         starting = np.flatnonzero(games != NO_GAME)
         games, attempts = games[starting], attempts[starting]
-        self._begun[envs] = NO_GAME
-        self._begun[envs[starting]] = len(self._games) + np.arange(len(starting))
+        episodes = len(self._games) + np.arange(len(starting))
         self._games, self._attempts = np.append(self._games, games), np.append(self._attempts, attempts)
+        self._begun[envs] = NO_GAME
+        self._begun[envs[starting]] = episodes
         seating = self._seating
         groups = np.tile(seating.in_opening, (len(games), 1)) if self._plies else seating.after_opening[games]
         return Starts(envs[starting], self._plans.seeds[games], groups)

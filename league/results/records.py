@@ -53,7 +53,7 @@ class Schedule:
 
     def contestants_at(self, position: int) -> tuple[str, ...]:
         """Return the contestants of match `position`."""
-        return tuple(self.contestants[index] for index in self.pairings[position % len(self.pairings)])
+        return tuple([self.contestants[index] for index in self.pairings[position % len(self.pairings)]])
 
     def seed_at(self, position: int) -> int:
         """Return the seed of match `position`."""
@@ -77,7 +77,7 @@ class Schedule:
     def seating_at(self, position: int, game: int) -> tuple[int, ...]:
         """Return the contestant of each side in a game of match `position`. Contestant g has the seat in game g."""
         seat = self.seat_at(position)
-        return tuple(game if side == seat else 1 - game for side in range(len(self.sides)))
+        return tuple([game if side == seat else 1 - game for side in range(len(self.sides))])
 
     def match_id(self, position: int) -> str:
         """Return the id of match `position`."""
