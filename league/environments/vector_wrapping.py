@@ -1,6 +1,6 @@
 """Applies the vectorised versions of SuperSuit's wrappers to vectorised environments."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
@@ -180,20 +180,12 @@ def _merged(blocks: Sequence[AgentRows]) -> AgentRows:
     """Return the rows of some blocks in one, sorted by environment, then by agent."""
     if len(blocks) == 1:
         return blocks[0]
-    envs, agents = (np.concatenate([getattr(rows, name) for rows in blocks]) for name in ("envs", "agents"))
-    order = np.lexsort((agents, envs))
-
-    def joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        return np.concatenate(columns)[order]
-
-    observations: Mapping[str, NDArray[Any]] = {
-        name: joined([rows.observations[name] for rows in blocks]) for name in blocks[0].observations
-    }
-    return AgentRows(
-        envs[order],
-        agents[order],
-        observations,
-        joined([rows.rewards for rows in blocks]),
-        joined([rows.terminations for rows in blocks]),
-        joined([rows.truncations for rows in blocks]),
+    rows = AgentRows(
+        np.concatenate([block.envs for block in blocks]),
+        np.concatenate([block.agents for block in blocks]),
+        {name: np.concatenate([block.observations[name] for block in blocks]) for name in blocks[0].observations},
+        np.concatenate([block.rewards for block in blocks]),
+        np.concatenate([block.terminations for block in blocks]),
+        np.concatenate([block.truncations for block in blocks]),
     )
+    return rows.take(np.lexsort((rows.agents, rows.envs)))
