@@ -2,7 +2,7 @@
 
 import importlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -12,6 +12,7 @@ from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.environments.vector.vector_env import UnsupportedArguments, VectorEnv
 from league.environments.vector_stepping import VectorStepping
+from league.environments.vector_wrapping import UnsupportedWrapper, wrapped_vector
 from league.errors import ConfigError
 from league.stack import VERIFIED, installed
 
@@ -58,25 +59,48 @@ class Implementation:
 
 
 def implementation(config: EnvironmentConfig) -> Implementation:
-    """Return how copies of an environment are stepped. Raises ConfigError if `environment.vector` is invalid."""
-    if config.wrappers:
-        return Implementation(None, f"It is stepped in lockstep, because wrapper {config.wrappers[0].name} needs it.")
+    """Return how copies of an environment are stepped. Raises ConfigError if `environment.vector` or a wrapper of a
+    vectorised environment is invalid."""
+    chosen = _without_wrappers(config)
+    return _with_wrappers(chosen.vector, config) if config.wrappers and chosen.vector else chosen
+
+
+def _without_wrappers(config: EnvironmentConfig) -> Implementation:
     if config.vector is not None:
         return _if_supported(config.vector, config)
     verified = VECTORISED.get(config.entry_point)
     if verified is None:
-        return Implementation(None, "It is stepped in lockstep, because it has no vectorised implementation.")
+        return _in_lockstep("it has no vectorised implementation")
     if config.api not in (None, verified.api):
-        return Implementation(None, f"It is stepped in lockstep, because {config.api} is not the vectorised API.")
+        return _in_lockstep(f"{config.api} is not the vectorised API")
+    return _if_verified(verified.packages) or _if_supported(verified.vector, config)
+
+
+def _with_wrappers(make: Callable[..., VectorEnv], config: EnvironmentConfig) -> Implementation:
+    if other := _if_verified(("supersuit",)):
+        return other
+    try:
+        wrapped = wrapped_vector(make, config)
+    except UnsupportedWrapper as error:
+        return _in_lockstep(str(error))
+    names = ", ".join(wrapper.name for wrapper in config.wrappers)
+    return Implementation(wrapped, f"It is vectorised by {make.__module__}:{make.__qualname__}, with {names}.")
+
+
+def _in_lockstep(reason: str) -> Implementation:
+    return Implementation(None, f"It is stepped in lockstep, because {reason}.")
+
+
+def _if_verified(packages: Sequence[str]) -> Implementation | None:
+    """Return None if the verified versions of these packages are installed."""
     found = installed()
-    for package in verified.packages:
+    for package in packages:
         if found.get(package) != VERIFIED[package]:
-            return Implementation(
-                None,
-                f"It is stepped in lockstep, because the vectorised implementation equals {package}"
-                f" {VERIFIED[package]}, but {found.get(package, 'none')} is installed.",
+            return _in_lockstep(
+                f"the vectorised implementation equals {package} {VERIFIED[package]}, but"
+                f" {found.get(package, 'none')} is installed"
             )
-    return _if_supported(verified.vector, config)
+    return None
 
 
 def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False) -> BatchedEnvironment:
@@ -95,7 +119,7 @@ def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation
     try:
         make(1, **config.kwargs)
     except UnsupportedArguments as error:
-        return Implementation(None, f"It is stepped in lockstep, because of its arguments: {error}.")
+        return _in_lockstep(f"of its arguments: {error}")
     except TypeError as error:
         raise ConfigError(f"environment.kwargs: {entry_point} does not accept them: {error}") from error
     return Implementation(make, f"It is vectorised by {entry_point}.")

@@ -7,7 +7,6 @@ images as four float channels; for pistonball's twenty agents its wrappers doubl
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -15,18 +14,20 @@ from numpy.typing import NDArray
 from supersuit.utils import agent_indicator
 from supersuit.utils.basic_transforms.color_reduction import GRAYSCALE_WEIGHTS
 
+from league.environment_config import WrapperConfig
+
 CHANNELS = {"R": 0, "G": 1, "B": 2}
 
 
 class Transform(ABC):
     """Transforms a batch of observations. By default without state."""
 
-    def reset(self) -> None:  # noqa: B027
-        """Start an episode."""
+    def reset(self, slots: NDArray) -> None:  # noqa: B027
+        """Start the episodes of some slots. A slot is an agent of an environment: env · agents + agent."""
 
     @abstractmethod
-    def __call__(self, rows: NDArray, agents: NDArray) -> NDArray:
-        """Transform observations (k, …) of the agents with indices (k,). Returns a new array or a view."""
+    def __call__(self, rows: NDArray, slots: NDArray) -> NDArray:
+        """Transform observations (k, …) of the slots (k,). Returns a new array or a view."""
 
 
 class Stateless(Transform):
@@ -35,37 +36,37 @@ class Stateless(Transform):
     def __init__(self, function: Callable[[NDArray], NDArray]) -> None:
         self._function = function
 
-    def __call__(self, rows: NDArray, agents: NDArray) -> NDArray:  # noqa: ARG002
+    def __call__(self, rows: NDArray, slots: NDArray) -> NDArray:  # noqa: ARG002
         return self._function(rows)
 
 
 class FrameStack(Transform):
     """Concatenates the last observations of each agent, newest last, initially zeros."""
 
-    def __init__(self, agents: int, space: spaces.Box, size: int) -> None:
+    def __init__(self, slots: int, space: spaces.Box, size: int) -> None:
         """space: observation space with 1 to 3 dimensions; images without a channel axis get one."""
         shape = (*space.shape, 1) if len(space.shape) == 2 else space.shape
         self._add_axis = len(space.shape) == 2
         self._new = shape[-1]
-        self._frames = np.zeros((agents, *shape[:-1], self._new * size), space.dtype)
+        self._frames = np.zeros((slots, *shape[:-1], self._new * size), space.dtype)
         # Stacks of 2, 4 or 8 bytes are shifted as one integer, which is eight times faster.
         itemsize = self._frames.itemsize
         width = self._frames.shape[-1] * itemsize
         self._word = np.dtype(f"u{width}") if width in (2, 4, 8) and sys.byteorder == "little" else None
         self._bits = self._new * itemsize * 8
 
-    def reset(self) -> None:
-        self._frames[:] = 0
+    def reset(self, slots: NDArray) -> None:
+        self._frames[slots] = 0
 
-    def __call__(self, rows: NDArray, agents: NDArray) -> NDArray:
-        frames = self._frames[agents]
+    def __call__(self, rows: NDArray, slots: NDArray) -> NDArray:
+        frames = self._frames[slots]
         if self._word is not None and self._bits < self._word.itemsize * 8:
             words = frames.view(self._word)
             np.right_shift(words, np.array(self._bits, self._word), out=words)
         else:
             frames[..., : -self._new] = frames[..., self._new :]
         frames[..., -self._new :] = rows[..., np.newaxis] if self._add_axis else rows
-        self._frames[agents] = frames
+        self._frames[slots] = frames
         return frames
 
 
@@ -76,7 +77,7 @@ class Resize(Transform):
         self._rows, self._down = _axis(height, to_height)
         self._columns, self._across = _axis(width, to_width)
 
-    def __call__(self, rows: NDArray, agents: NDArray) -> NDArray:  # noqa: ARG002
+    def __call__(self, rows: NDArray, slots: NDArray) -> NDArray:  # noqa: ARG002
         """Resize images (k, height, width) or (k, height, width, channels) of uint8 or floats."""
         trailing = (1,) * (rows.ndim - 3)
         down, across = self._down.reshape(-1, 1, *trailing), self._across.reshape(-1, *trailing)
@@ -95,12 +96,12 @@ class Indicator(Transform):
         self._add_axis = len(space.shape) == 2
         self._on = 1.0 if np.isinf(space.high).any() else np.max(space.high)
 
-    def __call__(self, rows: NDArray, agents: NDArray) -> NDArray:
+    def __call__(self, rows: NDArray, slots: NDArray) -> NDArray:
         if self._add_axis:
             rows = rows[..., np.newaxis]
         extended = np.zeros((*rows.shape[:-1], rows.shape[-1] + self._width), rows.dtype)
         extended[..., : rows.shape[-1]] = rows
-        own = self._of_agent[agents] + rows.shape[-1]
+        own = self._of_agent[slots % len(self._of_agent)] + rows.shape[-1]
         extended[np.arange(len(rows)), ..., own] = self._on
         return extended
 
@@ -127,20 +128,30 @@ def channel(mode: str = "full") -> Callable[[NDArray], NDArray] | None:
     return lambda pixels: pixels[..., index]
 
 
-def transform(name: str, kwargs: dict[str, Any], space: spaces.Box, agents: Sequence[str]) -> Transform | None:
+def transform(
+    wrapper: WrapperConfig, space: spaces.Box, changed: spaces.Box, agents: Sequence[str], num_envs: int = 1
+) -> Transform | None:
     """Return the vectorised version of a SuperSuit wrapper; None if there is none.
 
-    kwargs: arguments of the wrapper, already validated by SuperSuit. space: observation space of all `agents`.
+    Args:
+        wrapper: The wrapper, with arguments validated by SuperSuit.
+        space: Observation space of the agents whose observations are transformed.
+        changed: The space after the wrapper.
+        agents: All agents of the environment.
+        num_envs: Number of environments.
     """
-    match name:
+    kwargs = wrapper.kwargs
+    match wrapper.name:
         case "color_reduction_v0":
             return Stateless(channel(**kwargs) or _grey)
         case "resize_v1":
             return _resize(space, **kwargs)
         case "frame_stack_v1" if kwargs.get("stack_dim", -1) == -1:
-            return FrameStack(len(agents), space, kwargs.get("stack_size", 4))
+            return FrameStack(num_envs * len(agents), space, kwargs.get("stack_size", 4))
         case "agent_indicator_v0":
             return Indicator(agent_indicator.get_indicator_map(agents, kwargs.get("type_only", False)), space)
+        case "pad_observations_v0":
+            return Stateless(lambda rows: _padded(rows, changed.shape))
         case "dtype_v0":
             return Stateless(lambda rows: rows.astype(kwargs["dtype"]))
         case "flatten_v0":
@@ -150,6 +161,12 @@ def transform(name: str, kwargs: dict[str, Any], space: spaces.Box, agents: Sequ
         case "normalize_obs_v0":
             return _normalize(space, **kwargs)
     return None
+
+
+def _padded(rows: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """Append zeros to observations (k, …) until each has the given shape."""
+    missing = [(0, new - old) for new, old in zip(shape, rows.shape[1:], strict=True)]
+    return np.pad(rows, [(0, 0), *missing]) if any(after for _, after in missing) else rows
 
 
 def _grey(rows: NDArray) -> NDArray:

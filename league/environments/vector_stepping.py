@@ -83,7 +83,7 @@ class VectorStepping:
             finished = np.setdiff1d(finished, crashed)
         self._crashes.finish(finished)
         turn = Turn(finished=finished, crashed=crashed, last_states=self._states(finished))
-        turn.endings = [_rows(block, ended) for block in rows if len(ended := np.flatnonzero(_has_ended(block)))]
+        turn.endings = [block.take(ended) for block in rows if len(ended := np.flatnonzero(block.has_ended))]
         self._plays[finished] = self._plays[crashed] = False
         free = np.concatenate([finished, crashed, abandoned])
         free.sort()
@@ -208,7 +208,7 @@ class VectorStepping:
         """Return in which environments an agent must act, (n,)."""
         acts = np.zeros(self.num_envs, dtype=bool)
         for block in rows:
-            acts[block.envs[~_has_ended(block)]] = True
+            acts[block.envs[~block.has_ended]] = True
         return acts
 
     def _check_rewards(self, rows: Sequence[AgentRows]) -> None:
@@ -233,7 +233,7 @@ class VectorStepping:
 
     def _split(self, blocks: Sequence[AgentRows]) -> dict[int, Batch]:
         envs, agents = _column(blocks, "envs"), _column(blocks, "agents")
-        acting = np.flatnonzero(~np.concatenate([_has_ended(block) for block in blocks]))
+        acting = np.flatnonzero(~np.concatenate([block.has_ended for block in blocks]))
         if len(blocks) > 1:
             acting = acting[np.argsort(envs[acting], kind="stable")]
         groups = self._groups[envs[acting], agents[acting]]
@@ -253,21 +253,6 @@ class VectorStepping:
             return None
         values = self._vector.state(envs)
         return None if values is None else States(envs, values)
-
-
-def _has_ended(rows: AgentRows) -> NDArray[np.bool_]:
-    return rows.terminations | rows.truncations
-
-
-def _rows(rows: AgentRows, chosen: Indices) -> AgentRows:
-    return AgentRows(
-        rows.envs[chosen],
-        rows.agents[chosen],
-        {name: array[chosen] for name, array in rows.observations.items()},
-        rows.rewards[chosen],
-        rows.terminations[chosen],
-        rows.truncations[chosen],
-    )
 
 
 def _column(blocks: Sequence[AgentRows], name: str) -> NDArray:

@@ -4,6 +4,7 @@ import importlib
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class BatchedWrappers(BaseParallelWrapper):
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
         observations, infos = self.env.reset(seed=seed, options=options)
         for each in self._transforms:
-            each.reset()
+            each.reset(np.arange(len(self._index)))
         return self._transformed(observations), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], Any, Any, Any, Any]:
@@ -67,11 +68,11 @@ def batched(
     result of all wrappers.
     """
     transforms = []
-    for wrapper, before in zip(wrappers, spaces_before, strict=False):
+    for wrapper, before, after in zip(wrappers, spaces_before[:-1], spaces_before[1:], strict=True):
         space = before[0]
         if not isinstance(space, spaces.Box) or any(other != space for other in before):
             return None
-        made = transform(wrapper.name, wrapper.kwargs, space, env.possible_agents)
+        made = transform(wrapper, space, after[0], env.possible_agents)
         if made is None:
             return None
         transforms.append(made)
@@ -90,18 +91,37 @@ def wrapped(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> AEC
     """
     if not wrappers:
         return env
-    bare, spaces = env, [_observed(env)]
+    stages = _stages(env, wrappers)
+    observed = [AgentSpaces.of(each).observations for each in stages]
+    fast = batched(env, [with_arguments(each) for each in wrappers], observed) if isinstance(env, ParallelEnv) else None
+    return stages[-1] if fast is None else fast
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSpaces:
+    """The spaces of all agents."""
+
+    observations: list[spaces.Space[Any]]
+    actions: list[spaces.Space[Any]]
+
+    @classmethod
+    def of(cls, env: AECEnv | ParallelEnv) -> "AgentSpaces":
+        """Return the spaces of an environment."""
+        agents = env.possible_agents
+        return cls([env.observation_space(agent) for agent in agents], [env.action_space(agent) for agent in agents])
+
+
+def agent_spaces(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> list[AgentSpaces]:
+    """Return the spaces before each wrapper and after the last. Raises what `wrapped` raises."""
+    return [AgentSpaces.of(each) for each in _stages(env, wrappers)]
+
+
+def _stages(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> list[AECEnv | ParallelEnv]:
+    """Return `env` without wrappers, with the first, with the first two, …"""
+    stages = [env]
     for position, wrapper in enumerate(wrappers, start=1):
-        env = _stock(env, wrapper, position)
-        spaces.append(_observed(env))
-    fast = (
-        batched(bare, [_with_arguments(each) for each in wrappers], spaces) if isinstance(bare, ParallelEnv) else None
-    )
-    return env if fast is None else fast
-
-
-def _observed(env: AECEnv | ParallelEnv) -> list[Any]:
-    return [env.observation_space(agent) for agent in env.possible_agents]
+        stages.append(_stock(stages[-1], wrapper, position))
+    return stages
 
 
 def _stock(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, position: int) -> AECEnv | ParallelEnv:
@@ -110,7 +130,7 @@ def _stock(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, position: int) -> 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            made = make(env, **_with_arguments(wrapper).kwargs)
+            made = make(env, **with_arguments(wrapper).kwargs)
             for agent in made.possible_agents:
                 # Some wrappers check the space only on access.
                 made.observation_space(agent)
@@ -152,7 +172,7 @@ def _maker(name: str) -> Any:
     return make
 
 
-def _with_arguments(wrapper: WrapperConfig) -> WrapperConfig:
+def with_arguments(wrapper: WrapperConfig) -> WrapperConfig:
     """Convert arguments from YAML: lists to tuples, and names of functions to functions."""
     return WrapperConfig(name=wrapper.name, kwargs={key: _argument(wrapper, key) for key in wrapper.kwargs})
 

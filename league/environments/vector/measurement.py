@@ -31,7 +31,7 @@ def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds
         rows = list(vector.step(copies, drawn))
         over = np.ones(len(copies), dtype=bool)
         for block in rows:
-            over[block.envs[~(block.terminations | block.truncations)]] = False
+            over[block.envs[~block.has_ended]] = False
         if len(ended := np.flatnonzero(over)):
             rows += vector.reset(ended, rng.integers(2**31, size=len(ended)))
         taken += perf_counter() - began
@@ -43,7 +43,7 @@ def _draw(rows: list[AgentRows], actions: list[Space], rng: np.random.Generator)
     """Draw legal actions for all rows that must act, sorted by copy, then by agent."""
     drawn, places = [], []
     for block in rows:
-        acting = np.flatnonzero(~(block.terminations | block.truncations))
+        acting = np.flatnonzero(~block.has_ended)
         mask = block.observations.get(ACTION_MASK)
         for agent in np.unique(block.agents[acting]).tolist():
             own = acting[block.agents[acting] == agent]

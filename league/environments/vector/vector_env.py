@@ -37,6 +37,22 @@ class AgentRows:
     terminations: NDArray[np.bool_]
     truncations: NDArray[np.bool_]
 
+    @property
+    def has_ended(self) -> NDArray[np.bool_]:
+        """Whether each row is the last one of its agent, (k,)."""
+        return self.terminations | self.truncations
+
+    def take(self, chosen: NDArray[np.int64]) -> "AgentRows":
+        """Return some of the rows, in the given order."""
+        return AgentRows(
+            self.envs[chosen],
+            self.agents[chosen],
+            {name: array[chosen] for name, array in self.observations.items()},
+            self.rewards[chosen],
+            self.terminations[chosen],
+            self.truncations[chosen],
+        )
+
 
 class UnsupportedArguments(Exception):
     """A vectorised environment does not implement these constructor arguments; the stock environment must be used."""

@@ -28,7 +28,7 @@ def test_verified_environments_are_vectorised(entry_point: str) -> None:
     ("config", "reason"),
     [
         ({"entry_point": "pettingzoo.butterfly.pistonball_v6"}, "has no vectorised implementation"),
-        ({"entry_point": "mpe2.simple_spread_v3", "wrappers": ["frame_stack_v1"]}, "wrapper frame_stack_v1"),
+        ({"entry_point": "mpe2.simple_spread_v3", "wrappers": ["black_death_v3"]}, "wrapper black_death_v3"),
         ({"entry_point": CONNECT_FOUR, "kwargs": {"render_mode": "rgb_array"}}, "arguments: .*render_mode"),
         ({"entry_point": "mpe2.simple_spread_v3", "api": "aec"}, "aec is not the vectorised API"),
     ],
@@ -47,6 +47,16 @@ def test_another_version_of_the_stock_environment_is_stepped_in_lockstep(monkeyp
     found = implementation(EnvironmentConfig(entry_point=CONNECT_FOUR))
     assert found.vector is None
     assert "but 9.9.9 is installed" in found.reason
+
+
+def test_wrappers_are_vectorised_with_the_verified_version_of_supersuit(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = EnvironmentConfig.model_validate({"entry_point": "mpe2.simple_spread_v3", "wrappers": ["frame_stack_v1"]})
+    found = implementation(config)
+    assert found.reason.endswith("mpe.simple_spread:SimpleSpread, with frame_stack_v1.")
+    assert isinstance(stepping(config, 2), VectorStepping)
+    monkeypatch.setattr(choice, "installed", lambda: choice.VERIFIED | {"supersuit": "9.9.9"})
+    assert implementation(config).vector is None
+    assert "equals supersuit" in implementation(config).reason
 
 
 def test_users_name_their_own_vectorised_environment() -> None:

@@ -31,6 +31,7 @@ CASES: list[tuple[str, dict[str, Any], list[Any]]] = [
     (PISTONBALL, SMALL, [FLOAT, SIZE, {"normalize_obs_v0": {"env_min": -1, "env_max": 3}}]),
     (PONG, {"max_cycles": 20, "render_mode": "rgb_array"}, [{"color_reduction_v0": {"mode": "G"}}, SIZE, STACK]),
     (SPREAD, {}, ["agent_indicator_v0", STACK]),
+    (SPREAD, {}, ["pad_observations_v0", "agent_indicator_v0"]),
     (SPREAD, {}, [STACK, {"reshape_v0": {"shape": [4, 18]}}, {"dtype_v0": {"dtype": "float64"}}]),
     (PURSUIT, {"max_cycles": 15}, [FLOAT, SIZE, STACK, "flatten_v0"]),
 ]

@@ -25,6 +25,11 @@ LEAGUES: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "recurrent": ("pettingzoo.classic.connect_four_v3", {"recurrence": {"width": 4, "sequence": 3}}),
     "simultaneous": ("mpe2.simple_spread_v3", {}),
+    "wrapped": ("mpe2.simple_tag_v3", {}),
+}
+
+WRAPPERS: dict[str, list[Any]] = {
+    "wrapped": ["pad_observations_v0", "agent_indicator_v0", {"frame_stack_v1": {"stack_size": 2}}, "clip_reward_v0"]
 }
 
 pytestmark = pytest.mark.usefixtures("ray_session")
@@ -61,9 +66,8 @@ def assert_equal(first: Any, second: Any) -> None:
 def test_samples_and_weights_do_not_depend_on_the_implementation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     entry_point, training = LEAGUES[name]
     settings = {"runners": 0, "num_envs": 5, "hidden": [8], "train_batch_size": 120, "minibatch_size": 32}
-    league = LeagueConfig.from_mapping(
-        {"league": "same", "environment": {"entry_point": entry_point}, "training": settings | training}
-    )
+    environment = {"entry_point": entry_point, "wrappers": WRAPPERS.get(name, [])}
+    league = LeagueConfig.from_mapping({"league": "same", "environment": environment, "training": settings | training})
     vectorised = trained(league)
     monkeypatch.setattr(env_runner, "stepping", stock_stepping)
     stock = trained(league)
