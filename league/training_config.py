@@ -200,11 +200,11 @@ class PPOConfig(TrainingSettings):
     """Proximal policy optimisation (Schulman et al., 2017, arXiv 1707.06347)."""
 
     algorithm: Literal["ppo"] = "ppo"
-    lr: ScheduledPositive = 3e-4
+    lr: ScheduledPositive = 5e-4
     """Learning rate of Adam."""
-    train_batch_size: int = Field(default=2048, ge=1)
+    train_batch_size: int = Field(default=4096, ge=1)
     """Actions per update."""
-    minibatch_size: int = Field(default=256, ge=1)
+    minibatch_size: int = Field(default=512, ge=1)
     """Actions per gradient step."""
     epochs: int = Field(default=4, ge=1)
     """Passes over each train batch."""

@@ -3,8 +3,8 @@ from typing import Any
 import pytest
 
 from league.errors import ConfigError
-from tests.support.leagues.training_leagues import tictactoe
-from training.algorithms.setup import check_policies_to_train, learning_policies
+from tests.support.leagues.training_leagues import counting, tictactoe
+from training.algorithms.setup import check_policies_to_train, learning_policies, num_envs
 
 POLICIES = ("a", "b", "c")
 
@@ -37,3 +37,23 @@ def test_policies_with_a_shared_encoder_must_learn_together(policies: Any) -> No
         check_policies_to_train(training_with_policies(policies, shared_encoder=True), POLICIES)
     check_policies_to_train(training_with_policies(list(POLICIES), shared_encoder=True), POLICIES)
     check_policies_to_train(training_with_policies(None, shared_encoder=True), POLICIES)
+
+
+@pytest.mark.parametrize(
+    ("training", "expected"),
+    [
+        ({"train_batch_size": 4096}, 128),
+        ({"train_batch_size": 4096, "runners": 2}, 64),
+        ({"train_batch_size": 512}, 32),
+        ({"train_batch_size": 65536}, 512),
+        ({"train_batch_size": 4096, "num_envs": 7}, 7),
+        ({"algorithm": "dqn"}, 32),
+    ],
+    ids=["batch", "runners", "small batch", "large batch", "number", "replay buffer"],
+)
+def test_each_agent_gets_enough_steps_of_each_vectorised_environment(training: dict[str, Any], expected: int) -> None:
+    assert num_envs(tictactoe(**{"num_envs": "auto"} | training), agents=2) == expected
+
+
+def test_a_stock_environment_has_the_same_number_for_every_batch() -> None:
+    assert num_envs(counting([4, 6], [1], num_envs="auto", train_batch_size=65536), agents=2) == 32

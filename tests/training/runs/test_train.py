@@ -71,6 +71,7 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
     assert lineage(trained.versions) == [(1, 512, None), (2, 1024, 1)]
     assert "Published tictactoe@1 after 512 steps" in trained.output
     assert "shared: return" in trained.output
+    assert "Environments: 4 in one runner." in trained.output
     (run,) = (registry.storage.home / "runs" / "tictactoe").iterdir()
     assert not list(run.rglob("checkpoints/*")), "published checkpoints are deleted"
     tags = curves(run).Tags()["scalars"]
