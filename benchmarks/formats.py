@@ -70,8 +70,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         registry = publish(Path(scratch) / "home", versions=1)
         with local_ray(1):
-            small = prepare(CONFIGS / "pistonball.yaml", registry, updates=0)
-            large = prepare(CONFIGS / "pistonball.yaml", registry, updates=0, source="parity/2", **MNIH)
+            small = prepare(CONFIGS / "pistonball_gpu.yaml", registry, updates=0)
+            large = prepare(CONFIGS / "pistonball_gpu.yaml", registry, updates=0, source="parity/2", **MNIH)
         image = _image(registry, large)
         (grpc_port,) = haproxy.free_ports(1, "127.0.0.1")
         with running(registry.storage, replicas=1, grpc_port=grpc_port) as url:

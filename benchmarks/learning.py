@@ -9,16 +9,14 @@ unless stated otherwise.
 import argparse
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks.training.learned import (
-    CurvePoint,
     LearningCurve,
     interval,
     learn,
@@ -27,6 +25,7 @@ from benchmarks.training.learned import (
     report_target,
     two_at_once,
 )
+from benchmarks.training.pistonball import pistonball
 from benchmarks.training.truncation import as_rllib
 from benchmarks.training.two_step import two_step_game
 from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
@@ -39,7 +38,6 @@ SPREAD_STEPS, SPREAD_BETTER_BY = 1_000_000, 4.0
 """Equal numbers of actions for each seed, so that the ablation has the same experience; about two of the ten minutes
 that the target allows.
 """
-PISTON_SECONDS, PISTON_STEPS = 2700.0, 2_000_000
 NEAR_OPTIMUM = 0.95
 """Fraction of the distance from random play to the optimum."""
 
@@ -159,38 +157,6 @@ def simple_spread_qmix(scale: float) -> bool:
             print(f"    {point.steps:>9,} actions: {point.returns['shared']:8.2f} while exploring")
         met &= bool(better >= SPREAD_BETTER_BY)
     return report_target("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
-
-
-def pistonball(scale: float) -> bool:
-    """45 minutes on both cores: a runner in addition to the learner."""
-    league = LeagueConfig.load(CONFIGS / "pistonball.yaml")
-    with local_ray(cpus=3):
-        learned = learn(league, seconds=PISTON_SECONDS * scale, episodes=8)
-    finals = last_episodes(learned.curve, 0.1)
-    # The returns of the pistons in an episode are strongly correlated: an episode counts once.
-    random = interval(learned.random.reshape(-1, 20).mean(axis=1))
-    low, high = interval(finals)
-    last = learned.curve[-1]
-    print(
-        f"seed {league.training.seed}: {last.steps:,} actions in {last.seconds:,.0f} s, {learned.rate:,.0f} actions/s"
-    )
-    print(f"  {PISTON_STEPS:,} actions take {PISTON_STEPS / learned.rate / 3600:.2f} hours at this rate")
-    print(
-        f"  return in training, last tenth of the episodes: {finals.mean():.2f}, 95 % interval {low:.2f} … {high:.2f}"
-    )
-    print(f"  random: {learned.random.mean():.2f}, 95 % interval {random[0]:.2f} … {random[1]:.2f}")
-    print(f"  greedy: {learned.greedy.mean():.2f} over {len(learned.greedy) // 20} episodes")
-    for point in learned.curve[:: max(1, len(learned.curve) // 20)]:
-        print(f"    {point.steps:>9,} actions: {next(iter(point.returns.values()), float('nan')):8.2f}")
-    return report_target("its interval above random's", "yes", low > random[1])
-
-
-def last_episodes(curve: Sequence[CurvePoint], share: float) -> NDArray:
-    """Mean returns of the updates in which the last `share` of all episodes ended."""
-    ended = [point for point in curve if point.episodes]
-    counts = np.cumsum([point.episodes for point in ended])
-    chosen = [point for point, count in zip(ended, counts, strict=True) if count > counts[-1] * (1 - share)]
-    return np.array([next(iter(point.returns.values())) for point in chosen])
 
 
 PARTS: dict[str, Callable[[float], bool]] = {

@@ -90,14 +90,15 @@ def learn(
     if prepare is not None:
         prepare(algorithm)
     try:
-        curve = list(_updates(algorithm, seconds, steps))
+        curve = list(updates(algorithm, seconds, steps))
         greedy, random = greedy_returns(algorithm, episodes), _returns(algorithm, episodes, random_actions=True)
         return LearningCurve(curve, greedy, random, _parameters(algorithm))
     finally:
         algorithm.stop()
 
 
-def _updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[CurvePoint]:
+def updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[CurvePoint]:
+    """Train for `seconds` of training time, or for `steps` actions. Yields after each update."""
     taken, spent = 0, 0.0
     while spent < seconds and taken < steps:
         algorithm.progress = ScheduleProgress(taken, max(spent / seconds, taken / steps))
