@@ -2,8 +2,8 @@
 
 Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem, connect_four_dqn
 by DQN; two_step_game, simple_spread_qmix. With several seeds or opponents, two trainings run at a time, each in a
-process with one core. All seeds are printed. Returns are per agent and episode, with greedy policies in new episodes,
-unless stated otherwise.
+process with one core; those of pistonball run in turn, on two cores. All seeds are printed. Returns are per agent and
+episode, with greedy policies in new episodes, unless stated otherwise.
 """
 
 import argparse
