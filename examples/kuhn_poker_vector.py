@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.kuhn_poker import AGENTS, BET, DEALS, FIRST_BET, FIRST_CARD, OBSERVATION_SIZE, PASS
-from league.environments.vector import pcg64
 from league.environments.vector.alternation import TurnRows, rows_after_move
 from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.random import pcg64
 
 CARDS = np.array(DEALS)
 NO_ACTION = -1

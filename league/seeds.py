@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random.bit_generator import ISeedSequence
 from numpy.typing import NDArray
 
-from league.seed_sequence import generate_state
+from league.random.seed_sequence import generate_state
 
 
 def derive(seed: int, *path: int | str) -> int:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evaluation.matches.game_state import AgentGenerators, AgentStates
 from evaluation.matches.match_recorder import MatchRecorder
-from evaluation.matches.openings import Openings
+from evaluation.matches.openings import OpeningMoves
 from evaluation.matches.policy_calls import PolicyFault, call_policy
 from evaluation.matches.returns import agent_sides
 from evaluation.matches.seating import Roster, Seating
@@ -107,7 +107,7 @@ class _GameLoop:
         # Of each environment: its episode, and the one that it began last.
         self._running, self._begun = np.full(num_envs, NO_GAME), np.full(num_envs, NO_GAME)
         self._steps, self._returns = np.zeros(num_envs, np.int64), np.zeros(shape)
-        self._openings = Openings(interface, len(self._agents), plans.seeds, self._plies)
+        self._openings = OpeningMoves(interface, len(self._agents), plans.seeds, self._plies)
         self._generators = AgentGenerators(*shape)
         self._states: dict[int, AgentStates] = {}
         self._faulty: set[int] = set()

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.stepping import Batch, Indices
-from league.environments.vector import pcg64
 from league.interface import Interface
 from league.policies.draws import UniformNumbers
 from league.policies.scripted import Random
+from league.random import pcg64
 from league.seeds import spawn_key
 
 
-class Openings:
+class OpeningMoves:
     """Chooses the opening moves of some games.
 
     The random numbers of an agent are those of `generator(seed, "opening", attempt, agent)`. They are computed for all
@@ -55,7 +55,7 @@ class Openings:
 class _NumbersOfRows(UniformNumbers):
     """The random numbers of the rows of one batch."""
 
-    def __init__(self, openings: Openings, games: Indices, agents: Indices) -> None:
+    def __init__(self, openings: OpeningMoves, games: Indices, agents: Indices) -> None:
         self._openings, self._games, self._agents = openings, games, agents
 
     def draw(self, shape: tuple[int, ...]) -> NDArray[np.float64]:

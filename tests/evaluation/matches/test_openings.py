@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from evaluation.matches.openings import Openings
+from evaluation.matches.openings import OpeningMoves
 from league.environments.stepping import Batch
 from league.seeds import generator
 from tests.support.environments.kinds import KINDS, Kind
@@ -13,7 +13,7 @@ TEAM, CONTINUOUS = KINDS["team"], KINDS["continuous team"]
 def test_actions_use_the_numbers_of_the_generators_of_their_games(kind: Kind, shape: tuple[int, ...]) -> None:
     """Each agent continues its own numbers, and restarted openings have others."""
     seeds = np.array([3, 2**62, 2**31])
-    openings = Openings(kind.interface, agents=3, seeds=seeds, plies=4)
+    openings = OpeningMoves(kind.interface, agents=3, seeds=seeds, plies=4)
     rngs = {(game, agent): generator(int(seeds[game]), "opening", 0, agent) for game in range(3) for agent in range(3)}
     rng = np.random.default_rng(0)
     for turn in range(4):
@@ -32,4 +32,4 @@ def test_actions_use_the_numbers_of_the_generators_of_their_games(kind: Kind, sh
 
 
 def test_schedules_without_openings_need_no_numbers() -> None:
-    assert Openings(TEAM.interface, agents=3, seeds=np.array([1]), plies=0)
+    assert OpeningMoves(TEAM.interface, agents=3, seeds=np.array([1]), plies=0)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector import pcg64
+from league.random import pcg64
 
 
 def goals_and_positions(

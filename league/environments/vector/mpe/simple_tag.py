@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector import pcg64
 from league.environments.vector.mpe.arguments import COMMON, CURRICULUM, NEIGHBORS, check_counts, reject_changed
 from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
+from league.random import pcg64
 
 ADVERSARY_SIZE, GOOD_SIZE, OBSTACLE_SIZE = 0.075, 0.05, 0.2
 ADVERSARY_ACCELERATION, GOOD_ACCELERATION = 3.0, 4.0

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from league.environments.vector import pcg64
 from league.environments.vector.mpe.initial_states import goals_and_positions
+from league.random import pcg64
 
 SEEDS = np.array([0, 1, 7, 2**31 - 1])
 

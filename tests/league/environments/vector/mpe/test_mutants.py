@@ -11,7 +11,7 @@ from tests.support.environments.mutants import Mutation, mutated
 
 PACKAGE = "league.environments.vector.mpe"
 MODULES = {
-    "pcg64": "league.environments.vector.pcg64",
+    "pcg64": "league.random.pcg64",
     "particles": f"{PACKAGE}.particles",
     "initial_states": f"{PACKAGE}.initial_states",
     "particle_env": f"{PACKAGE}.particle_env",

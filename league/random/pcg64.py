@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from league.seed_sequence import generate_state
+from league.random.seed_sequence import generate_state
 
 MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
 """Of PCG64's linear congruential generator with 128-bit states."""

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.environments.vector import pcg64
+from league.random import pcg64
 
 SEEDS = np.concatenate([np.arange(1000), np.random.default_rng(0).integers(2**31, size=2000), [2**31 - 1, 2**32 - 1]])
 

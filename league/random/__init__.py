@@ -1,0 +1,1 @@
+"""Random numbers of NumPy for many seeds at once."""
