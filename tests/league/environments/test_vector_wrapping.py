@@ -12,6 +12,7 @@ from league.environments.implementation import implementation
 from league.environments.vector.equality import compare
 from league.environments.vector.mpe.simple_tag import SimpleTag
 from league.environments.vector.vector_env import VectorEnv
+from tests.support.environments.flicker import flicker
 from tests.support.environments.mutants import Mutation, mutated
 from tests.support.environments.plans import Plan, assert_equal, plans
 
@@ -96,6 +97,32 @@ def test_rewards_of_simultaneous_games_are_clipped() -> None:
     (rows,) = env.step(copies, np.array([(a, b) for a in range(3) for b in range(3)]).ravel())
     assert set(rows.rewards.tolist()) == {-0.5, 0.0, 1.0}
     assert compare(config, vectorised(config, 8), steps=500, seed=0).difference is None
+
+
+GREY = {"color_reduction_v0": {"mode": "full"}}
+FLOAT = {"dtype_v0": {"dtype": "float32"}}
+
+
+@pytest.mark.parametrize(
+    "wrappers",
+    [
+        [],
+        [GREY],
+        [{"color_reduction_v0": {"mode": "G"}}, {"frame_stack_v1": {"stack_size": 3}}],
+        [GREY, {"resize_v1": {"x_size": 3, "y_size": 4}}],
+        [{"resize_v1": {"x_size": 9, "y_size": 2}}],
+        [{"resize_v1": {"x_size": 2, "y_size": 3, "linear_interp": True}}],
+        [{"reshape_v0": {"shape": [15, 6]}}],
+        [FLOAT, "normalize_obs_v0"],
+        [FLOAT, {"normalize_obs_v0": {"env_min": -1, "env_max": 0}}, "flatten_v0", INDICATOR],
+    ],
+    ids=str,
+)
+def test_images_equal_those_of_the_stock_environment(wrappers: list[Any]) -> None:
+    config = flicker(wrappers)
+    found = compare(config, vectorised(config, 5), steps=300, seed=0)
+    assert found.difference is None
+    assert found.episodes > 10
 
 
 def test_padded_rows_are_in_the_order_of_the_agents() -> None:
