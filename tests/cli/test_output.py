@@ -7,10 +7,16 @@ from cli import output
 from evaluation.results import Progress
 
 
-def test_outside_a_terminal_progress_is_printed_as_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    printed = StringIO()
-    monkeypatch.setattr(output, "console", Console(file=printed))
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch) -> StringIO:
+    """What is printed outside a terminal, with a line for each event."""
+    text = StringIO()
+    monkeypatch.setattr(output, "console", Console(file=text))
     monkeypatch.setattr(output, "SECONDS_PER_LINE", 0.0)
+    return text
+
+
+def test_outside_a_terminal_progress_is_printed_as_lines(printed: StringIO) -> None:
     with output.GameProgress(quiet=False) as listener:
         listener(Progress("a against b", 0, 16))
         listener(Progress("a against b", 8, 16, moves_per_second=123456.7, llr=1.2))
@@ -20,10 +26,7 @@ def test_outside_a_terminal_progress_is_printed_as_lines(monkeypatch: pytest.Mon
     ]
 
 
-def test_quiet_progress_prints_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    printed = StringIO()
-    monkeypatch.setattr(output, "console", Console(file=printed))
-    monkeypatch.setattr(output, "SECONDS_PER_LINE", 0.0)
+def test_quiet_progress_prints_nothing(printed: StringIO) -> None:
     with output.GameProgress(quiet=True) as listener:
         listener(Progress("a against b", 8, 16))
     assert printed.getvalue() == ""
