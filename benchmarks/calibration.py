@@ -24,7 +24,7 @@ from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stro
 from benchmarks.simulations.simulated_years import boundary, chance, walk
 from evaluation.gating.gate import NIGHTS, AnchorResult, Decision, alpha_per_verdict, combine_results, decide
 from evaluation.statistics.sequential import expected_games
-from league.config import GateConfig
+from league.config.gate import GateConfig
 from tests.support.leagues import tictactoe
 
 CANDIDATES = 8

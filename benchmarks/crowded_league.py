@@ -33,7 +33,7 @@ from evaluation.gating.verdicts import conclude, gate_of, open_verdict
 from evaluation.matches.tournament import evaluate
 from evaluation.schedules.builders import gauntlet, round_robin
 from evaluation.service.snapshots import refresh
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY

@@ -34,7 +34,7 @@ from evaluation.gating.verdicts import conclude, open_verdict
 from evaluation.matches.tournament import play_schedule
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.results.records import Match, Schedule

@@ -30,7 +30,7 @@ from benchmarks.training.truncation import as_rllib
 from benchmarks.training.two_step import two_step_game
 from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
 from examples import traffic
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SEEDS = range(5)

@@ -24,7 +24,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_ME
 from scipy import stats
 
 from benchmarks.training.learned import local_ray, one_thread
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.maddpg import MADDPG
 from training.algorithms.setup import algorithm_config

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks.training.learned import local_ray
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.interface import Interface
 from league.policies import load

@@ -19,7 +19,7 @@ from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 
 from benchmarks.sampling import in_parallel, in_turns
 from benchmarks.training.learned import local_ray, one_thread, report_target
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.metrics import PHASES, totals
 from training.algorithms.off_policy import OffPolicy

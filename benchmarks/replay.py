@@ -16,7 +16,7 @@ import numpy as np
 from ray.rllib.env.multi_agent_episode import MultiAgentEpisode
 from ray.rllib.utils.replay_buffers.multi_agent_episode_buffer import MultiAgentEpisodeReplayBuffer
 
-from league.training_config import PrioritiesConfig
+from league.config.off_policy import PrioritiesConfig
 from training.replay_buffer import ReplayBuffer, TransitionBlock
 
 STEPS, BATCH, LENGTH, NUMBERS = 100_000, 1024, 25, 18

@@ -20,7 +20,7 @@ TARGETS = {"--help": 0.25, "versions rps": 0.6}
 """Seconds on an idle core."""
 COMMAND = [sys.executable, "-c", "import sys; from cli.main import run; sys.exit(run())"]
 REGISTER = """
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.settings import Storage

@@ -30,7 +30,7 @@ from pettingzoo.butterfly.pistonball import pistonball
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4, tictactoe_v3
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import build, observation_space
 from league.environments.implementation import stepping
 from league.environments.stepping import Batch, Indices, Starts

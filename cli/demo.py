@@ -16,7 +16,7 @@ from league.settings import Storage
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
 
 LEAGUE = "connect_four"
 OPPONENT = "script:one_ply"
@@ -36,7 +36,7 @@ def demo(
 
     The results are stored in LEAGUE_HOME and can be used with all other commands.
     """
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
     from serve_app.runtime.launch import running
 
     storage = Storage.from_environment()

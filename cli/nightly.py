@@ -16,7 +16,7 @@ from league.settings import Storage
 
 if TYPE_CHECKING:
     from evaluation.results import Confirmation, NightlyReport
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
     from league.registry.registry import Registry
 
 FAULTS = 1
@@ -140,7 +140,7 @@ def _configs(named: Sequence[str]) -> "list[LeagueConfig]":
 
 def _config(registry: "Registry", name: str) -> "LeagueConfig":
     """Return the configuration of a registered league, else of a file or a bundled configuration."""
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
 
     if not name.endswith((".yaml", ".yml")):
         try:

@@ -17,7 +17,7 @@ from league.errors import ConfigError
 from league.refs import CheckpointRef, of_league
 
 if TYPE_CHECKING:
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
     from training.sweeps.sweep import SweepReport
 
 INTERRUPTED = 130
@@ -52,7 +52,7 @@ def check_env(
 
     Next step: `league train CONFIG`.
     """
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
     from league.environments.conformance import examine
 
     league = LeagueConfig.load(find(config))
@@ -275,7 +275,7 @@ def _exit_at_once() -> NoReturn:
 
 
 def _load(config: str, settings: dict[str, object]) -> "LeagueConfig":
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
 
     return LeagueConfig.load(find(config)).with_training(**settings)
 

@@ -18,8 +18,8 @@ from markdown.extensions.toc import slugify
 from typer.core import TyperGroup
 
 from cli.main import app
-from league.config import LeagueConfig
-from league.training_config import ALGORITHMS
+from league.config.algorithms import ALGORITHMS
+from league.config.league import LeagueConfig
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from benchmarks.parity import CONFIGS, compare, prepare
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import OffPolicyConfig
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from league.settings import Storage
-from league.training_config import OffPolicyConfig
 from serve_app.runtime.launch import running
 
 pytestmark = pytest.mark.slow

@@ -27,9 +27,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from league.config.off_policy import PrioritiesConfig
 from league.errors import ConfigError
 from league.seeds import generator
-from league.training_config import PrioritiesConfig
 
 
 class SumTree:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest, Parity, PolicyManifest

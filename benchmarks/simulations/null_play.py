@@ -14,7 +14,7 @@ import numpy as np
 from evaluation.gating.gate import decide_matches
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import verdict
-from league.config import GateConfig
+from league.config.gate import GateConfig
 from league.registry.registry import Registry
 from tests.support.leagues import tictactoe
 

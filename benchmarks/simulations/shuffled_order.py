@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.simulations.simulated_gates import EQUALS, stronger
 from evaluation.gating.gate import SequentialMonitor, decide_matches
 from evaluation.matches.tournament import ReorderBuffer
-from league.config import GateConfig
+from league.config.gate import GateConfig
 from league.results.records import Game, Match
 
 SETTINGS = GateConfig(elo1=60, max_blocks=600, nights=None)

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from evaluation.gating.gate import decision_bounds
 from evaluation.statistics.sequential import ELO_PER_EFFECT, gsprt_llr, score_of
-from league.config import GateConfig
+from league.config.gate import GateConfig
 
 CELLS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 EQUALS = {

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evaluation.gating.gate import decision_bounds
 from evaluation.statistics.sequential import gsprt_llr
-from league.config import GateConfig
+from league.config.gate import GateConfig
 
 OPEN, REJECTED, PROMOTED = 0, 1, 2
 Floats = NDArray[np.float64]

@@ -24,7 +24,7 @@ from scipy.special import expit
 
 from evaluation.matches.leaderboard import rank_contestants
 from evaluation.schedules.builders import round_robin
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.registry.storage import tables

@@ -32,7 +32,7 @@ from ray.cluster_utils import Cluster
 from evaluation.matches import tournament
 from evaluation.matches.worker import baselines, match_worker
 from evaluation.schedules.builders import round_robin
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.results.ledger import Ledger

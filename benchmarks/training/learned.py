@@ -23,9 +23,9 @@ from ray.rllib.utils.metrics import (
     NUM_EPISODES,
 )
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
-from league.training_config import ScheduleProgress
 from training.runs.trial import build_algorithm
 
 Work, Result = TypeVar("Work"), TypeVar("Result")

@@ -7,7 +7,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import round_robin
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface as interface_of
 from league.environments.implementation import stepping
 from league.policies.loading import contestant

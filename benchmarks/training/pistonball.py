@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from benchmarks.training.learned import interval, local_ray, report_target, updates
 from benchmarks.training.matches import games, graph
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 

@@ -11,7 +11,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 
 from benchmarks.training.learned import greedy_returns, local_ray, one_thread, report_target, two_at_once
 from examples.two_step import ACTIONS, AGENTS, STATES, values
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 

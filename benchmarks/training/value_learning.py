@@ -15,7 +15,7 @@ from scipy.stats import binomtest
 from benchmarks.training.learned import interval, local_ray, one_thread, report_target
 from benchmarks.training.leduc import best_response, greedy, uniform
 from benchmarks.training.matches import games, graph
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 

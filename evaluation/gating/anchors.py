@@ -6,7 +6,7 @@ the current champion is not progress.
 
 from __future__ import annotations
 
-from league.config import AnchorConfig
+from league.config.gate import AnchorConfig
 from league.errors import UnknownAlias
 from league.policies.loading import check_eligible, pinned
 from league.refs import of_league

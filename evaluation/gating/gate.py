@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from evaluation.matches.game_records import forfeit_difference, unique_games
 from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
-from league.config import GateConfig
+from league.config.gate import GateConfig
 from league.errors import BoundExceeded
 from league.results.records import GAMES_PER_BLOCK, Match
 

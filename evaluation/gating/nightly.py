@@ -18,7 +18,7 @@ from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.matches.worker import baselines
 from evaluation.results import Confirmation, Listener, NightlyReport, VerdictReport
 from evaluation.schedules.builders import ANCHOR, gauntlet
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import (
     ArtifactCorrupt,

@@ -33,7 +33,7 @@ from evaluation.schedules.builders import companion
 from evaluation.schedules.builders import verdict as verdict_schedule
 from evaluation.statistics.payoff import paired_difference
 from evaluation.statistics.sequential import elo_estimate
-from league.config import GateConfig
+from league.config.gate import GateConfig
 from league.errors import AliasMoved
 from league.refs import CHAMPION, CheckpointRef, ScriptRef, parse_ref
 from league.registry.registry import Registry

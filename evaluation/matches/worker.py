@@ -11,7 +11,7 @@ from evaluation.matches.game_loop import play_matches
 from evaluation.matches.seating import Roster
 from evaluation.matches.watchdog import Deadline
 from evaluation.schedules.builders import ANCHOR
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation, stepping
 from league.environments.stepping import BatchedEnvironment

@@ -20,7 +20,7 @@ from evaluation.playback.single_game import GameStep, Move, play_game, policy_ou
 from evaluation.playback.video import data_uri
 from evaluation.results import Document
 from evaluation.schedules.builders import scoring
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput, one_line
 from league.interface import Interface

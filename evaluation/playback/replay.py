@@ -10,7 +10,7 @@ import numpy as np
 
 from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.single_game import GameStep, play_game, policy_output
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReference, LeagueError
 from league.interface import Interface

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
 from league.errors import UnknownPolicy

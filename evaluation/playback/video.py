@@ -23,7 +23,7 @@ from PIL.TiffImagePlugin import AppendingTiffWriter
 
 from evaluation.playback.captions import Caption, Captions, Line
 from evaluation.playback.replay import GameSource
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import build
 from league.environments.lockstep import stock_stepping
 from league.errors import ConfigError, EnvironmentMismatch

@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.schedules import adaptive_pairing
-from league.config import GateConfig, LeagueConfig
+from league.config.gate import GateConfig
+from league.config.league import LeagueConfig
 from league.errors import ConfigError, EnvironmentMismatch
 from league.interface import Interface, digest
 from league.refs import ScriptRef

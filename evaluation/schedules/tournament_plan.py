@@ -26,7 +26,7 @@ from evaluation.schedules.builders import (
     round_robin,
 )
 from evaluation.statistics.bradley_terry import rate
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import EnvironmentMismatch, InvalidInput
 from league.interface import Interface
 from league.results.records import GAMES_PER_BLOCK, BlockResult, Match, Schedule

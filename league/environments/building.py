@@ -16,8 +16,8 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
-from league.config import LeagueConfig
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
+from league.config.league import LeagueConfig
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch

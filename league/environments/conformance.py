@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.test import api_test, parallel_api_test
 
-from league.config import LeagueConfig
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
+from league.config.league import LeagueConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import action_space, build, describe, observation_space
 from league.environments.implementation import implementation

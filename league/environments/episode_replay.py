@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, adapter_for, splitter
 from league.environments.building import build, observation_space
 from league.environments.lockstep import plain_actions

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.environments.vector.vector_env import UnsupportedArguments, VectorEnv

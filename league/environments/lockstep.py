@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
 from league.environments.building import action_space, build, observation_space
 from league.environments.crash_limit import CrashLimit

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from supersuit.utils import agent_indicator
 from supersuit.utils.basic_transforms.color_reduction import GRAYSCALE_WEIGHTS
 
-from league.environment_config import WrapperConfig
+from league.config.environment import WrapperConfig
 
 CHANNELS = {"R": 0, "G": 1, "B": 2}
 

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build, observation_space
 from league.environments.crash_limit import CrashLimit
 from league.environments.episode_replay import EpisodeActions, StepActions

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from league.environment_config import EnvironmentConfig, WrapperConfig
+from league.config.environment import EnvironmentConfig, WrapperConfig
 from league.environments.building import build
 from league.environments.transforms import Transform, transform
 from league.environments.vector.vector_env import AgentRows, VectorEnv

@@ -15,7 +15,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from supersuit.lambda_wrappers.reward_lambda import aec_reward_lambda
 
-from league.environment_config import WrapperConfig
+from league.config.environment import WrapperConfig
 from league.environments.transforms import Transform, channel, transform
 from league.errors import ConfigError, one_line
 

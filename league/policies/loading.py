@@ -6,7 +6,7 @@ would be compared on a task that they were not trained for, even if the spaces a
 
 from contextlib import closing
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import EnvironmentMismatch, InvalidInput, UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy

@@ -13,7 +13,7 @@ from league.registry.storage.rows import LeagueRow, detached
 from league.registry.storage.tables import READY, LeagueTable, VersionTable
 
 if TYPE_CHECKING:
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
 
 
 class LeagueRepository(Repository):
@@ -79,7 +79,7 @@ def _unknown(session: Session, league: str) -> LeagueTable:
 
 
 def _row(league: LeagueTable) -> LeagueRow:
-    from league.config import LeagueConfig  # Takes 0.05 s to import, and most commands read versions only.
+    from league.config.league import LeagueConfig  # Takes 0.05 s to import, and most commands read versions only.
 
     config = LeagueConfig.from_mapping(league.config, source=f"the registered league {league.slug}")
     return detached(LeagueRow, league, config=config, interface=Interface.model_validate(league.interface))

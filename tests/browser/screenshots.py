@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 
 from evaluation.gating.nightly import nightly
 from evaluation.matches.tournament import evaluate
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.refs import CheckpointRef
 from league.registry.registry import Registry

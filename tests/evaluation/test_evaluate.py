@@ -13,7 +13,7 @@ from evaluation.matches.tournament import evaluate
 from evaluation.matches.worker import match_worker
 from evaluation.playback.replay import recorded_game
 from evaluation.schedules.tournament_plan import Budget
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, InvalidInput

@@ -9,7 +9,7 @@ from pettingzoo.test import api_test, seed_test
 
 from examples.kuhn_poker import BET, DEALS, PASS, KuhnPoker, env
 from examples.kuhn_poker_vector import KuhnPokerVector
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from tests.support.environments.plans import Plan, assert_equal, last_rows, plans
 

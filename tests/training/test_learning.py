@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.training.learned import LearningCurve, learn
 from examples import traffic
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 # Training takes minutes on a busy machine, more than the timeout of other tests.

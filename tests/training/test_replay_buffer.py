@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from league.training_config import PrioritiesConfig
+from league.config.off_policy import PrioritiesConfig
 from training.replay_buffer import DISCOUNTS, ReplayBuffer, TransitionBlock
 
 GAMMA = 0.5

@@ -26,7 +26,7 @@ from ray.rllib.utils.metrics import WEIGHTS_SEQ_NO
 from ray.rllib.utils.minibatch_utils import MiniBatchCyclicIterator
 from ray.tune.registry import register_env
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous

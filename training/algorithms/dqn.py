@@ -8,12 +8,12 @@ from.
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import DQNConfig
 from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
 from league.spaces import Discrete
-from league.training_config import DQNConfig
 from training.algorithms.off_policy import off_policy_config
 from training.algorithms.setup import rl_module_specs
 from training.learners.dqn import DQNLearner

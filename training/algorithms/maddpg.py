@@ -11,11 +11,11 @@ from collections.abc import Collection
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import MADDPGConfig
 from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
-from league.training_config import MADDPGConfig
 from training.algorithms.off_policy import OffPolicy, off_policy_config
 from training.algorithms.setup import rl_module_specs
 from training.learners.maddpg import MADDPGLearner

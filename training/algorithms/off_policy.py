@@ -2,8 +2,8 @@
 
 To add an algorithm (`training/algorithms/dqn.py` is the shortest example), write:
 
-- the settings: a subclass of OffPolicyConfig in league/training_config.py, a member of the union, a name in ALGORITHMS,
-  and rows in docs/configuration.md;
+- the settings: a subclass of OffPolicyConfig in league/config/off_policy.py, a member of the union and a name in
+  ALGORITHMS (league/config/algorithms.py), and rows in docs/configuration.md;
 - `training/algorithms/<name>.py` with `algorithm_config(league, interface, storage)`, which calls `off_policy_config`
   with a runner, a learner and modules, and `module_spec(settings, interface)`. Its modules are PolicyModules, which
   observe one agent only; they act and are exported;
@@ -36,11 +36,12 @@ from ray.rllib.utils.metrics import (
     WEIGHTS_SEQ_NO,
 )
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import OffPolicyConfig
+from league.config.training import TrainingSettings
 from league.interface import Interface
 from league.seeds import derive
 from league.settings import Storage
-from league.training_config import OffPolicyConfig, TrainingSettings
 from training.algorithms import setup
 from training.algorithms.metrics import EXPLORATION
 from training.algorithms.setup import configure, reset_episodes

@@ -23,12 +23,13 @@ from ray.rllib.utils.metrics import (
     TIMERS,
 )
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
+from league.config.schedules import ScheduleProgress
 from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
-from league.training_config import PPOConfig, ScheduleProgress
 from training.algorithms import setup
 from training.algorithms.setup import configure, reset_episodes, rl_module_specs
 from training.learners.ppo import PPOLearner, hyperparameters

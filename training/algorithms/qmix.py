@@ -9,10 +9,10 @@ Adam instead of RMSprop, and feed-forward networks learn from single transitions
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import QMIXConfig
 from league.interface import Interface
 from league.settings import Storage
-from league.training_config import QMIXConfig
 from training.algorithms.off_policy import OffPolicy, off_policy_config
 from training.algorithms.setup import rl_module_specs
 from training.learners.qmix import QMIXLearner, teams

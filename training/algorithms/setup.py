@@ -13,14 +13,16 @@ from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.env_runner import EnvRunner
 
-from league.config import LeagueConfig
+from league.config.algorithms import AnyTraining
+from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
+from league.config.training import PhaseConfig, TrainingSettings
 from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
 from league.seeds import derive
 from league.settings import Storage
-from league.training_config import AnyTraining, PhaseConfig, PPOConfig, TrainingSettings
 from training.modules.policy_module import PolicyModule
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner, module_spaces
 

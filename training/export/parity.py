@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Indices, Starts
 from league.errors import ParityError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.interface import Interface
 from league.registry.registry import Registry
 from league.registry.storage.manifest import PROBES, TRAINING, Manifest, PolicyManifest

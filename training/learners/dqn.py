@@ -5,8 +5,8 @@ from collections.abc import Collection, Mapping
 import torch
 from torch import Tensor, nn
 
+from league.config.off_policy import DQNConfig
 from league.spaces import ACTION_MASK
-from league.training_config import DQNConfig
 from training.learners.off_policy import (
     OffPolicyLearner,
     ReplayBatch,

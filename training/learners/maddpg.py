@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from league.training_config import MADDPGConfig
+from league.config.off_policy import MADDPGConfig
 from training.learners.off_policy import OffPolicyLearner, ReplayBatch, bootstrapped_returns
 from training.modules.maddpg import Actor, Critic
 from training.replay_buffer import DISCOUNTS, NEXT, Sample, subcolumns

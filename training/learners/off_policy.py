@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ray.rllib.utils.metrics import WEIGHTS_SEQ_NO
 from torch import Tensor, nn
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import OffPolicyConfig
 from league.errors import ConfigError
 from league.interface import Interface
-from league.training_config import OffPolicyConfig
 from training.modules.policy_module import MASKED_LOGIT
 from training.replay_buffer import Sample
 from training.rllib_compat import FixedPoliciesLearner, includes_component

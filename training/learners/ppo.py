@@ -12,9 +12,10 @@ from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
 from ray.rllib.utils.metrics import ALL_MODULES, NUM_MODULE_STEPS_TRAINED
 from torch import Tensor
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
+from league.config.schedules import Scheduled, ScheduleProgress, scheduled_value
 from league.errors import ConfigError
-from league.training_config import PPOConfig, Scheduled, ScheduleProgress, scheduled_value
 from training.learners.train_batch import (
     Bootstraps,
     Minibatch,

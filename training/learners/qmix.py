@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.off_policy import QMIXConfig
 from league.environments.building import divide
 from league.errors import ConfigError
 from league.interface import Interface
 from league.spaces import ACTION_MASK, Discrete
-from league.training_config import QMIXConfig
 from training.learners.off_policy import OffPolicyLearner, ReplayBatch, ReplayLoss, bootstrapped_returns, next_actions
 from training.modules.qmix import (
     AgentNetwork,

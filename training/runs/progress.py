@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, ProgressColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bars
 
+from league.config.training import TrainingSettings
 from league.registry.storage.rows import VersionRow
-from league.training_config import TrainingSettings
 from training.algorithms.metrics import OTHER_TIME, PHASES
 
 SECONDS_PER_LINE = 10.0

@@ -22,7 +22,8 @@ from typing import Self
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.training import TrainingSettings
 from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.files import disk_errors, replacing
 from league.interface import Interface
@@ -30,7 +31,6 @@ from league.policies.loading import contestant
 from league.refs import CheckpointRef, of_league, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
-from league.training_config import TrainingSettings
 
 
 def write(record: BaseModel, path: Path) -> None:

@@ -8,7 +8,8 @@ from pydantic import TypeAdapter
 from ray import tune
 from rich.console import Console
 
-from league.config import LeagueConfig
+from league.config.algorithms import AnyTraining, TrainingConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
 from league.errors import ConfigError, InterfaceChanged
@@ -18,7 +19,6 @@ from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.manifest import TRAINING
 from league.registry.storage.rows import VersionRow
-from league.training_config import AnyTraining, TrainingConfig
 from training.algorithms.off_policy import starts_with_empty_replay
 from training.algorithms.setup import algorithm_config, module_spec, num_envs
 from training.export.publish import git_commit

@@ -21,11 +21,11 @@ from ray import tune
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.schedules import ScheduleProgress
 from league.files import move_durably
 from league.interface import Interface
 from league.settings import Storage
-from league.training_config import ScheduleProgress
 from training.algorithms.metrics import (
     CHECKPOINT_TIME,
     OTHER_TIME,

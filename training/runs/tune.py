@@ -10,8 +10,8 @@ from typing import Any
 import ray
 from ray import tune
 
+from league.config.training import TrainingSettings
 from league.errors import ConfigError
-from league.training_config import TrainingSettings
 from training.rllib_compat import restored_sigusr1
 from training.runs.run_reporter import TensorBoard
 

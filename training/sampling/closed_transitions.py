@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch

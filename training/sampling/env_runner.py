@@ -19,7 +19,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME, WEIGHTS_SEQ_NO
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.implementation import stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import ConfigError, LeagueError

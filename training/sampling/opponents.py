@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from league.config.training import OpponentConfig
 from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError
 from league.interface import Interface
@@ -16,7 +17,6 @@ from league.policies.policy import Policy
 from league.refs import ScriptRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
-from league.training_config import OpponentConfig
 from training.sampling.recurrent_state import RecurrentStates
 
 

@@ -14,7 +14,7 @@ from pettingzoo import AECEnv
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
 from ray.tune.registry import register_env
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import build, interface
 from league.environments.lockstep import Lockstep
 from league.environments.stepping import Turn, each_agent_alone

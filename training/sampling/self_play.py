@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from league.config.training import TrainingSettings
 from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts, Turn
 from league.interface import Interface
 from league.policies.actions import to_environment
 from league.settings import Storage
 from league.spaces import ACTION_MASK
-from league.training_config import TrainingSettings
 from training.modules.policy_module import PREVIOUS_ACTION
 from training.sampling.distributions import OrnsteinUhlenbeck, distribution
 from training.sampling.opponents import Controllers, Matchups, Openings, OpponentPolicy, Opponents, RandomMoves

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from league.config import LeagueConfig, SweepConfig
+from league.config.league import LeagueConfig
+from league.config.sweep import SweepConfig
 from league.errors import ConfigError
 from league.seeds import generator
 

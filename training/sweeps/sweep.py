@@ -16,7 +16,8 @@ from ray import tune
 from ray.tune.schedulers import ASHAScheduler, FIFOScheduler, TrialScheduler
 from rich.console import Console
 
-from league.config import LeagueConfig, SweepConfig
+from league.config.league import LeagueConfig
+from league.config.sweep import SweepConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface

@@ -18,7 +18,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import ConfigError, NotFound
 from league.files import disk_errors
 from league.settings import Storage

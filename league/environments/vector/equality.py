@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for
 from league.environments.building import action_space, build, observation_space
 from league.environments.vector.differences import EnvironmentsDiffer, RowNames, check_column, check_rows

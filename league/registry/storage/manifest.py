@@ -4,7 +4,7 @@ from typing import Any, Self
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.errors import ArtifactCorrupt
 from league.interface import Interface
 from league.spaces import Space

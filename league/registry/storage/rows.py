@@ -11,7 +11,7 @@ from league.registry.storage.manifest import Manifest
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from league.config import LeagueConfig
+    from league.config.league import LeagueConfig
 
 Record = TypeVar("Record", bound="DataclassInstance")
 

@@ -11,7 +11,7 @@ from sqlalchemy import delete
 from evaluation.gating.anchors import earlier_champions, resolve_anchors
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import ConfigError, UnknownPolicy, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.storage import tables

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from evaluation.gating.gate import SequentialMonitor, decide, decide_matches, shadow_shortfall
 from evaluation.matches.game_records import unique_games
 from evaluation.statistics.sequential import bounds, elo_estimate, expected_games, gsprt_llr
-from league.config import GateConfig
+from league.config.gate import GateConfig
 from league.results.records import Game, Match
 from tests.support.closeness import close
 

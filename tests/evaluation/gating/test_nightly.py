@@ -21,7 +21,7 @@ from evaluation.gating.verification import verify
 from evaluation.matches import tournament
 from evaluation.reporting.league_report import league_report
 from evaluation.results import NightlyReport, Progress, VerdictReport
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError
 from league.histograms import BOUNDS

@@ -18,7 +18,7 @@ from evaluation.matches.tournament import play_schedule
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import ANCHOR, round_robin
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.errors import GameCrashed, GameHung, LeagueError

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from evaluation.playback.human_play import PERSON, GameState, human_play
 from evaluation.playback.single_game import GameStep, play_game
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment

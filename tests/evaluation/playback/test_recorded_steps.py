@@ -15,7 +15,7 @@ from PIL import Image
 from evaluation.matches.tournament import evaluate
 from evaluation.playback.recorded_steps import RecordedGame, recorded_steps
 from evaluation.playback.replay import recorded_game
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.policies.onnx import OnnxPolicy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evaluation.playback.single_game import first_observation, play_game
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import build, interface
 from league.environments.lockstep import stock_stepping
 from league.errors import UnknownPolicy

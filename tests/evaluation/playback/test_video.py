@@ -9,7 +9,7 @@ from PIL import Image
 from evaluation.matches.tournament import evaluate
 from evaluation.playback.replay import GameSource, live_game, recorded_game
 from evaluation.playback.video import FrameComposer, show_window, write_video
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch, InvalidReference, NotFound, StorageError
 from league.registry.registry import Registry

@@ -11,7 +11,7 @@ from evaluation.matches.game_records import Upset
 from evaluation.matches.tournament import evaluate
 from evaluation.reporting import flipbook
 from evaluation.reporting.flipbook import Flipbook, flipbooks
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.results.ledger import Ledger

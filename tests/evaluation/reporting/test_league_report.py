@@ -13,7 +13,7 @@ from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.reporting import league_report as module
 from evaluation.reporting.league_report import LeagueReport, league_report
 from evaluation.statistics.payoff import tabulate
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import UnknownLeague
 from league.registry.registry import Registry

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.schedules.builders import gauntlet, round_robin, scoring, verdict
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch
 from league.results.records import Schedule

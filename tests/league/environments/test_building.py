@@ -4,8 +4,8 @@ import pytest
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
-from league.config import LeagueConfig
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
+from league.config.league import LeagueConfig
 from league.environments.building import action_space, build, describe, interface, observation_space
 from league.errors import ConfigError, EnvironmentMismatch
 

@@ -8,7 +8,7 @@ import supersuit
 from mpe2 import simple_adversary_v3, simple_spread_v3, simple_world_comm_v3
 from pettingzoo.butterfly import pistonball_v6
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import Cycle, build
 
 PIXELS = [{"color_reduction_v0": {"mode": "B"}}, {"resize_v1": {"x_size": 42, "y_size": 42}}, "frame_stack_v1"]

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from examples.kuhn_poker_vector import KuhnPokerVector
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments import conformance
 from league.environments.conformance import Examination, examine
 from league.environments.vector.vector_env import AgentRows

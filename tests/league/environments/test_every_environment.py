@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import stock_stepping
 from tests.conformance.stepping import Reports, assert_same_episode, lockstep

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments import implementation as choice
 from league.environments.implementation import VECTORISED, implementation, stepping
 from league.environments.lockstep import Lockstep

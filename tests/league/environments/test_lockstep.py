@@ -8,7 +8,7 @@ import pytest
 
 from examples import two_step
 from examples.traffic import crossing
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import each_agent_alone
 from tests.conformance.stepping import assert_abandoning_conforms, assert_states_conform, assert_stepping_conforms

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import build
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment, Starts, Turn, each_agent_alone

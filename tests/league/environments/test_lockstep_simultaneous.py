@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError

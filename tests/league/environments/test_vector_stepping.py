@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.implementation import implementation, stepping
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Starts, States, Turn

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import stock_stepping
 from league.errors import ConfigError

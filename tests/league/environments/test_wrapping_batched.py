@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.building import build
 from league.environments.transforms import Resize
 from league.environments.wrapping import BatchedWrappers

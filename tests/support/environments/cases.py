@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 
 TEAM = {"team": ["*"]}
 

@@ -8,7 +8,7 @@ from typing import Any
 from evaluation.matches.game_loop import play_matches
 from evaluation.matches.seating import Roster
 from evaluation.schedules.builders import round_robin
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.interface import Interface

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import DifferentialTest
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import Box, Discrete, Space

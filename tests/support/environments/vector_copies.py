@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for, splitter
 from league.environments.building import build, observation_space
 from league.environments.vector.vector_env import AgentRows, VectorEnv

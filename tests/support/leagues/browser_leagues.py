@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 
 from evaluation.service.snapshots import refresh
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.refs import CheckpointRef
 from league.registry.registry import Registry

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.registry.registry import Registry
 from tests.support.leagues import tictactoe
 

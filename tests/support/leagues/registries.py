@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.interface import AgentInterface, Interface
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest, Parity, PolicyManifest, Tensor

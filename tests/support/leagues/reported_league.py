@@ -6,7 +6,7 @@ from pathlib import Path
 
 from evaluation.gating.nightly import nightly
 from evaluation.matches.tournament import evaluate
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.settings import Storage

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.interface import AgentInterface, Interface
 from league.policies.probes import Probes
 from league.registry.aliases import ANY

@@ -14,7 +14,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.interface import AgentInterface
 from league.registry.registry import Registry

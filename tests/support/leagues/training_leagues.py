@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 
 COUNTING = "tests.support.environments.counting:counting"
 ENVIRONMENTS = "tests.support.environments.training_environments"

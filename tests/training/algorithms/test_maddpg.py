@@ -8,7 +8,7 @@ import pytest
 import torch
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch
 from tests.support.environments.training_environments import ROUNDS

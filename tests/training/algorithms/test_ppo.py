@@ -7,7 +7,7 @@ import pytest
 import torch
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from tests.support.environments.training_environments import ROUNDS

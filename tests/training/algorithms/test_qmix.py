@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, LEARNER_RESULTS
 
 from benchmarks.training import two_step
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy

@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 import torch
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ParityError
 from league.interface import Interface

@@ -7,7 +7,7 @@ import pytest
 import torch
 from ray.rllib.core.learner.learner import DEFAULT_OPTIMIZER
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from tests.support.leagues.training_leagues import maddpg
 from training.algorithms.maddpg import algorithm_config

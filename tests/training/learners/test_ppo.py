@@ -9,10 +9,10 @@ import torch
 from ray.rllib.core.learner.training_data import TrainingData
 from ray.rllib.utils.metrics import ALL_MODULES
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
-from league.training_config import ScheduleProgress
 from tests.support.leagues.training_leagues import solvable
 from training.algorithms.ppo import algorithm_config
 from training.learners import ppo

@@ -1,7 +1,7 @@
 import pytest
 
+from league.config.schedules import ScheduleProgress
 from league.errors import ConfigError
-from league.training_config import ScheduleProgress
 from tests.support.leagues.training_leagues import tictactoe
 from training.learners.ppo import Hyperparameters, hyperparameters, scheduled_hyperparameters
 

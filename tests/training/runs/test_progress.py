@@ -2,7 +2,7 @@ import io
 
 from rich.console import Console
 
-from league.training_config import PPOConfig
+from league.config.ppo import PPOConfig
 from training.runs.progress import TrainingProgress, clock
 
 SETTINGS = PPOConfig(steps=1000, minutes=2)

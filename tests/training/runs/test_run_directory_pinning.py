@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import InvalidReference, LeagueError, UnknownVersion
 from tests.support.leagues import tictactoe
 from training.runs.run_directory import pin_opponents, with_pins

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import ConfigError, LeagueError, NotFound, ParityError, UnknownVersion
 from league.refs import CheckpointRef
 from league.registry.registry import Registry

@@ -1,8 +1,8 @@
 import pytest
 import ray
 
+from league.config.ppo import PPOConfig
 from league.errors import ConfigError
-from league.training_config import PPOConfig
 from training.runs.tune import cpu_share, placement
 
 

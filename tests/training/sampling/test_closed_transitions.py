@@ -10,12 +10,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
+from league.config.training import OpponentConfig
 from league.environments.building import interface as interface_of
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch
 from league.seeds import generator
-from league.training_config import OpponentConfig, PPOConfig
 from tests.support.environments.scripted_environment import AgentRecord, Scripted, interface
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward

@@ -20,7 +20,7 @@ from ray.rllib.utils.metrics import (
     WEIGHTS_SEQ_NO,
 )
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from tests.conformance.stepping import plain_loop
 from tests.support.environments.counting import Counting

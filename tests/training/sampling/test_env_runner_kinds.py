@@ -20,7 +20,7 @@ from ray.rllib.utils.metrics import (
     NUM_MODULE_STEPS_SAMPLED,
 )
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments import lockstep
 from league.environments.building import interface
 from league.errors import ConfigError, InvalidReward

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
+from league.config.ppo import PPOConfig
+from league.config.training import OpponentConfig
 from league.errors import ConfigError
 from league.policies.actions import to_environment
 from league.seeds import generator
-from league.training_config import OpponentConfig, PPOConfig
 from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.sampling.episode_chunks import as_episodes

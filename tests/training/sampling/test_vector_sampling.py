@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.environments.vector_stepping import VectorStepping

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.config import SweepConfig
+from league.config.sweep import SweepConfig
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import tictactoe
 from training.sweeps.search_space import applied, nested, plan

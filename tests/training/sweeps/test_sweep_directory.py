@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
 from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe

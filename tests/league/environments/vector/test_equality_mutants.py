@@ -2,7 +2,7 @@
 
 import pytest
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from tests.support.environments.mutants import Mutation, mutated
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector import leduc_holdem
 from league.environments.vector.equality import Comparison, DifferentialTest, compare
 from league.environments.vector.leduc import deals, rules

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from league.environments.vector.rps import RockPaperScissors
 from league.environments.vector.vector_env import UnsupportedArguments

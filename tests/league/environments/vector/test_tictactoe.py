@@ -3,7 +3,7 @@ import itertools
 import pytest
 from hypothesis import given, settings
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from league.environments.vector.tictactoe import LINES, TicTacToe
 from league.environments.vector.vector_env import AgentRows, UnsupportedArguments

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from tests.support.environments.mutants import Mutation, mutated
 

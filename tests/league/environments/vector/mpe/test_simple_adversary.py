@@ -2,7 +2,7 @@ from typing import Any
 
 import numpy as np
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.mpe.simple_adversary import SimpleAdversary
 
 

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import DifferentialTest
 from league.environments.vector.mpe.initial_states import positions_only
 from league.environments.vector.mpe.particles import lengths

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.environment_config import EnvironmentConfig
+from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.simple_adversary import SimpleAdversary

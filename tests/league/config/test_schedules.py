@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.config import LeagueConfig
+from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
+from league.config.schedules import AnnealingConfig, ScheduleProgress, scheduled_value
 from league.errors import ConfigError
-from league.training_config import AnnealingConfig, PPOConfig, ScheduleProgress, scheduled_value
 
 VALUES = st.floats(min_value=0, max_value=1)
 STEPS = st.integers(min_value=0, max_value=10**7)

@@ -1,18 +1,11 @@
-"""The `environment` section of a league's configuration, which each manifest repeats, and the base of all sections."""
+"""The `environment` section, which each manifest repeats."""
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from league.config.base import JSON, Part
 from league.interface import digest
-
-JSON = dict[str, Any]
-
-
-class Part(BaseModel):
-    """Base of configuration models: frozen, rejects unknown keys and non-finite numbers."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class WrapperConfig(Part):

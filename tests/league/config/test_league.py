@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from league.config import LeagueConfig
+from league.config.algorithms import ALGORITHMS
+from league.config.league import LeagueConfig
 from league.errors import ConfigError
-from league.training_config import ALGORITHMS
 
 CONFIGS = sorted(Path("configs").glob("*.yaml"))
 MINIMAL = {"league": "mini", "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}}

@@ -1,0 +1,105 @@
+"""The `gate` section: the statistical test for promotions."""
+
+from typing import Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from league.config.base import Part
+
+MAX_NORMALIZED_ELO = 190
+"""Bound for hypotheses with a usable test; see evaluation/statistics/sequential.py."""
+
+
+class AnchorConfig(Part):
+    """An opponent for the non-inferiority test of a candidate."""
+
+    ref: str
+    """A script (`script:one_ply`), a version (`connect_four@3`), or an alias, which is resolved when the verdict is
+    opened. `@3` and `@gold` refer to the league itself."""
+    margin: float | None = Field(default=None, gt=0)
+    """Non-inferiority margin; by default the gate's `margin`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        return {"ref": value} if isinstance(value, str) else value
+
+
+class GateConfig(Part):
+    """The statistical test for promotions. See docs/statistics.md."""
+
+    model: Literal["logistic", "normalized", "returns"] = "normalized"
+    """The observed quantity of a block: its score in logistic or normalized Elo (GSPRT), or its difference of returns
+    (test by betting)."""
+    elo0: float = 0.0
+    """H0: strength of the candidate relative to the champion, in Elo of `model`."""
+    elo1: float = 30.0
+    """H1: strength of the candidate relative to the champion."""
+    return0: float = 0.0
+    """H0 of the model `returns`: upper bound of the mean difference of returns."""
+    return1: float = 0.0
+    """H1 of the model `returns`: lower bound of the mean difference of returns."""
+    return_bound: float | None = Field(default=None, gt=0)
+    """Maximum absolute difference of returns in a block. Required by the model `returns`."""
+    alpha: float = Field(default=0.05, gt=0, lt=0.5)
+    """Probability of promoting at least one candidate under H0 in a year of nightly runs."""
+    nights: int | None = Field(default=365, ge=1)
+    """Nightly runs per year, among which alpha is divided equally; the candidates of a run share its part. Null: each
+    verdict uses the full alpha."""
+    beta: float = Field(default=0.05, gt=0, lt=0.5)
+    """Probability of rejecting a candidate under H1."""
+    max_blocks: int = Field(default=4000, ge=1)
+    """Blocks after which a test ends as `inconclusive` and the champion stays."""
+    anchors: tuple[AnchorConfig, ...] = ()
+    """Opponents of non-inferiority tests, in addition to previous champions."""
+    earlier_champions: int = Field(default=2, ge=0)
+    """Number of previous champions that are anchors."""
+    margin: float = Field(default=50.0, gt=0)
+    """Non-inferiority margin, in Elo of `model` or in returns."""
+    confirmation_blocks: int = Field(default=200, ge=0)
+    """Blocks against the previous champion after a promotion, for an unbiased estimate of the improvement."""
+    forfeits: bool = False
+    """Whether a candidate that forfeited a game (illegal action or crash) may be promoted."""
+    shadow_agreement: float | None = Field(default=None, ge=0, le=1)
+    """Minimum fraction of mirrored observations for which candidate and champion choose the same action; null for no
+    minimum. Like `latency_ms`, it applies only if the league has a champion."""
+    latency_ms: float | None = Field(default=None, gt=0)
+    """Maximum of the 95th percentile of the candidate's CPU time per mirrored request, in milliseconds."""
+    shadow_observations: int = Field(default=1000, ge=1)
+    """Minimum number of mirrored observations for these two criteria."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        margins = [self.margin, *(anchor.margin for anchor in self.anchors if anchor.margin is not None)]
+        if self.model == "returns":
+            self._check_returns(max(margins))
+            return self
+        if not self.elo0 < self.elo1:
+            raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
+        if self.model == "normalized" and max(-self.elo0, self.elo1, *margins) > MAX_NORMALIZED_ELO:
+            raise ValueError(
+                f"elo0, elo1 and margins must lie within ±{MAX_NORMALIZED_ELO} (normalized Elo),"
+                f" got {self.elo0:g}, {self.elo1:g} and {max(margins):g}"
+            )
+        return self
+
+    def _check_returns(self, margin: float) -> None:
+        if self.return_bound is None:
+            raise ValueError("model: returns requires return_bound, the maximum difference of returns in a block")
+        if not -self.return_bound < self.return0 <= self.return1 < self.return_bound:
+            raise ValueError(
+                f"return0 and return1 must lie within ±{self.return_bound:g} (return_bound), return0 first,"
+                f" got {self.return0:g} and {self.return1:g}"
+            )
+        if margin >= self.return_bound:
+            raise ValueError(f"margin must be smaller than return_bound ({self.return_bound:g}), got {margin:g}")
+
+    def against_anchor(self, margin: float | None) -> Self:
+        """Return the settings of a non-inferiority test. H0: weaker by the margin; H1: equally strong."""
+        below = -(self.margin if margin is None else margin)
+        zero = {"return0": below, "return1": 0.0} if self.model == "returns" else {"elo0": below, "elo1": 0.0}
+        return self.model_copy(update=zero)
+
+    def of_one_verdict(self, alpha: float) -> Self:
+        """Return the settings of one verdict with error probability `alpha`."""
+        return self.model_copy(update={"alpha": alpha, "nights": None})

@@ -1,0 +1,87 @@
+"""The configuration file of a league. Errors name the file, the key and the expected value."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+from pydantic import Field, ValidationError, field_validator
+
+from league.config.algorithms import TrainingConfig
+from league.config.base import Part
+from league.config.environment import EnvironmentConfig
+from league.config.gate import GateConfig
+from league.config.play import PlayConfig
+from league.config.ppo import PPOConfig
+from league.config.sweep import SweepConfig
+from league.config.validation_errors import describe_validation_error
+from league.errors import ConfigError, InvalidReference, one_line
+from league.refs import check_slug
+
+ONE_POLICY: dict[str, tuple[str, ...]] = {"shared": ("*",)}
+
+
+class LeagueConfig(Part):
+    """Configuration of a league. Only `league` and `environment` are required."""
+
+    league: str
+    """Name of the league: a-z, 0-9, `_` and `-`."""
+    environment: EnvironmentConfig
+    policies: dict[str, tuple[str, ...]] | str = Field(default=ONE_POLICY)
+    """Policy id → agents, by name or pattern (`player_*`); the first match determines an agent's policy. Alternatively
+    a function `package.module:function` from agent to policy id."""
+    sides: dict[str, tuple[str, ...]] | None = None
+    """Side → agents, by name or pattern. By default each agent is a separate side."""
+    play: PlayConfig = PlayConfig()
+    training: TrainingConfig = PPOConfig()
+    gate: GateConfig = GateConfig()
+    sweep: SweepConfig | None = None
+
+    @field_validator("league")
+    @classmethod
+    def _league_is_slug(cls, value: str) -> str:
+        return _slug("league", value)
+
+    @field_validator("policies", "sides")
+    @classmethod
+    def _keys_are_slugs(cls, value: dict[str, Any] | str | None) -> dict[str, Any] | str | None:
+        if isinstance(value, str) and not all(part.strip() for part in value.partition(":")):
+            raise ValueError("expected policy ids with their agents, or a function package.module:function")
+        if isinstance(value, dict) and not value:
+            raise ValueError("expected at least one entry")
+        for key in value if isinstance(value, dict) else ():
+            _slug("name", key)
+        return value
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a YAML file. Raises ConfigError if it cannot be read, or the configuration is invalid."""
+        try:
+            document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror or error}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not a YAML file: {one_line(error)}") from error
+        return cls.from_mapping(document, source=str(path))
+
+    @classmethod
+    def from_mapping(cls, document: Any, source: str = "configuration") -> Self:
+        """Validate a mapping, as parsed from YAML. Raises ConfigError, whose message names `source`."""
+        if not isinstance(document, Mapping):
+            raise ConfigError(f"{source}: expected a mapping with keys such as 'league' and 'environment'")
+        try:
+            return cls.model_validate(document)
+        except ValidationError as error:
+            raise ConfigError(f"{source}: {describe_validation_error(cls, error)}") from error
+
+    def with_training(self, **settings: Any) -> Self:
+        """Return the configuration with some training settings replaced. Raises ConfigError if it is invalid."""
+        training = self.training.model_dump(by_alias=True) | settings
+        return self.from_mapping(self.model_dump(by_alias=True) | {"training": training}, source=self.league)
+
+
+def _slug(kind: str, value: str) -> str:
+    try:
+        return check_slug(kind, value)
+    except InvalidReference as error:
+        raise ValueError(str(error)) from error

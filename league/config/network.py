@@ -1,0 +1,30 @@
+"""Layers of a policy network."""
+
+from pydantic import Field
+
+from league.config.base import Part
+
+
+class ConvolutionConfig(Part):
+    """A convolution without padding over image-like observations."""
+
+    filters: int = Field(ge=1)
+    kernel: int = Field(default=3, ge=1)
+    stride: int = Field(default=1, ge=1)
+
+
+class RecurrenceConfig(Part):
+    """An LSTM between the hidden layers and the heads (Hochreiter and Schmidhuber, 1997)."""
+
+    width: int = Field(default=128, ge=1)
+    sequence: int = Field(default=20, ge=1)
+    """Steps of truncated backpropagation through time."""
+
+
+class GatedRecurrenceConfig(Part):
+    """A GRU before the head (Cho et al., 2014, arXiv 1406.1078), whose input includes the previous action."""
+
+    width: int = Field(default=64, ge=1)
+    sequence: int = Field(default=50, ge=1)
+    """Length of training sequences. Longer episodes are split at its multiples; each part starts from the recurrent
+    state recorded during sampling."""

@@ -1,0 +1,27 @@
+"""The `play` section: matches."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from league.config.base import Part
+
+
+class PlayConfig(Part):
+    """Settings of matches."""
+
+    opening_plies: int = Field(default=0, ge=0)
+    """Random legal steps at the start of each game. Without them, greedy policies repeat one game of a deterministic
+    environment."""
+    scoring: Literal["game", "side"] | None = None
+    """What a contestant's return is compared with. game: the returns of its opponents in the same game. side: the
+    return of the other contestant on the same side in the block's other game. By default `game` if there are several
+    equivalent sides, else `side`."""
+    num_envs: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    """Games stepped in parallel in one worker. auto: 512 in a vectorised environment, else 32. Does not influence
+    results."""
+    max_moves: int = Field(default=10_000, ge=1)
+    """Environment steps after which a game counts as hung and its match fails. Simultaneous actions of several agents
+    are one step."""
+    game_seconds: float = Field(default=600.0, gt=0, allow_inf_nan=False)
+    """Seconds of environment time (resets and steps of this game alone) after which a game counts as hung."""

@@ -1,0 +1,60 @@
+"""Settings of PPO."""
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from league.config.base import Part
+from league.config.network import RecurrenceConfig
+from league.config.schedules import Scheduled, ScheduledPositive
+from league.config.training import TrainingSettings
+
+
+class PolicySettings(Part):
+    """Settings of PPO for one policy; null for the common value. See PPOConfig."""
+
+    lr: ScheduledPositive | None = None
+    gamma: float | None = Field(default=None, ge=0, le=1)
+    lambda_: float | None = Field(default=None, ge=0, le=1, alias="lambda")
+    clip: ScheduledPositive | None = None
+    entropy: Scheduled | None = None
+
+
+class PPOConfig(TrainingSettings):
+    """Proximal policy optimisation (Schulman et al., 2017, arXiv 1707.06347)."""
+
+    algorithm: Literal["ppo"] = "ppo"
+    lr: ScheduledPositive = 5e-4
+    """Learning rate of Adam."""
+    train_batch_size: int = Field(default=4096, ge=1)
+    """Actions per update."""
+    minibatch_size: int = Field(default=512, ge=1)
+    """Actions per gradient step."""
+    epochs: int = Field(default=4, ge=1)
+    """Passes over each train batch."""
+    lambda_: float = Field(default=0.95, ge=0, le=1, alias="lambda")
+    """λ of generalised advantage estimation."""
+    clip: ScheduledPositive = 0.2
+    """Clipping range of the probability ratio."""
+    entropy: Scheduled = 0.05
+    """Coefficient of the entropy bonus."""
+    value_loss: float = Field(default=0.5, ge=0)
+    """Coefficient of the value loss."""
+    recurrence: RecurrenceConfig | None = None
+    """Recurrent layer; null for none."""
+    shared_encoder: bool = False
+    """Share the convolutions and hidden layers among all policies. Heads are separate."""
+    per_policy: dict[str, PolicySettings] = Field(default={})
+    """Policy id → settings that differ from the common ones."""
+
+    @model_validator(mode="after")
+    def _minibatch_fits(self) -> Self:
+        if self.minibatch_size > self.train_batch_size:
+            raise ValueError(f"minibatch_size must be at most train_batch_size ({self.train_batch_size})")
+        return self
+
+    @model_validator(mode="after")
+    def _encoder_fits(self) -> Self:
+        if self.shared_encoder and self.recurrence is not None:
+            raise ValueError("shared_encoder does not support recurrence")
+        return self

@@ -1,0 +1,33 @@
+"""The `sweep` section: a search over training settings."""
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from league.config.base import JSON, Part
+
+
+class AshaConfig(Part):
+    """Early stopping by asynchronous successive halving (Li et al., 2020, arXiv 1810.05934)."""
+
+    grace_steps: int = Field(default=50_000, ge=1)
+    """Minimum number of actions per trial."""
+    reduction_factor: int = Field(default=3, ge=2)
+    """At each rung, one in this many trials continues."""
+
+
+class SweepConfig(Part):
+    """Search over training settings (`league sweep`)."""
+
+    parameters: dict[str, JSON | list[Any]] = Field(min_length=1)
+    """Training setting → a list of values (grid search), or a distribution: `{choice: [..]}`, `{uniform: [low, high]}`,
+    `{loguniform: [low, high]}`, `{randint: [low, high]}`. Settings of one policy are `per_policy.<id>.<setting>`."""
+    samples: int = Field(default=1, ge=1)
+    """Samples of the random parameters for each combination of the lists."""
+    concurrent: int = Field(default=1, ge=1)
+    """Maximum number of concurrent trials, also limited by the CPUs."""
+    metric: str = "return"
+    """Metric of the run by which trials are compared, such as `return` or `<policy>/return`."""
+    mode: Literal["max", "min"] = "max"
+    asha: AshaConfig | None = None
+    """Early stopping; null trains each trial to its full budget."""

@@ -1,0 +1,91 @@
+"""The `training` section: settings common to all algorithms."""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from league.config.base import Part
+from league.config.network import ConvolutionConfig
+
+
+class OpponentConfig(Part):
+    """A fixed policy that controls the other sides in a fraction of the episodes and does not learn."""
+
+    ref: str
+    """A script (`script:random`), a version (`connect_four@3`), or an alias, which is resolved when training starts.
+    `@3` and `@champion` refer to the league itself."""
+    share: float = Field(gt=0, le=1)
+    """Fraction of the episodes. The remaining episodes are self-play."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        return {"ref": value, "share": 1.0} if isinstance(value, str) else value
+
+
+class PhaseConfig(Part):
+    """A phase of training in which only some policies learn."""
+
+    policies: tuple[str, ...] = Field(min_length=1)
+    iterations: int = Field(ge=1)
+    """Number of updates. The phases are repeated in order."""
+
+
+class TrainingSettings(Part):
+    """Settings common to all algorithms."""
+
+    seed: int = Field(default=0, ge=0)
+    """Seed of the run, from which all random choices are derived."""
+    steps: int = Field(default=1_000_000, ge=1)
+    """Number of actions of all agents after which training ends."""
+    minutes: float | None = Field(default=None, gt=0)
+    """Wall-clock limit of training, in addition to `steps`."""
+    checkpoint_every: int | None = Field(default=200_000, ge=1)
+    """Number of actions between published versions; null disables this trigger. The end of training also publishes."""
+    checkpoint_minutes: float | None = Field(default=None, gt=0)
+    """Wall-clock minutes between published versions; the earlier of the two triggers applies."""
+    runners: int = Field(default=1, ge=0)
+    """Number of sampling processes (env runners); 0 samples in the learner's process."""
+    num_envs: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    """Environments stepped in parallel in each runner. auto: 32; with PPO and a vectorised environment up to 512, as
+    long as each agent gets 16 steps of each environment per batch."""
+    gamma: float = Field(default=0.99, ge=0, le=1)
+    """Discount factor per turn of an agent."""
+    grad_clip: float = Field(default=0.5, gt=0)
+    """Maximum global norm of the gradient."""
+    convolutions: tuple[ConvolutionConfig, ...] = ()
+    """Convolutions for image-like parts of the observation, (height, width, channels). Other parts are flattened."""
+    hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
+    """Widths of the hidden layers."""
+    normalize_observations: bool = False
+    """Normalize each observation feature by its running mean and standard deviation, inside the exported graph."""
+    policies_to_train: tuple[str, ...] | tuple[PhaseConfig, ...] | None = None
+    """The policies that learn, or repeated phases; null for all. Other policies keep their weights: those of the parent
+    version (`--from`), or their initial weights."""
+    opponents: tuple[OpponentConfig, ...] = ()
+    """Fixed opponents. In their episodes one random side learns, and the opponent controls all others."""
+    gpus: float = Field(default=0, ge=0)
+    """GPUs of the learner; a fraction shares a GPU."""
+    runner_gpus: float = Field(default=0, ge=0)
+    """GPUs of each runner for inference."""
+    crashes: int = Field(default=3, ge=0)
+    """Maximum number of consecutive exceptions after which an environment is recreated; the next one ends training."""
+    opening_plies: int = Field(default=0, ge=0)
+    """Maximum number of random legal moves at the start of each episode. They are excluded from training and lead to
+    positions that self-play alone would not visit."""
+
+    @model_validator(mode="after")
+    def _shares_fit(self) -> Self:
+        if (total := sum(opponent.share for opponent in self.opponents)) > 1 + 1e-9:
+            raise ValueError(f"the shares of opponents must sum to at most 1, got {total:g}")
+        return self
+
+    def budget_spent(self, steps: int, seconds: float) -> float:
+        """Return the fraction of the budget that a run has spent, of steps or of time, whichever is larger; at most 1.
+
+        Args:
+            steps: Actions of the run, without those of parent versions.
+            seconds: Training time of the run.
+        """
+        of_time = seconds / (60 * self.minutes) if self.minutes is not None else 0.0
+        return min(max(steps / self.steps, of_time), 1.0)
