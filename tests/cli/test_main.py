@@ -101,7 +101,7 @@ LARGE_PACKAGES = (
     "alembic",
     "gymnasium",
     "httpx",
-    "league.config",
+    "league.config.league",
     "numpy",
     "onnxruntime",
     "pettingzoo",
