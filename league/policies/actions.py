@@ -13,7 +13,7 @@ Discrete actions are the raw ones plus `start`. For a Box element with two finit
 import numpy as np
 from numpy.typing import NDArray
 
-from league.errors import ConfigError
+from league.errors import ConfigError, IllegalMask
 from league.spaces import Box, Discrete, MultiDiscrete, Space
 
 
@@ -74,3 +74,9 @@ def _bound(bound: object, infinity: float, shape: tuple[int, ...]) -> NDArray:
     # None becomes NaN in a float array; bounds contain no other NaN.
     values = np.array(bound, dtype=np.float64)
     return np.broadcast_to(np.where(np.isnan(values), infinity, values), shape)
+
+
+def check_legal_action(mask: NDArray) -> None:
+    """Raise IllegalMask unless every row of an action mask (k, n) allows an action."""
+    if not mask.any(axis=1).all():
+        raise IllegalMask("action_mask allows no action: expected at least one 1")

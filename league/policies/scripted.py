@@ -1,22 +1,24 @@
 """Scripted baselines, which need no training.
 
 `random` samples uniformly from the legal actions; `first` takes the first one. `mirror` repeats its observation, which
-is the opponent's last move in rock, paper, scissors. `one_ply` plays connect four and tic-tac-toe: it wins immediately
-if possible, else prevents the opponent's immediate win, else plays like `random`.
+is the opponent's last move in rock, paper, scissors. `one_ply`, `mcts_100`, `mcts_1000` and `solver` play connect four
+and tic-tac-toe; see `league.policies.line_games`, `league.policies.search` and `league.policies.solver`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import product
+from functools import partial
 from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.errors import EnvironmentMismatch, IllegalMask, UnknownPolicy
-from league.policies.actions import bounds, to_environment
+from league.errors import EnvironmentMismatch, UnknownPolicy
+from league.policies.actions import bounds, check_legal_action, to_environment
 from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
+from league.policies.line_games import OnePly
 from league.policies.policy import Actions, Arrays, Policy
+from league.policies.search import MCTS
+from league.policies.solver import Solver
 from league.spaces import (
     ACTION_MASK,
     OBSERVATION,
@@ -127,91 +129,15 @@ class Mirror:
         return Actions(to_environment(np.where(seen < self._action.n, seen, 0), self._action))
 
 
-@dataclass(frozen=True, slots=True)
-class LineGame:
-    """A game won by `length` squares in a line. Observations have two planes: own and opponent's squares.
-
-    With `gravity` an action is a column, whose lowest empty square is taken (row 0 is the top); otherwise it is a
-    square, numbered row by row.
-    """
-
-    rows: int
-    columns: int
-    length: int
-    gravity: bool
-
-    @property
-    def actions(self) -> int:
-        return self.columns if self.gravity else self.rows * self.columns
-
-    def lines(self) -> NDArray:
-        """Return the squares of each line as 0 and 1, (lines, rows · columns) float32."""
-        covered = []
-        for row, column in product(range(self.rows), range(self.columns)):
-            for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-                last_row, last_column = row + down * (self.length - 1), column + right * (self.length - 1)
-                if last_row < self.rows and 0 <= last_column < self.columns:
-                    line = np.zeros((self.rows, self.columns), np.float32)
-                    for step in range(self.length):
-                        line[row + down * step, column + right * step] = 1
-                    covered.append(line.ravel())
-        return np.array(covered)
-
-    def actions_on(self, squares: NDArray, empty: NDArray) -> NDArray:
-        """Return which actions take one of `squares`: two (k, rows · columns) bool → (k, actions) bool."""
-        if not self.gravity:
-            return squares & empty
-        empty = empty.reshape(-1, self.rows, self.columns)
-        lowest = empty.copy()
-        lowest[:, :-1] &= ~empty[:, 1:]
-        return (squares.reshape(empty.shape) & lowest).any(axis=1)
-
-
-CONNECT_FOUR = LineGame(rows=6, columns=7, length=4, gravity=True)
-TIC_TAC_TOE = LineGame(rows=3, columns=3, length=3, gravity=False)
-
-
-class OnePly:
-    """Looks one move ahead in connect four and tic-tac-toe."""
-
-    def __init__(self, observation: Space, action: Space) -> None:
-        self._game = _line_game(observation, action)
-        self._lines = self._game.lines()
-
-    def act(
-        self,
-        observations: Arrays,
-        *,
-        state: Arrays | None = None,  # noqa: ARG002
-        explore: bool = False,  # noqa: ARG002
-        rng: Generators | None = None,
-    ) -> Actions:
-        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
-        boards = observations[OBSERVATION]
-        legal = observations[ACTION_MASK] != 0
-        planes = boards.reshape(len(boards), -1, 2).astype(np.float32)
-        empty = planes.sum(axis=2) == 0
-        best = legal
-        for player in (1, 0):
-            completing = legal & self._game.actions_on(self._completing(planes[:, :, player]), empty)
-            best = np.where(completing.any(axis=1, keepdims=True), completing, best)
-        if not legal.any(axis=1).all():
-            raise IllegalMask(NO_LEGAL_ACTION)
-        return Actions(choose(best, draw(rng, len(best))))
-
-    def _completing(self, own: NDArray) -> NDArray:
-        """Return the squares of all lines in which one square is missing in `own`, (k, squares)."""
-        almost = own @ self._lines.T == self._game.length - 1
-        return almost.astype(np.float32) @ self._lines > 0
-
-
 SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {
     "random": Random,
     "one_ply": OnePly,
     "first": First,
     "mirror": Mirror,
+    "mcts_100": partial(MCTS, 100),
+    "mcts_1000": partial(MCTS, 1000),
+    "solver": Solver,
 }
-NO_LEGAL_ACTION = "action_mask allows no action: expected at least one 1"
 
 
 def _playable(name: str, observation: Space, action: Space) -> Leaf:
@@ -239,8 +165,8 @@ def _values(action: Leaf) -> int | None:
 def _masks(mask: NDArray, action: Leaf) -> list[NDArray]:
     """The mask (k, n) of each element of the action. Raises IllegalMask if one allows no action."""
     masks = elements(mask, action) if isinstance(action, MultiDiscrete) else [mask]
-    if not all(part.any(axis=1).all() for part in masks):
-        raise IllegalMask(NO_LEGAL_ACTION)
+    for part in masks:
+        check_legal_action(part)
     return masks
 
 
@@ -261,15 +187,6 @@ def _lowest(action: Leaf) -> NDArray:
         case _:
             assert_never(action)
     return lowest.astype(action.dtype)
-
-
-def _line_game(observation: Space, action: Space) -> LineGame:
-    leaves = inputs(observation)
-    for game in (CONNECT_FOUR, TIC_TAC_TOE):
-        fits = OBSERVATION in leaves and leaves[OBSERVATION].shape == (game.rows, game.columns, 2)
-        if fits and ACTION_MASK in leaves and action == Discrete(n=game.actions):
-            return game
-    raise EnvironmentMismatch("script:one_ply supports only the spaces of connect four and tic-tac-toe")
 
 
 def _spread(uniform: NDArray, space: Leaf) -> NDArray:

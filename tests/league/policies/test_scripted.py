@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pettingzoo.classic.connect_four.connect_four import raw_env as connect_four
 from pettingzoo.classic.rps.rps import raw_env as rps
 from pettingzoo.classic.tictactoe.tictactoe import raw_env as tictactoe
 
@@ -15,42 +14,22 @@ from league.errors import EnvironmentMismatch, IllegalMask, InvalidInput, Unknow
 from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
-from league.spaces.arrays import tensors
-from league.spaces.conversion import from_gymnasium, to_gymnasium
+from league.spaces.conversion import to_gymnasium
+from tests.support.environments.line_games import (
+    GAMES,
+    environment_after,
+    legal,
+    observations,
+    random_moves,
+    spaces,
+)
 
-GAMES = {"connect_four": connect_four, "tictactoe": tictactoe}
 DRAWS = 150
 """Enough draws for nine equally likely actions: the probability that one is missing is below 1e-6."""
 
 
 def generators(rows: int, seed: int = 0) -> list[np.random.Generator]:
     return [np.random.default_rng((seed, row)) for row in range(rows)]
-
-
-def environment_after(game: str, moves: Sequence[int]) -> Any:
-    """An environment after these moves."""
-    env = GAMES[game]()
-    env.reset(seed=0)
-    for move in moves:
-        env.step(move)
-    return env
-
-
-def random_moves(game: str, seed: int, plies: int) -> list[int]:
-    """This number of random legal moves, or fewer if the game would end."""
-    random, moves = np.random.default_rng(seed), list[int]()
-    env = environment_after(game, moves)
-    for _ in range(plies):
-        move = int(random.choice(legal(env)))
-        env.step(move)
-        if any(env.terminations.values()):
-            break
-        moves.append(move)
-    return moves
-
-
-def legal(env: Any) -> list[int]:
-    return np.flatnonzero(env.observe(env.agent_selection)["action_mask"]).tolist()
 
 
 def winning_moves(game: str, moves: Sequence[int], own: bool) -> list[int]:
@@ -67,16 +46,9 @@ def winning_moves(game: str, moves: Sequence[int], own: bool) -> list[int]:
     return found
 
 
-def spaces(env: Any) -> tuple[Space, Space]:
-    agent = env.possible_agents[0]
-    return from_gymnasium(env.observation_space(agent)), from_gymnasium(env.action_space(agent))
-
-
 def chosen_actions(policy: Policy, env: Any) -> set[int]:
     """All actions that a script takes in a position."""
-    value = tensors(spaces(env)[0], env.observe(env.agent_selection))
-    batch = {name: np.repeat(array[None], DRAWS, axis=0) for name, array in value.items()}
-    return set(policy.act(batch, rng=generators(DRAWS)).actions.tolist())
+    return set(policy.act(observations([env] * DRAWS), rng=generators(DRAWS)).actions.tolist())
 
 
 @settings(max_examples=120, deadline=None)
@@ -95,12 +67,11 @@ def test_random_plays_exactly_the_legal_moves(game: str, seed: int, plies: int) 
     assert chosen_actions(script("random", *spaces(env)), env) == set(legal(env))
 
 
-@pytest.mark.parametrize("name", ["random", "one_ply"])
+@pytest.mark.parametrize("name", ["random", "one_ply", "mcts_100", "solver"])
 def test_actions_do_not_depend_on_the_batch(name: str) -> None:
     envs = [environment_after("connect_four", random_moves("connect_four", seed, 3 * seed)) for seed in range(8)]
     policy = script(name, *spaces(envs[0]))
-    values = [tensors(spaces(env)[0], env.observe(env.agent_selection)) for env in envs]
-    batch = {key: np.stack([value[key] for value in values]) for key in values[0]}
+    batch = observations(envs)
     together = policy.act(batch, rng=generators(8)).actions
     for row in range(8):
         alone = {key: array[row : row + 1] for key, array in batch.items()}
@@ -208,7 +179,7 @@ def test_mirror_repeats_the_last_move_of_the_opponent() -> None:
 
 
 def test_unknown_scripts_are_reported_with_the_known_ones() -> None:
-    with pytest.raises(UnknownPolicy, match="unknown script 'minimax'; known: random, one_ply, first, mirror"):
+    with pytest.raises(UnknownPolicy, match=r"unknown script 'minimax'; known: random, one_ply, .*, solver"):
         script("minimax", *masked(3))
 
 
@@ -218,6 +189,8 @@ def test_unknown_scripts_are_reported_with_the_known_ones() -> None:
         ("one_ply", *masked(7)),
         ("one_ply", Box(dtype="int8", shape=(6, 7, 2), low=0, high=1), Discrete(n=7)),
         ("one_ply", spaces(tictactoe())[0], Discrete(n=8)),
+        ("mcts_100", *masked(7)),
+        ("solver", spaces(tictactoe())[0], Discrete(n=8)),
         ("random", masked(5)[0], MultiDiscrete(nvec=[2, 2], start=[0, 0], shape=(2,))),
         ("random", masked(4)[0], Box(dtype="float32", shape=(4,), low=0, high=1)),
         ("first", masked(4)[0], Discrete(n=5)),
@@ -233,7 +206,7 @@ def test_unsupported_spaces_are_rejected(name: str, observation: Space, action: 
         script(name, observation, action)
 
 
-@pytest.mark.parametrize("name", ["random", "one_ply"])
+@pytest.mark.parametrize("name", ["random", "one_ply", "mcts_100", "solver"])
 def test_missing_generators_and_empty_masks_are_reported(name: str) -> None:
     policy = script(name, *spaces(tictactoe()))
     batch = {"observation": np.zeros((2, 3, 3, 2), np.int8), "action_mask": np.ones((2, 9), np.int8)}

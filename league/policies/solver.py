@@ -1,0 +1,110 @@
+"""Exact play by search with bitboards: the script `solver` for tic-tac-toe and late positions of connect four.
+
+A column of a bitboard has one bit per square, from the bottom to the top, and one that is always 0, so that lines do
+not continue in the next column.
+"""
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.policies.actions import check_legal_action
+from league.policies.draws import Generators, choose, draw
+from league.policies.line_games import LineGame, OnePly, line_game
+from league.policies.policy import Actions, Arrays
+from league.spaces import ACTION_MASK, OBSERVATION, Space
+
+MAX_EMPTY = 18
+"""Number of empty squares up to which positions are solved."""
+CACHED_POSITIONS = 2**18
+
+
+class LineGameSolver:
+    """Computes the outcomes of moves. A position is a pair of bitboards: of the player to move and of its opponent."""
+
+    def __init__(self, game: LineGame) -> None:
+        self._game, self._stride = game, game.rows + 1
+        self._bits = np.array(
+            [1 << column * self._stride + row for row in reversed(range(game.rows)) for column in range(game.columns)],
+            dtype=np.uint64,
+        )
+        self._full = int(self._bits.sum())
+        actions = range(game.actions)
+        self._order = (
+            sorted(actions, key=lambda column: abs(2 * column + 1 - game.columns)) if game.gravity else actions
+        )
+        self._reaches = lru_cache(maxsize=CACHED_POSITIONS)(self._search)
+
+    def position(self, board: NDArray) -> tuple[int, int]:
+        """Return the bitboards of a board (rows, columns, 2)."""
+        own, other = (self._bits @ (board[..., player].ravel() != 0).astype(np.uint64) for player in (0, 1))
+        return int(own), int(other)
+
+    def outcomes(self, own: int, other: int) -> dict[int, int]:
+        """Return each legal action with its outcome under best play: 1 for a win, 0 for a draw, −1 for a loss."""
+        return {
+            action: 1 if self._wins(own | move) else -self._outcome(other, own | move)
+            for action, move in self._moves(own | other)
+        }
+
+    def _outcome(self, own: int, other: int) -> int:
+        return 1 if self._reaches(own, other, 1) else 0 if self._reaches(own, other, 0) else -1
+
+    def _search(self, own: int, other: int, goal: int) -> bool:
+        """Return whether the player to move can reach a draw (0) or a win (1). No line is complete."""
+        moves = [move for _, move in self._moves(own | other)]
+        if not moves:
+            return goal == 0
+        if any(self._wins(own | move) for move in moves):
+            return True
+        threats = [move for move in moves if self._wins(other | move)]
+        return any(not self._reaches(other, own | move, 1 - goal) for move in threats or moves)
+
+    def _moves(self, taken: int) -> Iterator[tuple[int, int]]:
+        """Yield the legal actions and the squares that they take."""
+        for action in self._order:
+            if self._game.gravity:
+                lowest = 1 << action * self._stride
+                move = (taken + lowest) & self._full & (lowest * ((1 << self._stride) - 1))
+            else:
+                move = int(self._bits[action]) & ~taken
+            if move:
+                yield action, move
+
+    def _wins(self, pieces: int) -> bool:
+        """Return whether `pieces` contain a line."""
+        for step in (1, self._stride - 1, self._stride, self._stride + 1):
+            line = pieces
+            for distance in range(1, self._game.length):
+                line &= pieces >> distance * step
+            if line:
+                return True
+        return False
+
+
+class Solver:
+    """Plays a random one of the best actions if at most MAX_EMPTY squares are empty, else like `one_ply`."""
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        self._solver = LineGameSolver(line_game("solver", observation, action))
+        self._early = OnePly(observation, action)
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,  # noqa: ARG002
+        explore: bool = False,  # noqa: ARG002
+        rng: Generators | None = None,
+    ) -> Actions:
+        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
+        boards, legal = observations[OBSERVATION], observations[ACTION_MASK] != 0
+        check_legal_action(legal)
+        best = self._early.best(boards, legal)
+        for row in np.flatnonzero((boards.sum(axis=3) == 0).sum(axis=(1, 2)) <= MAX_EMPTY):
+            outcomes = self._solver.outcomes(*self._solver.position(boards[row]))
+            values = np.array([outcomes.get(action, -2) for action in range(legal.shape[1])])
+            best[row] = legal[row] & (values == values[legal[row]].max())
+        return Actions(choose(best, draw(rng, len(best))))
