@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from examples.leduc_holdem import MOST_ACTIONS, ROUNDS
 from league.policies.policy import Policy
 
 CALL, RAISE, FOLD, CHECK = range(4)
@@ -21,7 +22,7 @@ HIDDEN = None
 """The public card before the second round."""
 
 PolicyFunction = Callable[[NDArray, NDArray], NDArray]
-"""Observation (36,) and mask (4,) → probabilities (4,)."""
+"""Observation and mask (4,) → probabilities (4,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,8 @@ class Hand:
     round: int = 0
     public: int | None = HIDDEN
     folded: int | None = None
+    history: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+    """The actions of both rounds."""
 
     @property
     def awaits_card(self) -> bool:
@@ -54,8 +57,10 @@ class Hand:
 
     def after(self, action: int) -> "Hand":
         """The hand after an action of the player to act."""
+        first, second = self.history
+        history = ((*first, action), second) if self.round == 0 else (first, (*second, action))
         if action == FOLD:
-            return replace(self, folded=self.turn)
+            return replace(self, folded=self.turn, history=history)
         paid = 0 if action == CHECK else max(self.bets) - self.bets[self.turn]
         if action == RAISE:
             paid += BIG_BLIND * (1 + self.round)
@@ -66,6 +71,7 @@ class Hand:
             turn=1 - self.turn,
             raises=self.raises + (action == RAISE),
             settled=1 if action == RAISE else self.settled + 1,
+            history=history,
         )
         if hand.settled < 2:
             return hand
@@ -80,6 +86,13 @@ class Hand:
         observation[6 + self.chips[self.turn]] = observation[21 + self.chips[1 - self.turn]] = 1
         return observation
 
+    def information_state(self, rank: int) -> NDArray:
+        """The observation of `examples.leduc_holdem`: that of the player to act, and the actions of both rounds."""
+        actions = np.zeros((ROUNDS, MOST_ACTIONS, 4), np.float32)
+        for round_, taken in enumerate(self.history):
+            actions[round_, range(len(taken)), list(taken)] = 1
+        return np.concatenate([self.observation(rank), actions.ravel()])
+
     def payoff(self, player: int, ranks: tuple[int, int]) -> float:
         """The payoff of a finished hand. ranks: the players' cards."""
         if self.folded is not None:
@@ -91,9 +104,12 @@ class Hand:
         return won * (self.chips[1 - player] if won > 0 else self.chips[player]) / BIG_BLIND if won else 0.0
 
 
-def best_response(policy_function: PolicyFunction) -> float:
-    """The maximum win of an opponent against a policy, per hand in big blinds; both have each blind equally often."""
-    known = cache(lambda hand, rank: policy_function(hand.observation(rank), hand.legal()))
+def best_response(policy_function: PolicyFunction, observe: Callable[[Hand, int], NDArray] = Hand.observation) -> float:
+    """The maximum win of an opponent against a policy, per hand in big blinds; both have each blind equally often.
+
+    observe: what the policy observes of a hand with its card.
+    """
+    known = cache(lambda hand, rank: policy_function(observe(hand, rank), hand.legal()))
     return float(np.mean([_dealt(known, player) for player in (0, 1)]))
 
 

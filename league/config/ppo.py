@@ -9,6 +9,8 @@ from league.config.network import RecurrenceConfig
 from league.config.schedules import Scheduled, ScheduledPositive
 from league.config.training import TrainingSettings
 
+UNIFORM, PREVIOUS = "uniform", "previous"
+
 
 class PolicySettings(Part):
     """Settings of PPO for one policy; null for the common value. See PPOConfig."""
@@ -18,6 +20,32 @@ class PolicySettings(Part):
     lambda_: float | None = Field(default=None, ge=0, le=1, alias="lambda")
     clip: ScheduledPositive | None = None
     entropy: Scheduled | None = None
+
+
+class MagnetConfig(Part):
+    """A reference policy ρ, and the weight of KL(π ‖ ρ) in the loss. Keeps policies close to ρ, and makes self-play
+    converge in games with hidden information."""
+
+    ref: str
+    """`uniform` over the legal actions; `previous`: the policy itself, as it was some updates ago; or a version
+    (`leduc_holdem@3`, `@champion`), which is resolved when training starts."""
+    weight: Scheduled
+    """Coefficient of the divergence."""
+    every: int | None = Field(default=None, ge=1)
+    """Updates after which `previous` is refreshed."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if (self.ref == PREVIOUS) != (self.every is not None):
+            raise ValueError("magnet.every is required for ref: previous, and only there")
+        if self.version is not None and "@" not in self.version:
+            raise ValueError(f"magnet.ref: expected uniform, previous or a version, got {self.ref!r}")
+        return self
+
+    @property
+    def version(self) -> str | None:
+        """The reference of a version; None for `uniform` and `previous`."""
+        return None if self.ref in (UNIFORM, PREVIOUS) else self.ref
 
 
 class PPOConfig(TrainingSettings):
@@ -40,6 +68,8 @@ class PPOConfig(TrainingSettings):
     """Coefficient of the entropy bonus."""
     value_loss: float = Field(default=0.5, ge=0)
     """Coefficient of the value loss."""
+    magnet: MagnetConfig | None = None
+    """Pull towards a reference policy; null for none."""
     recurrence: RecurrenceConfig | None = None
     """Recurrent layer; null for none."""
     shared_encoder: bool = False
@@ -57,4 +87,10 @@ class PPOConfig(TrainingSettings):
     def _encoder_fits(self) -> Self:
         if self.shared_encoder and self.recurrence is not None:
             raise ValueError("shared_encoder does not support recurrence")
+        return self
+
+    @model_validator(mode="after")
+    def _magnet_fits(self) -> Self:
+        if self.recurrence is not None and self.magnet is not None and self.magnet.ref != UNIFORM:
+            raise ValueError(f"magnet.ref {self.magnet.ref} does not support recurrence: expected {UNIFORM}")
         return self

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pettingzoo.classic import leduc_holdem_v4
 
 from benchmarks.training.leduc import CALL, CHECK, FOLD, RAISE, RANKS, Hand, best_response, uniform
+from examples.leduc_holdem import STOCK_SIZE
+from examples.leduc_holdem import env as with_history
 
 
-def test_hands_equal_those_of_pettingzoo() -> None:
-    env = leduc_holdem_v4.env()
+def test_hands_equal_those_of_the_environment() -> None:
+    env = with_history()
     for seed in range(200):
         env.reset(seed=seed)
         rng, hand = np.random.default_rng(seed), Hand()
@@ -25,7 +26,8 @@ def test_hands_equal_those_of_pettingzoo() -> None:
                     **{f: getattr(hand, f) for f in Hand.__slots__} | {"public": int(seen["observation"][3:6].argmax())}
                 )
             assert hand.turn == player
-            np.testing.assert_array_equal(hand.observation(rank), seen["observation"])
+            np.testing.assert_array_equal(hand.observation(rank), seen["observation"][:STOCK_SIZE])
+            np.testing.assert_array_equal(hand.information_state(rank), seen["observation"])
             np.testing.assert_array_equal(hand.legal(), seen["action_mask"])
             action = int(rng.choice(np.flatnonzero(seen["action_mask"])))
             hand = hand.after(action)

@@ -28,7 +28,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.interface import Interface
-from training.learners.ppo import SCHEDULES
+from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, SCHEDULES
 from training.sampling.closed_transitions import JOINT
 from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 
@@ -95,7 +95,7 @@ def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[st
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
         found |= {f"{key}/{name}": learned.get(metric) for name, metric in PPO_METRICS.items()}
-        found |= {f"{key}/{name}": learned.get(name) for name in SCHEDULES.values()}
+        found |= {f"{key}/{name}": learned.get(name) for name in (*SCHEDULES.values(), MAGNET_KL, MAGNET_WEIGHT)}
         found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
     return {name: float(value) for name, value in found.items() if value is not None}
 

@@ -32,6 +32,7 @@ from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
 from training.algorithms import setup
 from training.algorithms.setup import configure, reset_episodes, rl_module_specs
+from training.learners.magnet import check_magnet
 from training.learners.ppo import PPOLearner, hyperparameters
 from training.modules.actor_critic import ActorCritic, SharedEncoder
 from training.rllib_compat import NoResultsDirectory
@@ -100,6 +101,8 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
     settings = league.training
     assert isinstance(settings, PPOConfig)
     hyperparameters(settings, interface.policy_ids)
+    if settings.magnet is not None:
+        check_magnet(settings.magnet, interface)
     config = ppo.PPOConfig(algo_class=PPO)
     configure(
         config,

@@ -3,7 +3,7 @@
 import logging
 from collections import defaultdict
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +16,8 @@ from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.config.schedules import Scheduled, ScheduleProgress, scheduled_value
 from league.errors import ConfigError
+from league.interface import Interface
+from training.learners.magnet import Magnet, Previous, magnet, states
 from training.learners.train_batch import (
     Bootstraps,
     Minibatch,
@@ -26,8 +28,8 @@ from training.learners.train_batch import (
 )
 from training.modules.actor_critic import SharedEncoder
 from training.modules.distributions import TorchDistribution
-from training.rllib_compat import FixedPoliciesLearner, TrainingData
-from training.sampling.env_runner import LEAGUE
+from training.rllib_compat import FixedPoliciesLearner, TrainingData, includes_component
+from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE
 from training.sampling.episode_chunks import EpisodeChunks
 
 NOT_STARTED = ScheduleProgress(steps=0, budget=0.0)
@@ -77,6 +79,8 @@ class PPOLoss(NamedTuple):
     entropy: Tensor
     clip_fraction: Tensor
     """Fraction of the steps whose probability ratio is outside the clip range."""
+    magnet_kl: Tensor
+    """Mean divergence from the magnet's reference policy; 0 without a magnet."""
 
 
 def ppo_loss(
@@ -88,12 +92,14 @@ def ppo_loss(
     clip: float,
     entropy: float,
     value_loss: float,
+    magnet: float = 0.0,
 ) -> PPOLoss:
-    """Return the clipped surrogate loss. With r = π(a|s) / π_old(a|s) and the advantage A:
+    """Return the clipped surrogate loss. With r = π(a|s) / π_old(a|s), the advantage A and the magnet's policy ρ:
 
-        L = −mean(min(r A, clip(r, 1 − ε, 1 + ε) A)) + c_v mean((V − V_target)²) − c_e mean(H(π))
+        L = −mean(min(r A, clip(r, 1 − ε, 1 + ε) A)) + c_v mean((V − V_target)²) − c_e mean(H(π)) + c_m mean(KL(π ‖ ρ))
 
-    Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347, equations 7 and 9.
+    Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347, equations 7 and 9. The last
+    term: see `training.learners.magnet`.
 
     Args:
         minibatch: k steps.
@@ -103,6 +109,7 @@ def ppo_loss(
         clip: ε.
         entropy: c_e.
         value_loss: c_v.
+        magnet: c_m; not used if the minibatch has no reference policy.
     """
     log_p, entropies = distribution.evaluate(dist_inputs, minibatch.actions)
     ratio = torch.exp(log_p - minibatch.log_p)
@@ -111,18 +118,26 @@ def ppo_loss(
     value = (values - minibatch.targets).square().mean()
     mean_entropy = entropies.mean()
     total = policy + value_loss * value - entropy * mean_entropy
-    return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean())
+    magnet_kl = torch.zeros(())
+    if minibatch.magnet is not None:
+        magnet_kl = distribution.divergence(dist_inputs, minibatch.magnet).mean()
+        total = total + magnet * magnet_kl
+    return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean(), magnet_kl)
 
 
 logger = logging.getLogger(__name__)
 
-STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", "gradient_norm")
+MAGNET_KL, MAGNET_WEIGHT = "magnet_kl", "magnet_weight"
+"""Logged only with a magnet, the weight only if it has a schedule."""
+STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", MAGNET_KL, "gradient_norm")
 """Logged per policy: means over the minibatches of an update."""
 EXPLAINED_VARIANCE = "vf_explained_var"
 KL = "kl"
 """Mean Kullback–Leibler divergence between the policies before and after an update."""
 SCHEDULES = {"lr": "lr", "clip": "clip", "entropy": "entropy_coefficient"}
 """Hyperparameters that can have a schedule → their metrics, which are logged only then."""
+MAGNET = "magnet"
+"""Key of the magnet's snapshot in the state."""
 KL_STEPS = 1024
 """Number of steps for estimating the divergence."""
 ADAM_EPSILON = 1e-5
@@ -151,6 +166,10 @@ class PPOLearner(FixedPoliciesLearner):
         self.settings = settings
         self._set_hyperparameters(NOT_STARTED)
         super().build()
+        self._magnet: Magnet | None = None
+        if settings.magnet is not None:
+            interface = Interface.model_validate(self.config.env_config[INTERFACE])
+            self._magnet = magnet(settings.magnet, self.module, interface, self.config.env_config.get(STORAGE))
 
     @classmethod
     def rl_module_required_apis(cls) -> list[type]:
@@ -189,6 +208,8 @@ class PPOLearner(FixedPoliciesLearner):
         Returns:
             Policy id → metrics, for the policies that were updated.
         """
+        if isinstance(self._magnet, Previous):
+            self._magnet.before_update(self.weights_version, self.module)
         self.weights_version += 1
         self._set_hyperparameters(progress)
         batches = self._batches(training_data.episodes, self.module.keys() if policies is None else policies)
@@ -206,6 +227,7 @@ class PPOLearner(FixedPoliciesLearner):
     def _set_hyperparameters(self, progress: ScheduleProgress) -> None:
         self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies), progress)
         self._common_lr = scheduled_value(self.settings.lr, progress)
+        self._magnet_weight = scheduled_value(self.settings.magnet.weight, progress) if self.settings.magnet else 0.0
 
     def _batches(self, sampled: Iterable[EpisodeChunks], policies: Collection[str]) -> dict[str, TrainBatch]:
         chunks = defaultdict(list)
@@ -213,7 +235,7 @@ class PPOLearner(FixedPoliciesLearner):
             if own.policy in policies:
                 chunks[own.policy].append(own)
         recurrence = self.settings.recurrence
-        return {
+        batches = {
             policy: train_batch(
                 module,
                 chunks[policy],
@@ -224,6 +246,12 @@ class PPOLearner(FixedPoliciesLearner):
             )
             for policy, module in self.module.items()
             if policy in chunks
+        }
+        reference = self._magnet
+        if reference is None:
+            return batches
+        return {
+            policy: replace(batch, magnet=reference.dist_inputs(policy, batch)) for policy, batch in batches.items()
         }
 
     def _gradient_step(self, minibatch: dict[str, Minibatch]) -> dict[str, Tensor]:
@@ -254,6 +282,7 @@ class PPOLearner(FixedPoliciesLearner):
             clip=self.hyperparameters[module_id].clip,
             entropy=self.hyperparameters[module_id].entropy,
             value_loss=self.settings.value_loss,
+            magnet=self._magnet_weight,
         )
 
     def _clip_and_step(self, name: str) -> Tensor:
@@ -271,6 +300,25 @@ class PPOLearner(FixedPoliciesLearner):
         """Return the current learning rate of a policy, or of a shared encoder."""
         return self._common_lr if name == ALL_MODULES else self.hyperparameters[name].lr
 
+    def get_state(
+        self,
+        components: str | Collection[str] | None = None,
+        *,
+        not_components: str | Collection[str] | None = None,
+        **kwargs: Any,
+    ) -> dict[str, Any]:
+        """Return RLlib's state with the snapshot of the magnet, if it has one."""
+        state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
+        if isinstance(self._magnet, Previous) and includes_component(self, MAGNET, components, not_components):
+            state[MAGNET] = self._magnet.get_state()
+        return state
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        super().set_state(state)
+        if isinstance(self._magnet, Previous):
+            # A run without a magnet, which this one continues, has no snapshot.
+            self._magnet.set_state(state.get(MAGNET) or states(self.module))
+
     def _add_optimizer(self, name: str, parameters: list[torch.nn.Parameter]) -> None:
         optimizer = torch.optim.Adam(parameters, lr=self._lr(name), eps=ADAM_EPSILON, fused=True)
         self.register_optimizer(module_id=name, optimizer=optimizer, params=parameters)
@@ -284,6 +332,10 @@ class PPOLearner(FixedPoliciesLearner):
             logged |= {EXPLAINED_VARIANCE: batch.explained_variance, KL: divergences[policy]}
             scheduled = scheduled_hyperparameters(self.settings, policy)
             logged |= {SCHEDULES[name]: getattr(self.hyperparameters[policy], name) for name in scheduled}
+            if self.settings.magnet is None:
+                del logged[MAGNET_KL]
+            elif not isinstance(self.settings.magnet.weight, float):
+                logged[MAGNET_WEIGHT] = self._magnet_weight
             self.metrics.log_dict(logged, key=policy, window=1)
             self.metrics.log_value((policy, NUM_MODULE_STEPS_TRAINED), len(batch), reduce="sum")
 

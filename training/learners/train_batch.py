@@ -96,6 +96,8 @@ class TrainBatch:
     advantages: Tensor
     targets: Tensor
     sequences: Sequences | None
+    magnet: Tensor | None
+    """(n, d), of the reference policy of the magnet."""
     explained_variance: float
     """1 − Var(target − value) / Var(target) of the values before the update."""
 
@@ -125,6 +127,7 @@ class TrainBatch:
             log_p=self.log_p[steps],
             advantages=self.advantages[steps],
             targets=self.targets[steps],
+            magnet=None if self.magnet is None else self.magnet[steps],
         )
 
 
@@ -138,6 +141,7 @@ class Minibatch:
     log_p: Tensor
     advantages: Tensor
     targets: Tensor
+    magnet: Tensor | None = None
 
 
 def bootstrap_unless_terminated(chunks: EpisodeChunks) -> NDArray:
@@ -194,6 +198,7 @@ def train_batch(
         advantages=column(_standardized(advantages).astype(np.float32)),
         targets=column(targets.astype(np.float32)),
         sequences=_sequences(lengths, sequence, state) if sequence is not None and state else None,
+        magnet=None,
         explained_variance=float(1 - advantages.var() / max(targets.var(), 1e-8)),
     )
 

@@ -17,12 +17,13 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
 
 from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
 from league.config.training import TrainingSettings
 from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.files import disk_errors, replacing
@@ -54,25 +55,36 @@ def locked(directory: Path, what: str) -> Iterator[None]:
 
 
 def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface) -> dict[str, str]:
-    """Resolve each opponent of `training.opponents`: reference as written → `script:name` or `league@number`.
+    """Resolve each opponent of `training.opponents`, and the version of `training.magnet`: reference as written →
+    `script:name` or `league@number`.
 
-    Raises what loading an opponent raises: it does not exist, or does not fit the league.
+    Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for opponent in config.training.opponents:
-        ref = parse_ref(of_league(opponent.ref, config.league))
+    for written in (*(opponent.ref for opponent in config.training.opponents), *_magnet_versions(config)):
+        ref = parse_ref(of_league(written, config.league))
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
         contestant(pinned, registry, interface)
-        pins[opponent.ref] = pinned
+        pins[written] = pinned
     return pins
 
 
+def _magnet_versions(config: LeagueConfig) -> tuple[str, ...]:
+    settings = config.training
+    magnet = settings.magnet if isinstance(settings, PPOConfig) else None
+    return () if magnet is None or magnet.version is None else (magnet.version,)
+
+
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
-    """Return the league with its opponents replaced by what they are pinned to; others are unchanged."""
+    """Return the league with its references replaced by what they are pinned to; others are unchanged."""
+    settings = config.training
     opponents = [
-        opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in config.training.opponents
+        opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in settings.opponents
     ]
-    return config.with_training(opponents=opponents)
+    changes: dict[str, Any] = {"opponents": opponents}
+    if isinstance(settings, PPOConfig) and settings.magnet is not None:
+        changes["magnet"] = settings.magnet.model_dump() | {"ref": pins.get(settings.magnet.ref, settings.magnet.ref)}
+    return config.with_training(**changes)
 
 
 RUN_FILE = "run.json"

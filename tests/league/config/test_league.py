@@ -46,6 +46,16 @@ def test_only_league_and_environment_are_required() -> None:
             "training.distributional: high must be greater than low (1)",
         ),
         ({"training": {"minibatch_size": 4096, "train_batch_size": 64}}, "minibatch_size must be at most"),
+        ({"training": {"magnet": {"ref": "previous", "weight": 1}}}, "magnet.every is required for ref: previous"),
+        ({"training": {"magnet": {"ref": "uniform", "weight": 1, "every": 9}}}, "and only there"),
+        (
+            {"training": {"magnet": {"ref": "script:random", "weight": 1}}},
+            "expected uniform, previous or a version",
+        ),
+        (
+            {"training": {"magnet": {"ref": "@champion", "weight": 1}, "recurrence": {}}},
+            "magnet.ref @champion does not support recurrence: expected uniform",
+        ),
         ({"training": 3}, "training: "),
         ({"policies": {}}, "policies: expected at least one entry"),
         ({"policies": {"A": ["*"]}}, "must consist of a-z"),

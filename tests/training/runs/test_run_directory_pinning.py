@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
 from league.errors import InvalidReference, LeagueError, UnknownVersion
 from tests.support.leagues import tictactoe
 from training.runs.run_directory import pin_opponents, with_pins
@@ -23,6 +24,20 @@ def test_references_are_pinned_when_training_starts(tmp_path: Path) -> None:
     opponents = with_pins(league, pins).training.opponents
     assert [opponent.ref for opponent in opponents] == ["tictactoe@1", "tictactoe@2", "script:random"]
     assert [opponent.share for opponent in opponents] == [0.3, 0.3, 0.3]
+
+
+def test_the_magnet_is_pinned_too(tmp_path: Path) -> None:
+    registry = tictactoe.registry(tmp_path)
+    tictactoe.publish(registry, tictactoe.graph())
+    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="me", reason="first")
+    spaces = registry.leagues.get("tictactoe").interface
+    for ref, pinned in (("@champion", {"@champion": "tictactoe@1"}), ("uniform", {})):
+        league = tictactoe.config().with_training(magnet={"ref": ref, "weight": 0.1})
+        assert pin_opponents(league, registry, spaces) == pinned
+        settings = with_pins(league, pinned).training
+        assert isinstance(settings, PPOConfig)
+        assert settings.magnet is not None
+        assert settings.magnet.ref == pinned.get(ref, ref)
 
 
 @pytest.mark.parametrize(
