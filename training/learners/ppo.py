@@ -129,7 +129,7 @@ logger = logging.getLogger(__name__)
 
 MAGNET_KL, MAGNET_WEIGHT = "magnet_kl", "magnet_weight"
 """Logged only with a magnet, the weight only if it has a schedule."""
-STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", MAGNET_KL, "gradient_norm")
+STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", "gradient_norm")
 """Logged per policy: means over the minibatches of an update."""
 EXPLAINED_VARIANCE = "vf_explained_var"
 KL = "kl"
@@ -255,7 +255,7 @@ class PPOLearner(FixedPoliciesLearner):
         }
 
     def _gradient_step(self, minibatch: dict[str, Minibatch]) -> dict[str, Tensor]:
-        """Take a gradient step on the sum of the policies' losses; return policy id → STATISTICS."""
+        """Take a gradient step on the sum of the policies' losses; return policy id → STATISTICS and MAGNET_KL."""
         for parameters in self._parameters.values():
             for parameter in parameters:
                 parameter.grad = None
@@ -268,7 +268,7 @@ class PPOLearner(FixedPoliciesLearner):
         norms = {
             name: self._clip_and_step(name) for name in self._parameters if name in minibatch or name == ALL_MODULES
         }
-        return {policy: torch.stack([*loss[1:], norms[policy]]).detach() for policy, loss in losses.items()}
+        return {policy: torch.stack([*loss[1:-1], norms[policy], loss.magnet_kl]).detach() for policy, loss in losses.items()}
 
     def compute_loss_for_module(
         self, *, module_id: str, batch: Minibatch, fwd_out: dict[str, Tensor], **_: Any
@@ -328,7 +328,7 @@ class PPOLearner(FixedPoliciesLearner):
         divergences = self._divergences(batches)
         for policy, batch in batches.items():
             means = torch.stack(statistics[policy]).mean(0).tolist()
-            logged = dict(zip(STATISTICS, means, strict=True))
+            logged = dict(zip((*STATISTICS, MAGNET_KL), means, strict=True))
             logged |= {EXPLAINED_VARIANCE: batch.explained_variance, KL: divergences[policy]}
             scheduled = scheduled_hyperparameters(self.settings, policy)
             logged |= {SCHEDULES[name]: getattr(self.hyperparameters[policy], name) for name in scheduled}

@@ -96,10 +96,10 @@ class TrainBatch:
     advantages: Tensor
     targets: Tensor
     sequences: Sequences | None
-    magnet: Tensor | None
-    """(n, d), of the reference policy of the magnet."""
     explained_variance: float
     """1 − Var(target − value) / Var(target) of the values before the update."""
+    magnet: Tensor | None = None
+    """Inputs of the action distribution of the magnet's reference policy, (n, d)."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -198,7 +198,6 @@ def train_batch(
         advantages=column(_standardized(advantages).astype(np.float32)),
         targets=column(targets.astype(np.float32)),
         sequences=_sequences(lengths, sequence, state) if sequence is not None and state else None,
-        magnet=None,
         explained_variance=float(1 - advantages.var() / max(targets.var(), 1e-8)),
     )
 

@@ -74,7 +74,7 @@ def test_the_loss_contains_the_weighted_divergence_from_the_reference() -> None:
 def test_the_divergence_from_uniform_is_the_missing_entropy_of_legal_actions() -> None:
     legal = torch.tensor([[1, 1, 0], [1, 1, 1]], dtype=torch.bool)
     inputs = torch.where(legal, torch.tensor([[0.3, -1.0, 0.0], [2.0, 0.0, 1.0]]), MASKED_LOGIT)
-    batch = TrainBatch({}, *([torch.zeros(2)] * 2), inputs, *([torch.zeros(2)] * 3), None, None, 0.0)
+    batch = TrainBatch({}, *([torch.zeros(2)] * 2), inputs, *([torch.zeros(2)] * 3), None, 0.0)
     kl = TorchCategorical(3).divergence(inputs, Uniform().dist_inputs("shared", batch))
     entropy = TorchCategorical(3).evaluate(inputs, torch.zeros(2, dtype=torch.int64))[1]
     torch.testing.assert_close(kl, torch.tensor([2.0, 3.0]).log() - entropy)
