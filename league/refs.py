@@ -1,11 +1,12 @@
 """References to versions, policies and scripts.
 
-| text                    | record                                        |
-|-------------------------|-----------------------------------------------|
-| `connect_four@7`        | `CheckpointRef("connect_four", 7)`            |
-| `connect_four@champion` | `CheckpointRef("connect_four", "champion")`   |
-| `script:random`         | `ScriptRef("random")`                         |
-| `connect_four.shared`   | `PolicyRef("connect_four", "shared")`         |
+| text                        | record                                      |
+|-----------------------------|---------------------------------------------|
+| `connect_four@7`            | `CheckpointRef("connect_four", 7)`          |
+| `connect_four@champion`     | `CheckpointRef("connect_four", "champion")` |
+| `script:random`             | `ScriptRef("random")`                       |
+| `script:my_game.bots:block` | `ScriptRef("my_game.bots:block")`           |
+| `connect_four.shared`       | `PolicyRef("connect_four", "shared")`       |
 """
 
 import re
@@ -16,6 +17,8 @@ from league.errors import InvalidReference
 SLUG = re.compile(r"[a-z0-9_-]+")
 MAX_SLUG = 100
 """Characters. Ids of schedules and verdicts contain the league's name and must fit into 255 characters."""
+ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
+MAX_ENTRY_POINT = 200
 CHAMPION = "champion"
 MAX_VERSION = 2**31 - 1
 """Version numbers are a signed 32-bit column of the registry."""
@@ -47,6 +50,14 @@ def check_alias(text: str) -> str:
     return check_slug("alias", text)
 
 
+def _check_entry_point(text: str) -> str:
+    if len(text) > MAX_ENTRY_POINT:
+        raise InvalidReference(f"bot {text[:32]!r}… has {len(text)} characters, expected at most {MAX_ENTRY_POINT}")
+    if not ENTRY_POINT.fullmatch(text):
+        raise InvalidReference(f"bot {text!r} must be my_package.module:name")
+    return text
+
+
 @dataclass(frozen=True, slots=True)
 class CheckpointRef:
     """A version of a league, by number or by alias."""
@@ -67,16 +78,21 @@ class CheckpointRef:
 
 @dataclass(frozen=True, slots=True)
 class ScriptRef:
-    """A scripted baseline."""
+    """A scripted baseline by its name, or a bot by its entry point, `module:name`."""
 
     name: str
+
+    @property
+    def is_bot(self) -> bool:
+        """Whether this is code of the user, which only processes with environments may import."""
+        return ":" in self.name
 
     @classmethod
     def parse(cls, text: str) -> "ScriptRef":
         scheme, _, name = text.partition(":")
         if scheme != "script":
             raise InvalidReference(f"{text!r} is not a script: expected script:NAME")
-        return cls(check_slug("script", name))
+        return cls(_check_entry_point(name) if ":" in name else check_slug("script", name))
 
     def __str__(self) -> str:
         return f"script:{self.name}"

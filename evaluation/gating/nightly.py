@@ -30,7 +30,7 @@ from league.errors import (
     ObservationError,
     WorkerLost,
 )
-from league.policies.loading import eligible
+from league.policies.loading import check_scripts, eligible
 from league.ray_cluster import ray_session
 from league.refs import CHAMPION
 from league.registry.registry import Registry
@@ -69,13 +69,16 @@ def nightly(
         listener: Receives progress and verdicts.
 
     Raises:
+        ConfigError: A script or bot of the configuration cannot play.
         AlreadyRunning: Another nightly run of this league is active.
         InterfaceChanged: The configuration no longer fits the league's versions.
         WorkerLost: Workers died repeatedly.
     """
     began = time.monotonic()
     with registry.exclusive_lock(f"nightly-{config.league}"), ray_session():
-        registry.leagues.register(config, interface(config))
+        found = interface(config)
+        check_scripts(config, found)
+        registry.leagues.register(config, found)
         nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), workers, listener)
         before = nightly_run.champion()
         nightly_run.run_gate()
@@ -219,7 +222,8 @@ class _NightlyRun:
         """Schedule against the baselines, the champion and the previous version."""
         versions = {each.ref for each in eligible(self._registry, self._league.slug)} - {version.ref}
         rivals = (self.champion(), previous.ref if previous else None)
-        opponents = [*baselines(self._league.interface), *(ref for ref in rivals if ref and ref in versions)]
+        opponents = baselines(self._league.config, self._league.interface)
+        opponents += [ref for ref in rivals if ref and ref in versions]
         return gauntlet(
             self._league.config, self._league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS
         )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evaluation.matches.game_state import State
 from league.environments.stepping import Batch, allows_nothing, legal_rows
 from league.errors import IllegalMask, one_line
-from league.policies.policy import Actions, Policy
+from league.policies.policy import Actions, MalformedAction, Policy
 from league.results.records import Reason
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete
 
@@ -73,16 +73,14 @@ def action_fault(given: Actions, space: Leaf, mask: NDArray | None) -> PolicyFau
     """Why the single action of a batch is unplayable, or None. Raises IllegalMask like `call_policy`."""
     try:
         _check_form(given, 1, space)
-    except _Malformed as error:
-        return PolicyFault("malformed", str(error))
+    except MalformedAction as error:
+        return _fault(error)
+    if given.faults:
+        return _fault(given.faults[0])
     if legal_rows(given.actions, space, mask).all():
         return None
     _check_mask(mask, space)
     return _illegal(given.actions[0], mask, 0)
-
-
-class _Malformed(Exception):
-    """The policy did not return an array of actions."""
 
 
 def _call_batch(
@@ -91,7 +89,7 @@ def _call_batch(
     """Call the policy and check the form of its output. Raises whatever the policy raises."""
     given = policy.act(batch.observations, state=state, rng=generators)
     _check_form(given, len(batch), space)
-    return PolicyOutput(given.actions, given.state)
+    return PolicyOutput(given.actions, given.state, {row: _fault(error) for row, error in given.faults.items()})
 
 
 def _call_rows(
@@ -108,12 +106,11 @@ def _call_rows(
             answer = _call_batch(policy, batch.rows(np.array([row])), space, own, draws)
         except MemoryError:
             raise
-        except _Malformed as error:
-            faults[row] = PolicyFault("malformed", str(error))
         except Exception as error:
-            faults[row] = PolicyFault("crashed", one_line(error, with_type=True))
+            faults[row] = _fault(error)
         else:
             given[row] = answer.actions[0]
+            faults |= {row + index: fault for index, fault in answer.faults.items()}
             for name, own_state in (answer.states or {}).items():
                 states.setdefault(name, np.zeros((rows, *own_state.shape[1:]), own_state.dtype))[row] = own_state[0]
     # The policy's own dtype, as for a whole batch, because actions are recorded in it.
@@ -124,15 +121,21 @@ def _call_rows(
 
 
 def _check_form(given: Actions, rows: int, space: Leaf) -> None:
-    """Raise _Malformed unless there is an action of the space's shape and kind, and a state if any, for each row."""
+    """Raise MalformedAction unless each row has an action of the space's shape and kind, and a state if any."""
     kinds = "iu" if isinstance(space, Discrete | MultiDiscrete) else "iuf" if isinstance(space, Box) else "biuf"
     actions = given.actions
     if not isinstance(actions, np.ndarray) or actions.dtype.kind not in kinds or actions.shape != (rows, *space.shape):
         found = f"{actions.dtype} {list(actions.shape)}" if isinstance(actions, np.ndarray) else type(actions).__name__
-        raise _Malformed(f"actions are {found}, expected {space.dtype} {[rows, *space.shape]}")
+        raise MalformedAction(f"actions are {found}, expected {space.dtype} {[rows, *space.shape]}")
     for name, array in (given.state or {}).items():
         if len(array) != rows:
-            raise _Malformed(f"{name} has {len(array)} rows, expected {rows}")
+            raise MalformedAction(f"{name} has {len(array)} rows, expected {rows}")
+
+
+def _fault(error: Exception) -> PolicyFault:
+    if isinstance(error, MalformedAction):
+        return PolicyFault("malformed", str(error))
+    return PolicyFault("crashed", one_line(error, with_type=True))
 
 
 def _illegal(action: NDArray, mask: NDArray | None, row: int) -> PolicyFault:

@@ -40,9 +40,9 @@ from evaluation.schedules.tournament_plan import (
 from evaluation.statistics.payoff import cross_play_table, tabulate
 from evaluation.statistics.population import population
 from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
-from league.policies.loading import check_eligible, eligible, pinned
+from league.policies.loading import check_eligible, check_plays, eligible, pinned
 from league.ray_cluster import ensure_local, node_addresses, ray_session
-from league.refs import CHAMPION
+from league.refs import CHAMPION, ScriptRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow
 from league.results.ledger import Ledger
@@ -181,9 +181,11 @@ def evaluate(
     if schedule == "gauntlet":
         opponents = [pinned(ref, league, registry) for ref in against] or _opponents(registry, row)
     elif schedule != "cross_play":
-        requested += baselines(row.interface)
+        requested += baselines(row.config, row.interface)
     for ref in [*requested, *opponents]:
         check_eligible(ref, registry, row.config)
+        if ref.startswith("script:"):
+            check_plays(ScriptRef.parse(ref), row.interface)
     contestants = list(dict.fromkeys(requested))
     blocks = blocks or (DEFAULT_BLOCKS if budget.is_open else MOST_BLOCKS)
     if budget.precision is not None and ANCHOR not in [*contestants, *opponents]:
@@ -205,7 +207,7 @@ def _check_options(schedule: Kind, against: Sequence[str], budget: Budget) -> No
 
 def _opponents(registry: Registry, row: LeagueRow) -> list[str]:
     champion = registry.aliases.current(row.slug).get(CHAMPION)
-    return [*([] if champion is None else [f"{row.slug}@{champion}"]), *baselines(row.interface)]
+    return [*([] if champion is None else [f"{row.slug}@{champion}"]), *baselines(row.config, row.interface)]
 
 
 def _play_plan(

@@ -61,8 +61,9 @@ class Playability(Document):
     draws: bool
 
 
-def playability(league: str, registry: Registry, interface: Interface, draws: bool) -> Playability:
+def playability(config: LeagueConfig, registry: Registry, interface: Interface, draws: bool) -> Playability:
     """What can be played. draws: whether the environment renders images. Raises UnknownLeague."""
+    league = config.league
     side_of = {agent: side for side, agents in interface.sides.items() for agent in agents}
     playable_agents = tuple(
         PlayableAgent(agent, side_of[agent], spaces.action.n, spaces.action.start)
@@ -77,7 +78,7 @@ def playability(league: str, registry: Registry, interface: Interface, draws: bo
         playable=bool(playable_agents),
         why=why,
         agents=playable_agents,
-        opponents=(*versions[:MOST_OPPONENTS], *baselines(interface)),
+        opponents=(*versions[:MOST_OPPONENTS], *baselines(config, interface)),
         draws=draws,
     )
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from league.config.league import LeagueConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
-from league.errors import UnknownPolicy
+from league.errors import GameCrashed, UnknownPolicy, one_line
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
@@ -107,6 +107,8 @@ class _AgentPolicy:
     def act(self, batch: Batch) -> tuple[NDArray, Move]:
         """Actions (1, …) for a batch of this agent alone, and the move."""
         given = policy_output(self._policy, batch.observations, self._state, [self._draws])
+        for fault in given.faults.values():
+            raise GameCrashed(f"{self._agent} has no action: {one_line(fault, with_type=True)}") from fault
         self._state, inputs = given.state, given.dist_inputs
         seen = {name: array[0] for name, array in batch.observations.items()}
         move = Move(self._agent, seen, given.actions[0].tolist(), None if inputs is None else inputs[0])

@@ -61,7 +61,7 @@ class GameWorker:
         matches = self._ready()
         match operation:
             case PlayabilityRequest():
-                return _json(playability(self._league, self._registry, matches.interface, self._renders))
+                return _json(playability(matches.config, self._registry, matches.interface, self._renders))
             case VideoRequest():
                 return GameResponse("image/gif", self._video(operation))
             case RecordingRequest():

@@ -7,12 +7,12 @@ would be compared on a task that they were not trained for, even if the spaces a
 from contextlib import closing
 
 from league.config.league import LeagueConfig
-from league.errors import EnvironmentMismatch, InvalidInput, UnknownPolicy
+from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, LeagueError, UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.policies.scripted import script
-from league.refs import CheckpointRef, ScriptRef, parse_ref
+from league.refs import CheckpointRef, ScriptRef, of_league, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 
@@ -88,7 +88,7 @@ def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Poli
 
 
 def pinned(ref: str, league: str, registry: Registry) -> str:
-    """Return an immutable reference: an alias is replaced by its current version.
+    """Return an immutable reference: an alias is replaced by its current version. Bots are not imported.
 
     Raises:
         InvalidReference: The reference is malformed.
@@ -101,12 +101,56 @@ def pinned(ref: str, league: str, registry: Registry) -> str:
     if isinstance(parsed, CheckpointRef):
         _check_league(parsed, league)
         return registry.versions.resolve(parsed).ref
-    check_plays(parsed, registry.leagues.get(league).interface)
+    row = registry.leagues.get(league)
+    if not parsed.is_bot:
+        check_plays(parsed, row.interface)
     return ref
 
 
+def check_scripts(config: LeagueConfig, interface: Interface) -> None:
+    """Check the scripts and bots that a configuration names.
+
+    Raises:
+        ConfigError: One does not exist, cannot be imported, or does not support the spaces. Names its key.
+    """
+    named = [("gate.anchors", anchor.ref) for anchor in config.gate.anchors]
+    named += [("training.opponents", opponent.ref) for opponent in config.training.opponents]
+    for key, ref in named:
+        parsed = parse_ref(of_league(ref, config.league))
+        if isinstance(parsed, ScriptRef):
+            try:
+                check_plays(parsed, interface)
+            except LeagueError as error:
+                raise ConfigError(f"{key}: {error}") from error
+
+
+def configured_bots(config: LeagueConfig) -> list[str]:
+    """Return the bots among the anchors and opponents of a configuration."""
+    named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents]
+    return [ref for ref in dict.fromkeys(named) if _is_bot(ref)]
+
+
+def check_requested(ref: str, config: LeagueConfig) -> None:
+    """Raise UnknownPolicy if `ref` is a bot that the league's configuration does not name.
+
+    A request from the network must not choose which code is imported.
+    """
+    if _is_bot(ref) and ref not in (known := configured_bots(config)):
+        raise UnknownPolicy(
+            f"{ref} is neither in gate.anchors nor in training.opponents of {config.league};"
+            f" its bots: {', '.join(known) or 'none'}"
+        )
+
+
+def _is_bot(ref: str) -> bool:
+    return ref.startswith("script:") and ScriptRef.parse(ref).is_bot
+
+
 def check_plays(ref: ScriptRef, interface: Interface) -> None:
-    """Raise UnknownPolicy if the script does not exist, EnvironmentMismatch if it does not support the spaces."""
+    """Raise UnknownPolicy if the script does not exist, EnvironmentMismatch if it does not support the spaces.
+
+    Imports bots, and raises ConfigError if that fails.
+    """
     for policy in interface.policy_ids:
         spaces = interface.of_policy(policy)
         script(ref.name, spaces.observation, spaces.action)

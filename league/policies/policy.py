@@ -1,7 +1,7 @@
 """Interface of a policy: a batched, stateless function from observations to actions."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 Arrays = Mapping[str, NDArray]
 """Name of an ONNX input or output → array whose first axis is the batch."""
+
+
+class MalformedAction(Exception):
+    """A policy returned something that is not an action of the space's shape and type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,11 +23,13 @@ class Actions:
         actions: Actions in the agent's action space, (k, *action shape).
         state: Recurrent state for the next call, under the names `state_in_<i>`; None for policies without state.
         dist_inputs: Masked inputs of the action distribution, (k, d) float32; None for scripts or if not requested.
+        faults: Row → the exception that a policy raised for this row only. The row's action is undefined.
     """
 
     actions: NDArray
     state: dict[str, NDArray] | None = None
     dist_inputs: NDArray | None = None
+    faults: Mapping[int, Exception] = field(default_factory=dict)
 
 
 class Policy(Protocol):

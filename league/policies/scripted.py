@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from league.errors import EnvironmentMismatch, UnknownPolicy
 from league.policies.actions import bounds, check_legal_action, to_environment
+from league.policies.bots import Bot
 from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
 from league.policies.line_games import OnePly
 from league.policies.policy import Actions, Arrays, Policy
@@ -37,16 +38,21 @@ def script(name: str, observation: Space, action: Space) -> Policy:
     """Create a scripted policy.
 
     Args:
-        name: Name of the script.
+        name: Name of a script, or the entry point of a bot, `my_package.module:name`.
         observation: Observation space of the agent.
         action: Action space of the agent.
 
     Raises:
         UnknownPolicy: The script does not exist.
         EnvironmentMismatch: The script does not support the spaces.
+        ConfigError: The bot cannot be imported, or does not have the interface of a bot.
     """
+    if ":" in name:
+        return Bot(name, observation, action)
     if name not in SCRIPTS:
-        raise UnknownPolicy(f"unknown script {name!r}; known: {', '.join(SCRIPTS)}")
+        raise UnknownPolicy(
+            f"unknown script {name!r}; known: {', '.join(SCRIPTS)}, or a bot, script:my_package.module:name"
+        )
     return SCRIPTS[name](observation, action)
 
 

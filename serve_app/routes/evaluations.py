@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from league.errors import Forbidden
-from league.policies.loading import check_eligible, eligible, pinned
+from league.policies.loading import check_eligible, check_requested, eligible, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
@@ -112,6 +112,7 @@ def _pinned(evaluation_request: EvaluationRequest, league: str, registry: Regist
         for name in ("contestants", "against"):
             document[name] = [pinned(ref, league, registry) for ref in getattr(evaluation_request.root, name)]
             for ref in document[name]:
+                check_requested(ref, row.config)
                 check_eligible(ref, registry, row.config)
         document["contestants"] = document["contestants"] or [version.ref for version in eligible(registry, league)]
     return document

@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from league.errors import UnknownMatch
-from league.policies.loading import check_eligible, pinned
+from league.policies.loading import check_eligible, check_requested, pinned
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -74,8 +74,9 @@ class GameRoutes:
         body = parsing.parse_body(PlayBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
 
         def build_operation(registry: Registry, league: str) -> HumanPlayRequest:
-            opponent = pinned(body.opponent, league, registry)
-            check_eligible(opponent, registry, registry.leagues.get(league).config)
+            opponent, config = pinned(body.opponent, league, registry), registry.leagues.get(league).config
+            check_requested(opponent, config)
+            check_eligible(opponent, registry, config)
             return HumanPlayRequest(**body.model_dump() | {"opponent": opponent})
 
         return _response(await self._request_game(request, build_operation))

@@ -12,7 +12,7 @@ aliases = slugs.filter(lambda slug: not slug.isdigit())
 versions = st.integers(1, 2**31 - 1) | aliases
 
 
-@given(st.builds(CheckpointRef, slugs, versions) | st.builds(ScriptRef, slugs))
+@given(st.builds(CheckpointRef, slugs, versions) | st.builds(ScriptRef, slugs | st.just("my_package.bots:Bot")))
 def test_a_contestant_survives_parsing_its_text(ref: CheckpointRef | ScriptRef) -> None:
     assert parse_ref(str(ref)) == ref
 

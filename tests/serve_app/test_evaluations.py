@@ -72,6 +72,7 @@ def test_by_default_all_versions_play(evaluator: TestClient) -> None:
         ("/v1/leagues/chess/evaluations", {}, 404, "unknown_league"),
         (BOARD, {"contestants": ["board@9"]}, 404, "unknown_version"),
         (BOARD, {"contestants": ["board@candidate"]}, 404, "unknown_alias"),
+        (BOARD, {"contestants": ["script:os:system"]}, 404, "unknown_policy"),
         (BOARD, {"contestants": ["script:clever"]}, 404, "unknown_policy"),
         (BOARD, {"contestants": ["memory@1"]}, 400, "environment_mismatch"),
         ("/v1/leagues/vector/evaluations", {"contestants": ["script:one_ply"]}, 400, "environment_mismatch"),

@@ -169,6 +169,7 @@ def test_an_illegal_choice_has_a_message_with_the_legal_ones(client: TestClient)
         ({"opponent": "tictactoe@9"}, 404, "unknown_version"),
         ({"opponent": "tictactoe@candidate"}, 404, "unknown_alias"),
         ({"opponent": "script:clever"}, 404, "unknown_policy"),
+        ({"opponent": "script:os:system"}, 404, "unknown_policy"),
         ({"opponent": "other@1"}, 400, "environment_mismatch"),
         ({"opponent": "tictactoe"}, 400, "invalid_reference"),
         ({"seed": -1}, 400, "invalid_input"),

@@ -14,6 +14,7 @@ from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
 from league.errors import ConfigError, InterfaceChanged
 from league.interface import Interface
+from league.policies.loading import check_scripts
 from league.ray_cluster import UNLIMITED, LocalRay, connected
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
@@ -83,6 +84,7 @@ def train(
     silence_tune()
     interface = interface_of(config)
     check(config, interface)
+    check_scripts(config, interface)
     registry.leagues.register(config, interface)
     number = None if parent is None else _parent(registry, parent, config, interface).number
     interrupted = RunDirectory.resume(registry.storage, config) if resume else None

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from league.config.training import OpponentConfig
 from league.environments.stepping import Batch, Indices
-from league.errors import ConfigError
+from league.errors import ConfigError, GameCrashed, one_line
 from league.interface import Interface
+from league.policies.bots import Bot
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
@@ -133,9 +134,11 @@ class Opponents:
         }
         self._greedy = {config.ref for config in configs if _is_greedy(config.ref, storage)}
         self._recurrent_states = {
-            opponent: RecurrentStates({key: rows[0] for key, rows in initial.items()}, num_envs, len(interface.agents))
+            opponent: RecurrentStates(
+                {key: np.asarray(rows[0], rows.dtype) for key, rows in initial.items()}, num_envs, len(interface.agents)
+            )
             for opponent, policy in self._policies.items()
-            if isinstance(policy, OnnxPolicy) and (initial := policy.initial_state(1))
+            if isinstance(policy, OnnxPolicy | Bot) and (initial := policy.initial_state(1))
         }
 
     def act(self, opponent: OpponentPolicy, batch: Batch, rng: np.random.Generator) -> NDArray:
@@ -147,6 +150,8 @@ class Opponents:
             explore=isinstance(policy, OnnxPolicy) and opponent.ref not in self._greedy,
             rng=[rng] * len(batch),
         )
+        for fault in answer.faults.values():
+            raise GameCrashed(f"training.opponents: {opponent.ref}: {one_line(fault, with_type=True)}") from fault
         if states and answer.state is not None:
             states.update(batch, answer.state)
         return answer.actions

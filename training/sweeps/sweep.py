@@ -21,6 +21,7 @@ from league.config.sweep import SweepConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface
+from league.policies.loading import check_scripts
 from league.ray_cluster import UNLIMITED, LocalRay, connected
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
@@ -109,6 +110,7 @@ def sweep(
     interface = interface_of(config)
     trials = plan(config, config.sweep)
     _check(config, config.sweep, trials, interface)
+    check_scripts(config, interface)
     registry.leagues.register(config, interface)
     interrupted = SweepDirectory.resume(registry.storage, config, trials) if resume else None
     pins = {} if interrupted else pin_opponents(config, registry, interface)

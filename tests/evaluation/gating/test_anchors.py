@@ -129,3 +129,30 @@ def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry:
 def test_an_invalid_gate_is_rejected(gate: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         config(**gate)
+
+
+BOT = "script:examples.tictactoe_bot:act"
+
+
+def test_a_candidate_that_loses_to_a_bot_is_refused_and_the_bot_is_rated(tmp_path: Path) -> None:
+    registry = league_of(tmp_path / "home", STRONG)
+    report = nightly(config(anchors=[{"ref": BOT, "margin": 40}]), registry=registry)
+    assert [verdict.outcome for verdict in report.verdicts] == ["reject"]
+    assert BOT in str(registry.verdicts.all(tictactoe.LEAGUE)[0].evidence)
+    assert report.champion is None
+    ratings = {standing.ref: standing.rating for standing in report.leaderboard}
+    assert ratings[BOT] is not None
+    assert ratings[BOT] > ratings["tictactoe@1"]
+    verify(report.verdicts[0].verdict, registry=registry)
+    registry.close()
+
+
+def test_an_anchor_that_cannot_be_imported_ends_the_run_before_it_starts(registry: Registry) -> None:
+    with pytest.raises(ConfigError, match=r"gate.anchors: script:no_bots:act: cannot import 'no_bots'"):
+        nightly(config(anchors=["script:no_bots:act"]), registry=registry)
+    assert registry.verdicts.all(tictactoe.LEAGUE) == []
+
+
+def test_a_malformed_anchor_is_rejected_with_the_configuration() -> None:
+    with pytest.raises(ConfigError, match=r"gate.anchors.*my_package.module:name"):
+        config(anchors=["script:bots:"])
