@@ -268,7 +268,10 @@ class PPOLearner(FixedPoliciesLearner):
         norms = {
             name: self._clip_and_step(name) for name in self._parameters if name in minibatch or name == ALL_MODULES
         }
-        return {policy: torch.stack([*loss[1:-1], norms[policy], loss.magnet_kl]).detach() for policy, loss in losses.items()}
+        return {
+            policy: torch.stack([*loss[1:-1], norms[policy], loss.magnet_kl]).detach()
+            for policy, loss in losses.items()
+        }
 
     def compute_loss_for_module(
         self, *, module_id: str, batch: Minibatch, fwd_out: dict[str, Tensor], **_: Any
