@@ -1,9 +1,9 @@
 """Do the shipped configurations learn? Each part trains one for a fixed time and measures the result.
 
-Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem, connect_four_dqn
-by DQN; two_step_game, simple_spread_qmix. With several seeds or opponents, two trainings run at a time, each in a
-process with one core; those of pistonball run in turn, on two cores. All seeds are printed. Returns are per agent and
-episode, with greedy policies in new episodes, unless stated otherwise.
+Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem_dqn,
+connect_four_dqn by DQN; two_step_game, simple_spread_qmix. With several seeds or opponents, two trainings run at a
+time, each in a process with one core; those of pistonball run in turn, on two cores. All seeds are printed. Returns are
+per agent and episode, with greedy policies in new episodes, unless stated otherwise.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from benchmarks.training.learned import (
 from benchmarks.training.pistonball import pistonball
 from benchmarks.training.truncation import as_rllib
 from benchmarks.training.two_step import two_step_game
-from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem, leduc_vs_random
+from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem_dqn, leduc_vs_random
 from examples import traffic
 from league.config.league import LeagueConfig
 
@@ -163,7 +163,7 @@ PARTS: dict[str, Callable[[float], bool]] = {
     part.__name__: part
     for part in (
         *(rps, cars_and_lights, shared_encoder, simple_spread, pistonball),
-        *(leduc_vs_random, leduc_holdem, connect_four_dqn),
+        *(leduc_vs_random, leduc_holdem_dqn, connect_four_dqn),
         *(two_step_game, simple_spread_qmix),
     )
 }

@@ -41,7 +41,7 @@ class Phase:
 
 
 PARTS = {
-    "leduc_holdem": Phase(leduc_holdem_v4, in_turns, 1),
+    "leduc_holdem_dqn": Phase(leduc_holdem_v4, in_turns, 1),
     "connect_four_dqn": Phase(connect_four_v3, in_turns, 1),
     "simple_spread_qmix": Phase(simple_spread_v3, in_parallel, 3),
     "simple_adversary": Phase(simple_adversary_v3, in_parallel, 3),

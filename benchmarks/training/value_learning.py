@@ -50,7 +50,7 @@ def leduc_vs_random(scale: float) -> bool:
     return report_target("lower bound of each seed", f"{RLCARD:+.2f}", met)
 
 
-def leduc_holdem(scale: float) -> bool:
+def leduc_holdem_dqn(scale: float) -> bool:
     """Exploitability in self-play: the winnings of an exact best response, over training."""
     met, random = True, best_response(uniform)
     print(f"uniform play: {random:.4f}")
@@ -92,7 +92,7 @@ def _against_random(seed: int, scale: float) -> Outcome:
 
 
 def _exploitability(seed: int, scale: float) -> Outcome:
-    return _train("leduc_holdem", seed, scale, lambda *_: {}, exploitability)
+    return _train("leduc_holdem_dqn", seed, scale, lambda *_: {}, exploitability)
 
 
 def _connect_four(seed: int, scale: float) -> Outcome:
