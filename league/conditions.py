@@ -26,6 +26,9 @@ HIDDEN_INFORMATION = frozenset(
 )
 """Names (`metadata["name"]`) of PettingZoo's environments in which observations hide cards or the opponent's move."""
 
+VALUE_BASED = frozenset(("dqn", "qmix"))
+"""Algorithms that learn action values. Their versions have no action distribution, and are always greedy."""
+
 
 class Conditions(NamedTuple):
     """Results of games under different conditions are never combined."""
@@ -46,9 +49,11 @@ def action_selection(config: "LeagueConfig", interface: "Interface") -> ActionSe
 
 def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
     """Return a sentence for people: how versions select actions, and why."""
-    chosen = action_selection(config, interface)
+    chosen, algorithm = action_selection(config, interface), config.training.algorithm
+    if chosen == "sampled" and algorithm in VALUE_BASED:
+        return f"Versions play with greedy actions: those of {algorithm} have no action distribution."
     if config.play.actions is not None:
-        return f"Versions play with {chosen} actions, as play.actions requires."
+        return f"Versions play with {chosen} actions, as play.actions says."
     if len(interface.sides) == 1:
         reason = "there is only one side"
     elif interface.hidden_information:

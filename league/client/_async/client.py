@@ -78,7 +78,7 @@ class AsyncClient:
                 these (for example with the keys `observation` and `action_mask`).
             explore: Sample the action from the policy's distribution (True), or take the most likely one (False). By
                 default, actions are selected as in the league's matches.
-            seed: Seed for sampling. With `explore` and without a seed a random one is used, which the response contains.
+            seed: Seed for sampling. Without it, `explore` uses a random one, which the response contains.
             probabilities: Include the action probabilities in the response.
             state: Recurrent state of the previous response; None starts an episode. `episode` tracks it for you.
 

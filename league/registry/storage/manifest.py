@@ -4,6 +4,7 @@ from typing import Any, Self
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
 from league.errors import ArtifactCorrupt
 from league.interface import Interface
@@ -12,8 +13,6 @@ from league.spaces import Box, Space
 MANIFEST = "manifest.json"
 TRAINING = "training"
 """Directory of RLlib's state, which only training reads."""
-VALUE_BASED = frozenset(("dqn", "qmix"))
-"""Algorithms that learn action values. Their policies take the action with the greatest value."""
 PROBES = ".probes.npz"
 """Suffix of a policy's file of probes."""
 

@@ -177,7 +177,7 @@ class ShadowCounts:
     observations: int
     """Observations in those requests."""
     agreed: int
-    """Observations with the same greedy action."""
+    """Observations with the same action; if actions are sampled, with the same random numbers."""
     failed: int
     """Requests that failed on the candidate."""
     dropped: int

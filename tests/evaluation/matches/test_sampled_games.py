@@ -122,7 +122,7 @@ def test_games_depend_on_the_seed() -> None:
     assert first != second
 
 
-@pytest.mark.parametrize("name", ["roles", "continuous team", "memory"])
+@pytest.mark.parametrize("name", ["roles", "memory"])
 def test_sampled_actions_of_all_kinds_are_played_and_replayed(name: str) -> None:
     kind = KINDS[name]
     schedule = replace(kind.schedule(["kind@1", "kind@2"], blocks=2), actions="sampled")
