@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.simulations import coverage, golden, null_play
+from benchmarks.simulations import coverage, golden, null_play, sampled_play
 from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completion
 from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulations.simulated_years import boundary, chance, walk
@@ -33,20 +33,24 @@ SINGLE = GateConfig(elo0=0, elo1=60, max_blocks=1000, nights=None)
 
 def gates(quick: bool) -> bool:
     """20,000 gates for each hypothesis and three kinds of games."""
-    number, met = 1_000 if quick else 20_000, True
+    met = [_simulated(kind, shares, quick) for kind, shares in EQUALS.items()]
+    return all(met)
+
+
+def _simulated(kind: str, shares: tuple[float, ...], quick: bool) -> bool:
+    """Gates of games with these shares of the cells between equal players."""
+    number = 1_000 if quick else 20_000
     theory = expected_games(SINGLE.elo0, SINGLE.elo1, SINGLE.elo0, SINGLE.alpha, SINGLE.beta)
-    for kind, shares in EQUALS.items():
-        null = simulate(SINGLE, np.asarray(shares), number, seed=1)
-        better = simulate(SINGLE, stronger(shares, SINGLE.elo1), number, seed=2)
-        false, high = null.promoted.mean(), _high(int(null.promoted.sum()), number)
-        lengths = [2 * float(each.blocks.mean()) / theory for each in (null, better)]
-        print(
-            f"  {kind}: {number} gates at H0: {false:.2%} promoted, upper 95 % bound {high:.2%} (≤ 5 %, ≤ 5.3 %);"
-            f" at H1: {better.promoted.mean():.2%} (≥ 95 %); mean length {lengths[0]:.3f}× and {lengths[1]:.3f}×"
-            f" of the {theory:.0f} games of theory (within 10 %)"
-        )
-        met &= high <= 0.053 and better.promoted.mean() >= 0.95 and all(abs(each - 1) <= 0.1 for each in lengths)
-    return bool(met)
+    null = simulate(SINGLE, np.asarray(shares), number, seed=1)
+    better = simulate(SINGLE, stronger(shares, SINGLE.elo1), number, seed=2)
+    false, high = null.promoted.mean(), _high(int(null.promoted.sum()), number)
+    lengths = [2 * float(each.blocks.mean()) / theory for each in (null, better)]
+    print(
+        f"  {kind}: {number} gates at H0: {false:.2%} promoted, upper 95 % bound {high:.2%} (≤ 5 %, ≤ 5.3 %);"
+        f" at H1: {better.promoted.mean():.2%} (≥ 95 %); mean length {lengths[0]:.3f}× and {lengths[1]:.3f}×"
+        f" of the {theory:.0f} games of theory (within 10 %)"
+    )
+    return bool(high <= 0.053 and better.promoted.mean() >= 0.95 and all(abs(each - 1) <= 0.1 for each in lengths))
 
 
 def years(quick: bool) -> bool:
@@ -124,6 +128,20 @@ def play(quick: bool) -> bool:
     return met
 
 
+def sampled(quick: bool) -> bool:
+    """Gates of sampled games: simulated with their exact probabilities, and played."""
+    shares = sampled_play.shares(sampled_play.policy())
+    met = _simulated(f"Kuhn poker, {1 - shares[2]:.1%} of blocks uneven", shares, quick)
+    number = 20 if quick else 200
+    promoted, uneven = sampled_play.promoted(number)
+    low, high = binomtest(promoted, number).proportion_ci(0.95)
+    print(
+        f"  {number} gates, one policy under two numbers, {uneven:.1%} of blocks uneven: {promoted} promoted, "
+        f"{promoted / number:.1%} [{low:.1%}, {high:.1%}] (≤ 5 %)"
+    )
+    return met and bool(low <= 0.05)
+
+
 def order(quick: bool) -> bool:
     """Games whose duration depends on their result, on workers that finish them in any order."""
     number = 100 if quick else 1_000
@@ -156,6 +174,7 @@ PARTS: dict[str, Callable[[bool], bool]] = {
     "traps": traps,
     "order": order,
     "play": play,
+    "sampled": sampled,
     "intervals": intervals,
 }
 

@@ -119,6 +119,7 @@ def _show(report: "EvaluationReport") -> None:
 
 def _show_payoff(report: "EvaluationReport") -> None:
     payoff = report.payoff
+    say(f"\nVersions played with {report.actions} actions.")
     names = [_short(ref) for ref in payoff.contestants]
     compared = "" if report.scoring == "game" else ", compared on the same side and seed"
     say(f"\nPayoff matrix: score of the row against the column{compared} (1: wins every game, 0.5: even):")

@@ -90,8 +90,11 @@ def act(
     local: Annotated[
         bool, typer.Option("--local", help="Load the version in this process instead of calling a server.")
     ] = False,
-    explore: Annotated[bool, typer.Option("--explore", help="Sample an action instead of the greedy one.")] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="Random seed for --explore.")] = None,
+    explore: Annotated[
+        bool | None,
+        typer.Option("--explore/--greedy", help="Sample an action, or take the greedy one. Default: as in matches."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Random seed for a sampled action.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the complete response as JSON.")] = False,
 ) -> None:
     """Request one action from a policy server, or compute it locally."""
@@ -107,7 +110,7 @@ def act(
 
 
 def _ask(
-    ref: CheckpointRef, policy: str | None, value: Any, explore: bool, seed: int | None, url: str
+    ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, url: str
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -125,7 +128,7 @@ def _ask(
 
 
 def _act_here(
-    ref: CheckpointRef, policy: str | None, value: Any, explore: bool, seed: int | None, _: str
+    ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, _: str
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -141,7 +144,8 @@ def _act_here(
     observations = ObservationReader(space).read([value])
     # The same generator as on the server, so that both sample the same action.
     rng = np.random.default_rng() if seed is None else generator(seed, 0)
-    actions = loaded.act(observations, explore=explore, rng=[rng] if explore else None)
+    is_sampled = registry.leagues.get(ref.league).conditions.actions == "sampled" if explore is None else explore
+    actions = loaded.act(observations, explore=is_sampled, rng=[rng])
     return {
         "action": actions.actions[0].tolist(),
         "model": str(PolicyRef(ref.league, policy)),

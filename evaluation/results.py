@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from league.conditions import ActionSelection
 from league.results.records import Scoring
 
 
@@ -134,7 +135,7 @@ class EvaluationReport(Document):
     """Result of a tournament or of cross-play.
 
     schedule: id of the schedule; for an adaptive tournament, the common prefix of its rounds' ids.
-    kind: `round_robin`, `gauntlet`, `adaptive` or `cross_play`.
+    kind: `round_robin`, `gauntlet`, `adaptive` or `cross_play`. actions: how versions selected them.
     by_side: leaderboard of each side; empty if sides are alike or there is only one.
     population: for a round robin in which all pairs met, else None.
     cross_play: None for a tournament. With cross-play, leaderboard and payoff are empty.
@@ -150,6 +151,7 @@ class EvaluationReport(Document):
     payoff: Payoff
     scoring: Scoring
     by_side: dict[str, tuple[Standing, ...]]
+    actions: ActionSelection = "greedy"
     forfeits: dict[str, int] = field(default_factory=dict)
     kind: str = "round_robin"
     stopped_by: StoppedBy = "schedule"

@@ -40,7 +40,7 @@ class KuhnPoker(AECEnv):
     | 5 to 10 | the three actions of the longest line, one-hot; zeros for actions to come |
     """
 
-    metadata = {"name": "kuhn_poker", "render_modes": []}  # noqa: RUF012  # PettingZoo's name and form
+    metadata = {"name": "kuhn_poker", "render_modes": [], "hidden_information": True}  # noqa: RUF012  # PettingZoo's form
     render_mode = None
 
     def __init__(self) -> None:

@@ -28,6 +28,8 @@ class Interface(BaseModel):
     """Agent → policy id."""
     sides: dict[str, tuple[str, ...]]
     """Side → agents, in the order in which contestants rotate."""
+    hidden_information: bool = False
+    """Whether the environment hides information from opponents; see `league.conditions.hides_information`."""
 
     @property
     def policy_ids(self) -> tuple[str, ...]:

@@ -185,11 +185,11 @@ class _NightlyRun:
     def rate(self) -> None:
         """Play the missing or unfinished rating gauntlet of each version."""
         ledger = Ledger(self._registry)
-        digest = self._league.environment_digest
+        conditions = self._league.conditions
         begun = {
             schedule.contestants[0]: schedule
             for schedule in ledger.schedules(self._league.slug)
-            if schedule.kind == "gauntlet" and schedule.environment_digest == digest
+            if schedule.kind == "gauntlet" and schedule.conditions == conditions
         }
         versions = eligible(self._registry, self._league.slug)
         for previous, version in zip([None, *versions], versions, strict=False):

@@ -1,9 +1,9 @@
 """The game loop: plays games in parallel environments, with the actions of each policy batched over all games.
 
-A game depends on its plan alone. Openings and scripts use random numbers of the game, recurrent states belong to
-agents, and a policy's output for a row does not depend on its batch. The number of parallel environments and the other
-games therefore do not change a result. This includes forfeits: a contestant without a legal action loses that game
-immediately, and the other games continue.
+A game depends on its plan alone. Openings, scripts and sampled actions use random numbers of the game, recurrent states
+belong to agents, and a policy's output for a row does not depend on its batch. The number of parallel environments and
+the other games therefore do not change a result. This includes forfeits: a contestant without a legal action loses that
+game immediately, and the other games continue.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.game_state import AgentGenerators, AgentStates
+from evaluation.matches.game_state import ActionNumbers, AgentGenerators, AgentStates
 from evaluation.matches.match_recorder import MatchRecorder
 from evaluation.matches.openings import OpeningMoves
-from evaluation.matches.policy_calls import PolicyFault, call_policy
+from evaluation.matches.policy_calls import PolicyFault, Randomness, call_policy
 from evaluation.matches.returns import agent_sides
 from evaluation.matches.seating import Roster, Seating
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
@@ -52,7 +52,7 @@ def play_matches(
         positions: Positions of matches in it.
         environment: Parallel environments to play in.
         interface: Interface of the league.
-        roster: All contestants of these matches. Checkpoints play greedily.
+        roster: All contestants of these matches. Versions select actions as `schedule.actions` says.
         max_moves: Maximum environment steps of a game. Simultaneous actions are one step.
         deadline: Time limit of a game.
 
@@ -193,11 +193,7 @@ class _GameLoop:
         """Return a contestant's actions, keep its recurrent states, and note the games that it forfeits."""
         games = self._games[self._running[batch.envs]]
         state = self._states[group].get(batch) if group in self._states else None
-        draws = ref.startswith("script:")  # checkpoints play greedily
-        generators = (
-            self._generators.get(batch, self._plans.seeds[games], self._plans.indices[games]) if draws else None
-        )
-        answer = call_policy(policy, batch, self._spaces[batch.agents[0]], state, generators)
+        answer = call_policy(policy, batch, self._spaces[batch.agents[0]], state, self._randomness(group, batch, games))
         if answer.states is not None:
             if group not in self._states:
                 self._states[group] = AgentStates(*self._returns.shape)
@@ -207,6 +203,12 @@ class _GameLoop:
             self._faulty.add(int(batch.envs[row]))
             self._log_forfeit(ref, fault)
         return answer.actions
+
+    def _randomness(self, group: int, batch: Batch, games: Indices) -> Randomness:
+        seated, seeds, indices = self._seating.policies[group], self._plans.seeds[games], self._plans.indices[games]
+        if seated.is_script:
+            return self._generators.get(batch, seeds, indices)
+        return ActionNumbers(seeds, indices, batch.agents, self._steps[batch.envs]) if seated.samples else None
 
     def _log_forfeit(self, ref: str, fault: PolicyFault) -> None:
         """Log the details of a forfeit once. The record contains only the reason."""

@@ -1,12 +1,16 @@
-"""State of games in progress: the random generators and recurrent states of their agents."""
+"""State of games in progress: the random numbers and recurrent states of their agents."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.stepping import Batch, Indices
-from league.seeds import generators
+from league.policies.draws import UniformNumbers
+from league.random import pcg64
+from league.seeds import generators, spawn_key
 
 State = dict[str, NDArray]
 """name of a recurrent input → array (k, …)"""
@@ -33,6 +37,37 @@ class AgentGenerators:
     def forget(self, envs: Indices) -> None:
         """The games in `envs` are over."""
         self._kept[envs] = None
+
+
+@dataclass(frozen=True, slots=True)
+class ActionNumbers(UniformNumbers):
+    """The random numbers with which versions sample the actions of k rows.
+
+    They are those of `generator(seed, "action", index, agent, step)`, a function of the game, the agent and the step.
+    Nothing is kept between steps, and one game's numbers do not depend on the others in its batch.
+
+    Attributes:
+        seeds: Seeds of the games, (k,).
+        indices: Numbers of the games in their blocks, (k,).
+        agents: Agents that act, (k,).
+        steps: Steps of the games, from 0, (k,).
+    """
+
+    seeds: Indices
+    indices: Indices
+    agents: Indices
+    steps: Indices
+
+    def draw(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return the first numbers of each row, (k, *shape). Repeated calls return the same ones."""
+        key = spawn_key("action", self.indices, self.agents, self.steps)
+        outputs = pcg64.outputs(self.seeds, int(np.prod(shape, dtype=int)), key)
+        return pcg64.uniform(outputs, 0.0, 1.0).T.reshape(-1, *shape)
+
+    def row(self, row: int) -> ActionNumbers:
+        """Return the numbers of one row."""
+        one = slice(row, row + 1)
+        return ActionNumbers(self.seeds[one], self.indices[one], self.agents[one], self.steps[one])
 
 
 class AgentStates:

@@ -1,7 +1,7 @@
 """Calls policies and validates their actions row by row. Rows without a playable action forfeit their games.
 
 The result of a row must not depend on its batch. If a policy fails on a batch, it is called for each row separately
-with the row's generator restored, so that a fault in one game does not affect the others.
+with the row's random numbers restored, so that a fault in one game does not affect the others.
 """
 
 from __future__ import annotations
@@ -12,14 +12,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.game_state import State
+from evaluation.matches.game_state import ActionNumbers, State
 from league.environments.stepping import Batch, allows_nothing, legal_rows
 from league.errors import IllegalMask, one_line
+from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, MalformedAction, Policy
 from league.results.records import Reason
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete
 
 Generators = Sequence[np.random.Generator]
+Randomness = Generators | ActionNumbers | None
+"""The generators of scripts, the numbers with which graphs sample their actions, or None for greedy actions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,24 +45,21 @@ class PolicyOutput:
     faults: dict[int, PolicyFault] = field(default_factory=dict)
 
 
-def call_policy(
-    policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
-) -> PolicyOutput:
+def call_policy(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
     """Call a policy that acts in `space` on a batch.
 
-    generators: one per row for a stochastic policy, else None.
     Raises IllegalMask if the environment allows no action, which is not the contestant's fault.
     """
-    before = None if generators is None else [each.bit_generator.state for each in generators]
+    generators = () if randomness is None or isinstance(randomness, ActionNumbers) else randomness
+    before = [each.bit_generator.state for each in generators]
     try:
-        answer = _call_batch(policy, batch, space, state, generators)
+        answer = _call_batch(policy, batch, space, state, randomness)
     except MemoryError:
         raise
     except Exception:
-        if generators is not None and before is not None:
-            for each, mark in zip(generators, before, strict=True):
-                each.bit_generator.state = mark
-        answer = _call_rows(policy, batch, space, state, generators)
+        for each, mark in zip(generators, before, strict=True):
+            each.bit_generator.state = mark
+        answer = _call_rows(policy, batch, space, state, randomness)
     mask = batch.observations.get(ACTION_MASK)
     legal = legal_rows(answer.actions, space, mask)
     if answer.faults or not legal.all():
@@ -83,25 +83,25 @@ def action_fault(given: Actions, space: Leaf, mask: NDArray | None) -> PolicyFau
     return _illegal(given.actions[0], mask, 0)
 
 
-def _call_batch(
-    policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
-) -> PolicyOutput:
+def _call_batch(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
     """Call the policy and check the form of its output. Raises whatever the policy raises."""
-    given = policy.act(batch.observations, state=state, rng=generators)
+    if isinstance(randomness, ActionNumbers):
+        assert isinstance(policy, OnnxPolicy), "scripts have generators"
+        given = policy.act(batch.observations, state=state, explore=True, rng=randomness)
+    else:
+        given = policy.act(batch.observations, state=state, rng=randomness)
     _check_form(given, len(batch), space)
     return PolicyOutput(given.actions, given.state, {row: _fault(error) for row, error in given.faults.items()})
 
 
-def _call_rows(
-    policy: Policy, batch: Batch, space: Leaf, state: State | None, generators: Generators | None
-) -> PolicyOutput:
+def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
     rows = len(batch)
     given: dict[int, NDArray] = {}
     states: State = {}
     faults: dict[int, PolicyFault] = {}
     for row in range(rows):
         own = None if state is None else {name: array[[row]] for name, array in state.items()}
-        draws = None if generators is None else [generators[row]]
+        draws = _of_row(randomness, row)
         try:
             answer = _call_batch(policy, batch.rows(np.array([row])), space, own, draws)
         except MemoryError:
@@ -118,6 +118,12 @@ def _call_rows(
     for row, action in given.items():
         actions[row] = action
     return PolicyOutput(actions, states or None, faults)
+
+
+def _of_row(randomness: Randomness, row: int) -> Randomness:
+    if isinstance(randomness, ActionNumbers):
+        return randomness.row(row)
+    return None if randomness is None else [randomness[row]]
 
 
 def _check_form(given: Actions, rows: int, space: Leaf) -> None:

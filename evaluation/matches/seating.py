@@ -10,6 +10,7 @@ import numpy as np
 from evaluation.schedules.builders import GamePlans
 from league.environments.stepping import Indices
 from league.interface import Interface
+from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.results.records import Schedule
 
@@ -23,12 +24,18 @@ NO_GROUP = -1
 class SeatedPolicy:
     """The policy that acts for the rows of one group.
 
-    ref, policy: of a contestant; None for random opening moves.
+    ref, policy: of a contestant; None for random opening moves. samples: whether it samples its actions from the
+    distribution of its graph.
     """
 
     policy_id: str
     ref: str | None = None
     policy: Policy | None = None
+    samples: bool = False
+
+    @property
+    def is_script(self) -> bool:
+        return self.ref is not None and self.ref.startswith("script:")
 
 
 class Seating:
@@ -52,8 +59,9 @@ class Seating:
         seated: dict[tuple[str | None, str], SeatedPolicy] = {
             (None, policy_id): SeatedPolicy(policy_id) for policy_id in interface.policy_ids
         }
+        is_sampled = schedule.actions == "sampled"
         seated |= {
-            (ref, policy_id): SeatedPolicy(policy_id, ref, policy)
+            (ref, policy_id): SeatedPolicy(policy_id, ref, policy, is_sampled and isinstance(policy, OnnxPolicy))
             for ref, policies in roster.items()
             for policy_id, policy in policies.values()
         }

@@ -249,6 +249,7 @@ def _report(
         leaderboard=table,
         payoff=tabulate(order, sides, matches if tournament else ()),
         scoring=compared,
+        actions=row.conditions.actions,
         by_side=by_side(sides, matches) if rated_by_side else {},
         kind=kind,
         stopped_by=stopped_by,

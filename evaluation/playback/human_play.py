@@ -20,6 +20,7 @@ from evaluation.playback.single_game import GameStep, Move, play_game, policy_ou
 from evaluation.playback.video import data_uri
 from evaluation.results import Document
 from evaluation.schedules.builders import scoring
+from league.conditions import ActionSelection, action_selection
 from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput, one_line
@@ -139,7 +140,9 @@ def human_play(
     """
     space = space_of(interface, request.agent)
     person = _Person(request.actions, space, players[request.agent] if request.chances else None)
-    steps, last, stop, picture = _play(environment, players, person, request, interface, draws)
+    steps, last, stop, picture = _play(
+        environment, players, person, request, interface, draws, action_selection(config, interface)
+    )
     awaiting = stop if isinstance(stop, _AwaitingPerson) else None
     forfeit = stop if isinstance(stop, _Forfeited) else None
     if person.left and not awaiting:
@@ -170,6 +173,7 @@ def _play(
     request: HumanPlayRequest,
     interface: Interface,
     draws: bool,
+    actions: ActionSelection,
 ) -> tuple[list[RecordedStep], GameStep, _Stop | None, str | None]:
     """The steps of the game, the last one, what stopped it before its end, and the last picture."""
     policies: dict[str, Policy] = {
@@ -183,7 +187,7 @@ def _play(
     stop: _Stop | None = None
     try:
         try:
-            for last in play_game(environment, policies, request.seed):
+            for last in play_game(environment, policies, request.seed, actions):
                 steps.append(step_of(last, controllers, interface))
         except _Stop as stopping:
             stop = stopping
@@ -291,11 +295,11 @@ class _Opponent:
         observations: Arrays,
         *,
         state: Arrays | None = None,
-        explore: bool = False,  # noqa: ARG002
+        explore: bool = False,
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
         try:
-            given = policy_output(self._policy, observations, state, rng)
+            given = policy_output(self._policy, observations, state, rng, explore)
         except MemoryError:
             raise
         except Exception as error:

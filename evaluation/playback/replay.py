@@ -167,7 +167,7 @@ def live_game(refs: Sequence[str], registry: Registry, side: str | None = None, 
         config=row.config,
         interface=row.interface,
         controllers=controllers,
-        play=lambda environment: play_game(environment, policies, seed),
+        play=lambda environment: play_game(environment, policies, seed, row.conditions.actions),
     )
 
 

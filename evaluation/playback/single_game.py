@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
@@ -49,19 +50,23 @@ class GameStep:
     acting: tuple[str, ...] = ()
 
 
-def play_game(environment: BatchedEnvironment, players: Mapping[str, Policy], seed: int) -> Iterator[GameStep]:
-    """Play one game in environment 0 and yield its steps. players: agent → policy. Checkpoints play greedily.
+def play_game(
+    environment: BatchedEnvironment, players: Mapping[str, Policy], seed: int, actions: ActionSelection = "greedy"
+) -> Iterator[GameStep]:
+    """Play one game in environment 0 and yield its steps.
+
+    players: agent → policy. actions: how versions select actions.
 
     The environment stays as the game left it, so that each step can be rendered. The caller closes it.
     """
     agents = environment.agents
-    policies = [_AgentPolicy(agent, players[agent], seed) for agent in agents]
+    policies = [_AgentPolicy(agent, players[agent], seed, actions == "sampled") for agent in agents]
     returns = dict.fromkeys(agents, 0.0)
     turn, step = environment.start(each_agent_alone([seed], len(agents))), 0
     yield GameStep(step, (), (), dict(returns), not turn.batches, _acting(turn, agents))
     while turn.batches:
         answers = {agent: policies[agent].act(batch) for agent, batch in turn.batches.items()}
-        turn = environment.step({agent: actions for agent, (actions, _) in answers.items()})
+        turn = environment.step({agent: chosen for agent, (chosen, _) in answers.items()})
         step += 1
         for agent, batch in turn.batches.items():
             returns[agents[agent]] += float(batch.rewards[0])
@@ -73,12 +78,16 @@ def play_game(environment: BatchedEnvironment, players: Mapping[str, Policy], se
 
 
 def policy_output(
-    policy: Policy, observations: Arrays, state: Arrays | None, rng: Sequence[np.random.Generator] | None
+    policy: Policy,
+    observations: Arrays,
+    state: Arrays | None,
+    rng: Sequence[np.random.Generator] | None,
+    explore: bool = False,
 ) -> Actions:
-    """A policy's greedy output. For a graph, it includes the inputs of the action distribution."""
-    if isinstance(policy, OnnxPolicy):
+    """A policy's output. For a graph, it includes the inputs of the action distribution."""
+    if isinstance(policy, OnnxPolicy) and not explore:
         return policy.distribution(observations, state=state)
-    return policy.act(observations, state=state, rng=rng)
+    return policy.act(observations, state=state, explore=explore, rng=rng)
 
 
 def first_observation(config: LeagueConfig, interface: Interface, policy: str | None, seed: int = 0) -> Any:
@@ -99,14 +108,14 @@ def first_observation(config: LeagueConfig, interface: Interface, policy: str | 
 class _AgentPolicy:
     """Policy of one agent with its recurrent state and random generator."""
 
-    def __init__(self, agent: str, policy: Policy, seed: int) -> None:
-        self._agent, self._policy = agent, policy
+    def __init__(self, agent: str, policy: Policy, seed: int, explore: bool) -> None:
+        self._agent, self._policy, self._explore = agent, policy, explore
         self._draws = generator(seed, agent)
         self._state: Arrays | None = None
 
     def act(self, batch: Batch) -> tuple[NDArray, Move]:
         """Actions (1, …) for a batch of this agent alone, and the move."""
-        given = policy_output(self._policy, batch.observations, self._state, [self._draws])
+        given = policy_output(self._policy, batch.observations, self._state, [self._draws], self._explore)
         for fault in given.faults.values():
             raise GameCrashed(f"{self._agent} has no action: {one_line(fault, with_type=True)}") from fault
         self._state, inputs = given.state, given.dist_inputs

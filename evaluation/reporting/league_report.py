@@ -1,7 +1,7 @@
 """League report: leaderboard, payoff matrix, verdicts with reasons, promotions and upsets as one document.
 
 Everything is read from the registry and the ledger; nothing is changed. Games count if they were played in the league's
-current environment with its current sides. html_page.py renders the report.
+current environment with its current sides and action selection. html_page.py renders the report.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from evaluation.reporting.flipbook import Flipbook, flipbooks
 from evaluation.results import Document, Payoff, RatedVersion, Standing, iso_timestamp
 from evaluation.schedules.builders import scoring
 from evaluation.statistics.population import PopulationShare, shares
+from league.conditions import ActionSelection
 from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent
@@ -53,6 +54,7 @@ class LeagueReport(Document):
     environment_digest: str
     sides: tuple[str, ...]
     scoring: Scoring
+    actions: ActionSelection
     made_at: str
     champion: str | None
     games: int
@@ -85,6 +87,7 @@ def league_report(
         environment_digest=row.environment_digest,
         sides=tuple(row.interface.sides),
         scoring=scoring(row.config, row.interface),
+        actions=row.conditions.actions,
         made_at=iso_timestamp(now or datetime.now(UTC)),
         champion=None if champion is None else f"{league}@{champion}",
         games=played.games,

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.schedules import adaptive_pairing
+from league.conditions import ActionSelection, action_selection
 from league.config.gate import GateConfig
 from league.config.league import LeagueConfig
 from league.errors import ConfigError, EnvironmentMismatch
@@ -154,8 +155,8 @@ def cross_play(
     if len(contestants) < 2:
         raise EnvironmentMismatch(f"cross-play in league {config.league} needs two contestants")
     pairings = list(combinations_with_replacement(range(len(contestants)), 2))
-    length = blocks * len(pairings)
-    return _schedule(config, interface.apart(), "cross_play", contestants, pairings, length, seed, "team")
+    length, actions = blocks * len(pairings), action_selection(config, interface)
+    return _schedule(config, interface.apart(), "cross_play", contestants, pairings, length, seed, "team", actions)
 
 
 def adaptive_round(
@@ -237,9 +238,11 @@ def _schedule(
     length: int,
     seed: int,
     compared: Scoring | None = None,
+    actions: ActionSelection | None = None,
     of: str | None = None,
 ) -> Schedule:
     compared = compared or scoring(config, interface)
+    actions = actions or action_selection(config, interface)
     if not pairings:
         raise EnvironmentMismatch(f"a schedule of league {config.league} needs at least two contestants")
     content: dict[str, Any] = {
@@ -254,6 +257,8 @@ def _schedule(
     }
     if of is not None:
         content |= {"kind": kind, "of": of}
+    if actions != "greedy":  # otherwise the ids of the schedules that were created before there was a choice
+        content["actions"] = actions
     name = digest(content)
     return Schedule(
         id=f"{config.league}-{kind}-{name[:16]}",
@@ -267,4 +272,5 @@ def _schedule(
         length=length,
         opening_plies=config.play.opening_plies,
         scoring=compared,
+        actions=actions,
     )

@@ -65,6 +65,7 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
             "matches": played.blocks,
             "unique_games": played.unique_games,
             "scoring": scoring(row.config, row.interface),
+            "actions": row.conditions.actions,
             "sides": sides,
             "environment": row.config.environment.entry_point,
             "environment_digest": row.environment_digest,

@@ -56,7 +56,7 @@ def play(
     players: Mapping[str, Player],
     *,
     seed: int | None = None,
-    explore: bool = False,
+    explore: bool | None = None,
     probabilities: bool = False,
 ) -> Iterator[Step]:
     """Play one episode. The version of each model is fixed by its first response.
@@ -65,8 +65,8 @@ def play(
         environment: A PettingZoo environment.
         client: Client of the server.
         players: Model or function for every possible agent. Each agent has its own recurrent state.
-        seed: Seed of the environment's reset and, with `explore`, of the actions.
-        explore: Sample actions instead of taking the most likely ones.
+        seed: Seed of the environment's reset and of sampled actions.
+        explore: See `Client.act`.
         probabilities: Include the action probabilities in each step's response.
 
     Yields:
@@ -101,7 +101,7 @@ class _Actors:
         players: Mapping[str, Player],
         agents: list[str],
         seed: int | None,
-        explore: bool,
+        explore: bool | None,
         probabilities: bool,
     ) -> None:
         if missing := [agent for agent in agents if agent not in players]:

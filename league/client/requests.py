@@ -14,7 +14,7 @@ import random
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import orjson
@@ -106,8 +106,8 @@ def _encode_png(image: NDArray) -> str:
 class ActionRequest:
     """The body of a request for one action.
 
-    seed: seed for sampling, None for the most likely action. If none is given for sampling, a random one is chosen
-    here, so that a repeated request has the same result.
+    seed: seed for sampling, None if the request has none. With `explore`, a random one is chosen here if none is given,
+    so that a repeated request has the same result.
     """
 
     body: JsonObject
@@ -119,14 +119,15 @@ class ActionRequest:
         observation: Any,
         encoding: Encoding,
         *,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | None = None,
         probabilities: bool = False,
         state: str | None = None,
     ) -> "ActionRequest":
         """For the arguments see `Client.act`. Raises InvalidInput."""
-        used_seed = _or_random(seed) if explore else None
-        return cls(_body({"observation": encode(observation, encoding)}, used_seed, probabilities, state), used_seed)
+        used_seed = _used_seed(explore, seed)
+        body = {"observation": encode(observation, encoding)}
+        return cls(_body(body, explore, used_seed, probabilities, state), used_seed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,26 +143,34 @@ class BatchActionRequest:
         observations: Any,
         encoding: Encoding,
         *,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
         state: Sequence[str | None] | None = None,
     ) -> "BatchActionRequest":
         """For the arguments see `Client.act_batch`. Raises InvalidInput."""
-        used_seed = (list(seed) if isinstance(seed, Sequence) else _or_random(seed)) if explore else None
+        used_seed = _used_seed(explore, list(seed) if isinstance(seed, Sequence) else seed)
         states = None if state is None else list(state)
         body = {"observations": [encode(row, encoding) for row in split_batch(observations)]}
-        return cls(_body(body, used_seed, probabilities, states), used_seed)
+        return cls(_body(body, explore, used_seed, probabilities, states), used_seed)
 
 
-def _or_random(seed: int | None) -> int:
-    return random.getrandbits(63) if seed is None else seed
+Seed = TypeVar("Seed", int, int | list[int])
 
 
-def _body(body: JsonObject, seed: Any, probabilities: bool, state: Any) -> JsonObject:
+def _used_seed(explore: bool | None, seed: Seed | None) -> Seed | int | None:
+    """The seed of the request: none for greedy actions."""
+    if explore is False:
+        return None
+    return random.getrandbits(63) if explore and seed is None else seed
+
+
+def _body(body: JsonObject, explore: bool | None, seed: Any, probabilities: bool, state: Any) -> JsonObject:
     """Adds the fields that differ from their defaults."""
+    if explore is not None:
+        body["explore"] = explore
     if seed is not None:
-        body |= {"explore": True, "seed": seed}
+        body["seed"] = seed
     if probabilities:
         body["probabilities"] = True
     if state is not None:

@@ -13,6 +13,10 @@ class PlayConfig(Part):
     opening_plies: int = Field(default=0, ge=0)
     """Random legal steps at the start of each game. Without them, greedy policies repeat one game of a deterministic
     environment."""
+    actions: Literal["greedy", "sampled"] | None = None
+    """greedy: versions take the most likely actions. sampled: versions sample actions from their distributions. By
+    default `sampled` if the environment hides information from opponents, else `greedy`; see league/conditions.py.
+    Versions of value-based algorithms have no distribution, and are always greedy."""
     scoring: Literal["game", "side"] | None = None
     """What a contestant's return is compared with. game: the returns of its opponents in the same game. side: the
     return of the other contestant on the same side in the block's other game. By default `game` if there are several

@@ -16,6 +16,7 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
+from league.conditions import hides_information
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
@@ -162,6 +163,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
         agents=agents,
         policies=policies,
         sides={side: tuple(agent for agent in names if side_of[agent] == side) for side in sides},
+        hidden_information=hides_information(env),
     )
 
 

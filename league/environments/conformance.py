@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.test import api_test, parallel_api_test
 
+from league.conditions import describe_selection
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
@@ -117,6 +118,8 @@ class Examination:
     """Size of the global state; None without one."""
     implementation: str = ""
     """How copies of the environment are stepped, and why."""
+    actions: str = ""
+    """How versions select actions, and why."""
     vectorised: Vectorised | None = None
     """Comparison with the vectorised environment, if there is one."""
 
@@ -150,6 +153,7 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int = 2000, seed: in
         return found
     found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
     found.agents = len(interface.agents)
+    found.actions = describe_selection(config, interface)
     for agent, spaces in interface.agents.items():
         if not _is_supported(spaces.action):
             found.add(

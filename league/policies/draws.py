@@ -63,13 +63,22 @@ def invert(logits: NDArray, uniform: NDArray) -> NDArray:
     return (cumulated <= (uniform * cumulated[:, -1])[:, None]).sum(axis=1)
 
 
-def sample(dist_inputs: NDArray, space: Space, rng: Generators | None) -> NDArray:
+def normal(rng: Generators | UniformNumbers | None, rows: int, count: int) -> NDArray:
+    """Return normally distributed numbers, (rows, count) float64. Raises InvalidInput like `draw`."""
+    if isinstance(rng, UniformNumbers):
+        radius, angle = np.split(rng.draw((2 * count,)), 2, axis=1)
+        # Box and Muller (1958). A uniform number may be 0, but not 1.
+        return np.sqrt(-2 * np.log1p(-radius)) * np.cos(2 * np.pi * angle)
+    return np.array([generator.standard_normal(count) for generator in _each(rng, rows)]).reshape(rows, count)
+
+
+def sample(dist_inputs: NDArray, space: Space, rng: Generators | UniformNumbers | None) -> NDArray:
     """Sample a raw action for each row; see `league.policies.actions`.
 
     Args:
         dist_inputs: Inputs of the distributions, (k, d) float32.
         space: The action space.
-        rng: One generator per row.
+        rng: One generator per row, or uniform numbers of all rows.
 
     Returns:
         Raw actions, (k,) or (k, m).
@@ -88,8 +97,7 @@ def sample(dist_inputs: NDArray, space: Space, rng: Generators | None) -> NDArra
             return np.stack([invert(part, uniform[:, i]) for i, part in enumerate(parts)], axis=1)
         case Box():
             means, log_deviations = np.split(dist_inputs, 2, axis=1)
-            noise = np.array([generator.standard_normal(means.shape[1]) for generator in _each(rng, rows)])
-            return (means + np.exp(log_deviations) * noise.reshape(means.shape)).astype(np.float32)
+            return (means + np.exp(log_deviations) * normal(rng, *means.shape)).astype(np.float32)
     raise ConfigError(f"unsupported action space {space!r}")
 
 

@@ -84,7 +84,8 @@ def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Poli
         )
         raise UnknownPolicy(f"{problem}; known: {', '.join(known)}")
     manifest = known[policy]
-    return OnnxPolicy(registry.artifacts.read(version.manifest, manifest.file), manifest)
+    graph = registry.artifacts.read(version.manifest, manifest.file)
+    return OnnxPolicy(graph, manifest, version.manifest.has_distribution(policy))
 
 
 def pinned(ref: str, league: str, registry: Registry) -> str:

@@ -1,6 +1,5 @@
 """Runs the ONNX graph of a policy with ONNX Runtime on one thread."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError, one_line
 from league.policies.actions import dist_inputs_size, to_environment
-from league.policies.draws import sample
+from league.policies.draws import Generators, UniformNumbers, sample
 from league.policies.policy import Actions, Arrays
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import Discrete, Space
@@ -33,16 +32,21 @@ class OnnxPolicy:
     Args:
         graph: Path or content of the ONNX file, which must contain its weights.
         manifest: Expected inputs, outputs and action space. Without it, the graph is not checked against them.
+        has_distribution: Whether actions can be sampled; see `Manifest.has_distribution`. Otherwise they are greedy,
+            also with `explore`.
 
     Raises:
         ArtifactCorrupt: The file is not an ONNX graph, or it does not match the manifest.
     """
 
-    def __init__(self, graph: Path | str | bytes, manifest: PolicyManifest | None = None) -> None:
+    def __init__(
+        self, graph: Path | str | bytes, manifest: PolicyManifest | None = None, has_distribution: bool = True
+    ) -> None:
         self._session = _session(graph if isinstance(graph, bytes) else Path(graph).read_bytes())
         self._inputs = {node.name: node for node in self._session.get_inputs()}
         self._outputs = {node.name: node for node in self._session.get_outputs()}
         _check_graph(self._inputs, self._outputs, manifest)
+        self.has_distribution = has_distribution
         self._action = manifest.action if manifest else _discrete(self._outputs)
         self._observed = tuple(name for name in self._inputs if not name.startswith(STATE_IN))
         self._recurrent = tuple(name for name in self._inputs if name.startswith(STATE_IN))
@@ -56,7 +60,7 @@ class OnnxPolicy:
         *,
         state: Arrays | None = None,
         explore: bool = False,
-        rng: Sequence[np.random.Generator] | None = None,
+        rng: Generators | UniformNumbers | None = None,
     ) -> Actions:
         """Choose actions for a batch; see `Policy.act`. `dist_inputs` are returned only with `explore`.
 
@@ -70,6 +74,8 @@ class OnnxPolicy:
             ObservationError: An array is missing or its shape or dtype does not fit the graph.
             EnvironmentMismatch: `explore` without a manifest, for an action space that the graph does not determine.
         """
+        if explore and not self.has_distribution:
+            return self.distribution(observations, state=state)
         if explore and self._action is None:
             raise EnvironmentMismatch("this policy cannot explore without a manifest, which defines its action space")
         outputs = self._run(observations, state, self._exploring if explore else self._greedy)

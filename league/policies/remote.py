@@ -49,6 +49,7 @@ class RemotePolicy:
             RemoteError: The server is unreachable or failed.
         """
         rows = len(next(iter(observations.values())))
+        # Explicit in both cases, because the default of the server depends on the league.
         request = BatchActionRequest.build(
             [_observation(observations, row) for row in range(rows)],
             self._client.encoding,

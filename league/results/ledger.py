@@ -9,6 +9,7 @@ from typing import Any, TypeVarTuple
 from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
+from league.conditions import Conditions
 from league.errors import InvalidInput, NotFound, UnknownMatch
 from league.registry import leagues
 from league.registry.registry import Registry
@@ -176,8 +177,8 @@ class Ledger:
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
-    def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
-        """Return the matches of a league without moves, in schedule order; of one environment if given.
+    def results(self, league: str, conditions: Conditions | None = None) -> list[BlockResult]:
+        """Return the matches of a league without moves, in schedule order; those played under `conditions` if given.
 
         Excludes purged schedules, and cross-play in one team, which does not show who is stronger.
         """
@@ -187,7 +188,7 @@ class Ledger:
             schedules = {
                 known.id: known
                 for known in _schedules(session, league)
-                if environment_digest in (None, known.environment_digest) and known.scoring != "team"
+                if conditions in (None, known.conditions) and known.scoring != "team"
             }
             found = session.execute(_in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None)))
             return [

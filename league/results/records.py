@@ -11,6 +11,8 @@ from datetime import datetime
 from functools import lru_cache
 from typing import Any, Literal
 
+from league.conditions import ActionSelection, Conditions
+
 Action = Any
 """An action as JSON: an integer, or a nested list of numbers. A float32 is stored as the double of equal value."""
 
@@ -50,6 +52,13 @@ class Schedule:
     opening_plies: int
     """Random environment steps at the start of each game."""
     scoring: Scoring = "game"
+    actions: ActionSelection = "greedy"
+    """How versions select actions."""
+
+    @property
+    def conditions(self) -> Conditions:
+        """Those under which the matches are played."""
+        return Conditions(self.environment_digest, self.actions)
 
     def contestants_at(self, position: int) -> tuple[str, ...]:
         """Return the contestants of match `position`."""

@@ -35,7 +35,8 @@ class DecodedActionRequest:
     arrays."""
     tokens: list[StateToken | None] | None
     """Recurrent state as tokens, one per observation; None at the start of an episode."""
-    explore: bool
+    explore: bool | None
+    """Whether to sample the actions; None for the league's default."""
     seed: int | list[int] | None
     probabilities: bool
     strings: int
@@ -51,7 +52,8 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
     observations = document["observations"] if is_batch else [document["observation"]]
     if is_batch:
         _check_batch(observations, max_batch)
-    explore, probabilities = parse_flag(document, "explore"), parse_flag(document, "probabilities")
+    explore = parse_flag(document, "explore") if "explore" in document else None
+    probabilities = parse_flag(document, "probabilities")
     seed = document.get("seed")
     _check_seed(seed, len(observations) if is_batch else None)
     arrays, tokens, strings = None, None, len(document)
@@ -173,6 +175,11 @@ def encode_state(answer: Actions, version: LoadedVersion, policy: LoadedPolicy) 
     return write_tokens(version.model(policy), version.number, version.sha256, answer.state)
 
 
+def is_sampled(explore: bool | None, policy: LoadedPolicy) -> bool:
+    """Whether the actions of a request are sampled. explore: None if the request does not say."""
+    return policy.samples if explore is None else explore
+
+
 async def execute(
     policy: LoadedPolicy,
     observations: Arrays,
@@ -195,7 +202,7 @@ async def execute_request(
     request: DecodedActionRequest, policy: LoadedPolicy, observations: Arrays, state: Arrays | None
 ) -> Actions:
     """Run the graph with the request's seed."""
-    rng = generators(request.seed, len(request.observations)) if request.explore else None
+    rng = generators(request.seed, len(request.observations)) if is_sampled(request.explore, policy) else None
     return await execute(policy, observations, state, rng, request.probabilities)
 
 

@@ -25,15 +25,16 @@ from serve_app.models.version_cache import LoadedPolicy
 FRAMING = 1
 REQUEST = struct.Struct("<BBHIQ")
 RESPONSE = struct.Struct("<BBHIII")
-EXPLORE, HAS_SEED, RESET, HAS_RESETS = 1, 2, 4, 8
-FLAGS = EXPLORE | HAS_SEED | RESET | HAS_RESETS
+EXPLORE, HAS_SEED, RESET, HAS_RESETS, GREEDY = 1, 2, 4, 8, 16
+FLAGS = EXPLORE | HAS_SEED | RESET | HAS_RESETS | GREEDY
 
 
 class BinaryRequest(NamedTuple):
     """A request with a parsed header."""
 
     rows: int
-    explore: bool
+    explore: bool | None
+    """Whether to sample the actions; None for the league's default."""
     seed: int | None
     reset: bool
     resets: NDArray | None
@@ -94,6 +95,9 @@ def parse_request(message: bytes, max_batch: int) -> BinaryRequest:
     if not 1 <= rows <= max_batch:
         refusal = BodyTooLarge if rows else InvalidInput
         raise refusal(f"the message has {rows} rows, expected 1 to {max_batch}")
+    if flags & EXPLORE and flags & GREEDY:
+        raise InvalidInput(f"the flags are {flags}, expected {EXPLORE} (explore) or {GREEDY} (greedy), not both")
+    explore = True if flags & EXPLORE else False if flags & GREEDY else None
     has_seed = bool(flags & HAS_SEED)
     if seed >= 2**63 or (seed and not has_seed):
         raise InvalidInput("seed must be less than 2^63, and 0 if there is none")
@@ -102,7 +106,7 @@ def parse_request(message: bytes, max_batch: int) -> BinaryRequest:
         begin += rows
         resets = _resets(message[REQUEST.size : begin], rows)
     tensors = memoryview(message)[begin:]
-    return BinaryRequest(rows, bool(flags & EXPLORE), seed if has_seed else None, bool(flags & RESET), resets, tensors)
+    return BinaryRequest(rows, explore, seed if has_seed else None, bool(flags & RESET), resets, tensors)
 
 
 def _resets(data: bytes, rows: int) -> NDArray:
@@ -130,9 +134,9 @@ def _little(dtype: str) -> np.dtype:
 
 
 def encode_request(
-    tensors: Iterable[NDArray], rows: int, seed: int | None = None, explore: bool = False, reset: bool = False
+    tensors: Iterable[NDArray], rows: int, seed: int | None = None, explore: bool | None = None, reset: bool = False
 ) -> bytes:
     """Encode a message as a client does."""
-    flags = explore * EXPLORE | (seed is not None) * HAS_SEED | reset * RESET
+    flags = (0 if explore is None else EXPLORE if explore else GREEDY) | (seed is not None) * HAS_SEED | reset * RESET
     head = REQUEST.pack(FRAMING, flags, 0, rows, seed or 0)
     return head + b"".join(tensor.tobytes() for tensor in tensors)

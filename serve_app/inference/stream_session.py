@@ -33,6 +33,7 @@ from serve_app.inference.action_request import (
     execute_request,
     generators,
     is_plain,
+    is_sampled,
     parse_action_request,
     parse_flag,
     pinned_version,
@@ -160,7 +161,8 @@ class StreamSession:
         plain = is_plain(request, served.policy, data.count(b'"') - 2 * len(own))
         observations = await read_observations(request, served.policy, plain, len(data))
         answer = await execute_request(request, served.policy, observations, state)
-        self._mirror(served, observations, state, None if request.explore else answer.actions)
+        greedy = None if is_sampled(request.explore, served.policy) else answer.actions
+        self._mirror(served, observations, state, greedy)
         self._store_state(served, answer, request.is_batch)
         response = build_response(request, answer, observations, served.policy) | served.signature
         if return_state and self._state is not None:
@@ -174,9 +176,9 @@ class StreamSession:
         request = parse_request(data, self._dependencies.settings.max_batch)
         served, state = self._continue(request.rows, request.reset, request.resets)
         observations = served.codec.read(request)
-        rng = generators(request.seed, request.rows) if request.explore else None
+        rng = generators(request.seed, request.rows) if is_sampled(request.explore, served.policy) else None
         answer = await execute(served.policy, observations, state, rng)
-        self._mirror(served, observations, state, None if request.explore else answer.actions)
+        self._mirror(served, observations, state, answer.actions if rng is None else None)
         self._store_state(served, answer, is_batch=request.rows > 1)
         message = StreamMessage(served.codec.write(answer.actions, served.version.number), False)
         self._count(served, request.rows, begun)

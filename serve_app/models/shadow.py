@@ -24,6 +24,7 @@ from league.histograms import Histogram
 from league.policies.policy import Arrays
 from league.policies.probes import same
 from league.registry.storage.rows import ShadowCounts
+from league.seeds import generators
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.resolver import policy_ref
 from serve_app.models.traffic_split import TrafficSplit
@@ -41,8 +42,8 @@ MAX_ROWS = 256
 """Maximum observations per batch, unless one request has more."""
 
 MirrorFunction = Callable[[Arrays, Arrays | None, NDArray | None], None]
-"""Takes the observations of a request, its recurrent state, and the champion's greedy actions, or None if the champion
-explored."""
+"""Takes the observations of a request, its recurrent state, and the champion's greedy actions, or None if they were
+sampled."""
 
 
 class MirroredRequest(NamedTuple):
@@ -213,10 +214,11 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
     try:
         candidate = requests[0].candidate.policy(requests[0].policy)
         observations = _concatenate([request.observations for request in requests])
+        seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
         begun = thread_time_ns()
-        actions = candidate.policy.act(observations).actions
+        actions = _act(candidate, observations, seeds)
         taken = thread_time_ns() - begun
-        expected = _champion_actions(requests, requests[0].champion.policy(requests[0].policy), observations)
+        expected = _champion_actions(requests, requests[0].champion.policy(requests[0].policy), observations, seeds)
         outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
     except Exception as error:  # any failure is counted against the candidate
         outcome.failed, outcome.fault = len(requests), one_line(error, with_type=True)
@@ -226,11 +228,20 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
     return outcome
 
 
-def _champion_actions(requests: Sequence[MirroredRequest], champion: LoadedPolicy, observations: Arrays) -> NDArray:
-    """The champion's greedy actions, recomputed if it explored."""
+def _act(policy: LoadedPolicy, observations: Arrays, seeds: NDArray[np.int64]) -> NDArray:
+    """Actions as by default. With the same seeds, two policies sample equal actions as often as they are alike."""
+    if not policy.samples:
+        return policy.policy.act(observations).actions
+    return policy.policy.act(observations, explore=True, rng=generators(seeds)).actions
+
+
+def _champion_actions(
+    requests: Sequence[MirroredRequest], champion: LoadedPolicy, observations: Arrays, seeds: NDArray[np.int64]
+) -> NDArray:
+    """The champion's actions, recomputed if they were or are to be sampled."""
     known = [request.actions for request in requests if request.actions is not None]
-    if len(known) < len(requests):
-        return champion.policy.act(observations).actions
+    if champion.samples or len(known) < len(requests):
+        return _act(champion, observations, seeds)
     return np.concatenate(known)
 
 

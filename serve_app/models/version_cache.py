@@ -35,6 +35,8 @@ class LoadedPolicy:
     limits: RequestLimits
     inline_rows: int
     """The largest batch that is fast enough to run on the event loop."""
+    samples: bool = False
+    """Whether actions are sampled if a request does not say, as in the league's matches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,22 +74,23 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
             f"{version.ref} was retired and its files were removed: start a new episode with another version"
         )
     registry.artifacts.verify_names(league, number, version.sha256)
+    is_sampled = registry.leagues.get(league).conditions.actions == "sampled"
     policies = {}
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.
         graph = registry.artifacts.read(version.manifest, manifest.file)
-        policy = OnnxPolicy(graph, manifest)
+        policy = OnnxPolicy(graph, manifest, version.manifest.has_distribution(name))
         if manifest.probes is not None:
             probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
             probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
         try:
-            policies[name] = _warm_up(policy, manifest, inline)
+            policies[name] = _warm_up(policy, manifest, inline, is_sampled)
         except InvalidInput as error:
             raise ArtifactCorrupt(f"policy {name} of {version.ref} does not run: {error}") from error
     return LoadedVersion(league, number, version.sha256, policies)
 
 
-def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float) -> LoadedPolicy:
+def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float, is_sampled: bool) -> LoadedPolicy:
     """Run the graph to allocate its memory, and measure how many rows fit into `inline` seconds."""
     reader = ObservationReader(manifest.observation)
     one, many = (_measure(policy, reader, rows) for rows in (1, WARM_BATCH))
@@ -98,7 +101,7 @@ def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float) -> Loa
         for tensor in manifest.state
     )
     limits = RequestLimits.of([leaf for *_, leaf in reader.leaves] + [leaf for _, leaf in state])
-    return LoadedPolicy(policy, manifest, reader, state, limits, rows)
+    return LoadedPolicy(policy, manifest, reader, state, limits, rows, is_sampled and policy.has_distribution)
 
 
 def _measure(policy: Policy, reader: ObservationReader, rows: int) -> float:

@@ -33,6 +33,7 @@ from serve_app.inference.action_request import (
     encode_state,
     execute_request,
     is_plain,
+    is_sampled,
     parse_action_request,
     pinned_version,
     read_observations,
@@ -139,7 +140,7 @@ async def _response(
     state = decode_state(request, version, policy, not plain)
     output = await execute_request(request, policy, observations, state)
     if mirror is not None:
-        mirror(observations, state, None if request.explore else output.actions)
+        mirror(observations, state, None if is_sampled(request.explore, policy) else output.actions)
     response = build_response(request, output, observations, policy)
     if output.state is not None:
         if request.state is not None:

@@ -128,6 +128,7 @@ def _league(registry: Registry, league: str) -> dict[str, Any]:
     return {
         "league": league,
         "environment": row.config.environment.entry_point,
+        "actions": row.conditions.actions,
         "champion": aliases.get(CHAMPION),
         "aliases": aliases,
         "policies": {policy: interface.of_policy(policy).model_dump(mode="json") for policy in interface.policy_ids},

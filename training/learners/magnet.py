@@ -17,6 +17,7 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
 from torch import Tensor
 
+from league.conditions import VALUE_BASED
 from league.config.ppo import PREVIOUS, UNIFORM, MagnetConfig
 from league.errors import ConfigError
 from league.interface import Interface
@@ -28,7 +29,6 @@ from league.settings import Storage
 from league.spaces import Box
 from training.learners.train_batch import TrainBatch
 from training.modules.policy_module import MASKED_LOGIT
-from training.sampling.opponents import VALUE_BASED_ALGORITHMS
 
 ROWS = 8192
 """Rows per forward pass of a reference policy."""
@@ -130,7 +130,7 @@ def check_magnet(settings: MagnetConfig, interface: Interface) -> None:
 
 def _graphs(ref: str, registry: Registry, interface: Interface) -> dict[str, OnnxPolicy]:
     algorithm = registry.versions.resolve(CheckpointRef.parse(ref)).manifest.algorithm
-    if algorithm in VALUE_BASED_ALGORITHMS:
+    if algorithm in VALUE_BASED:
         raise ConfigError(
             f"training.magnet.ref: {ref} was trained by {algorithm}, whose graphs output action values: expected a"
             " version with an action distribution"

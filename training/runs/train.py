@@ -8,6 +8,7 @@ from pydantic import TypeAdapter
 from ray import tune
 from rich.console import Console
 
+from league.conditions import describe_selection
 from league.config.algorithms import AnyTraining, TrainingConfig
 from league.config.league import LeagueConfig
 from league.environments.building import interface as interface_of
@@ -95,6 +96,7 @@ def train(
         with run.locked(), progress, RunReporter(registry, run) as reporter:
             progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
             progress.say(_parallel_environments(config, interface))
+            progress.say(describe_selection(config, interface))
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
             _train_and_publish(run, registry, interface, progress, reporter)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from league.conditions import VALUE_BASED
 from league.config.training import OpponentConfig
 from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError, GameCrashed, one_line
@@ -116,10 +117,6 @@ class Openings:
         return ended, self._waiting[ended]
 
 
-VALUE_BASED_ALGORITHMS = ("dqn", "qmix")
-"""Algorithms whose graphs output action values instead of a distribution: they play greedily."""
-
-
 class Opponents:
     """The loaded policies of all opponents, with their recurrent states."""
 
@@ -167,7 +164,7 @@ def _is_greedy(ref: str, storage: Storage | None) -> bool:
     if isinstance(parsed, ScriptRef) or storage is None:
         return False
     with closing(Registry.open(storage)) as registry:
-        return registry.versions.resolve(parsed).manifest.algorithm in VALUE_BASED_ALGORITHMS
+        return registry.versions.resolve(parsed).manifest.algorithm in VALUE_BASED
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:

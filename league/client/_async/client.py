@@ -65,7 +65,7 @@ class AsyncClient:
         model: str,
         observation: Any,
         *,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | None = None,
         probabilities: bool = False,
         state: str | None = None,
@@ -76,8 +76,9 @@ class AsyncClient:
             model: `LEAGUE[.POLICY][@VERSION]`: `connect_four`, `connect_four@3`, `duo.left@champion`.
             observation: An observation as the environment returns it: an array, a number, nested lists, or a dict of
                 these (for example with the keys `observation` and `action_mask`).
-            explore: Sample the action from the policy's distribution instead of taking the most likely one.
-            seed: Seed for sampling. Without it a random seed is used, which the response contains.
+            explore: Sample the action from the policy's distribution (True), or take the most likely one (False). By
+                default, actions are selected as in the league's matches.
+            seed: Seed for sampling. Without it, `explore` uses a random one, which the response contains.
             probabilities: Include the action probabilities in the response.
             state: Recurrent state of the previous response; None starts an episode. `episode` tracks it for you.
 
@@ -94,7 +95,7 @@ class AsyncClient:
         model: str,
         observations: Any,
         *,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
         state: Sequence[str | None] | None = None,
@@ -117,7 +118,7 @@ class AsyncClient:
         )
         return await self.send(calls.act_batch(parse_model(model), request))
 
-    def episode(self, model: str, *, explore: bool = False, seed: int | None = None) -> AsyncEpisode:
+    def episode(self, model: str, *, explore: bool | None = None, seed: int | None = None) -> AsyncEpisode:
         """Start an episode, whose actions all come from one version; see `AsyncEpisode`."""
         return AsyncEpisode(self, parse_model(model), explore=explore, seed=seed)
 

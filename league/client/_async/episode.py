@@ -31,11 +31,11 @@ class AsyncEpisode:
     Args:
         client: Sends the requests.
         model: The policy, with or without a version.
-        explore: Sample actions instead of taking the most likely ones.
+        explore: See `AsyncClient.act`.
         seed: Seed of the episode. The seed of step t is derived from it and t.
     """
 
-    def __init__(self, client: AsyncSender, model: Model, *, explore: bool, seed: int | None) -> None:
+    def __init__(self, client: AsyncSender, model: Model, *, explore: bool | None, seed: int | None) -> None:
         self._client = client
         self._model = model
         self._explore = explore

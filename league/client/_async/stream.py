@@ -58,7 +58,7 @@ class AsyncStream:
         observation: Any,
         *,
         reset: bool = False,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | None = None,
         probabilities: bool = False,
     ) -> Any:
@@ -90,7 +90,7 @@ class AsyncStream:
         observations: Any,
         *,
         reset: bool | Sequence[bool] = False,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
     ) -> list[Any]:

@@ -32,11 +32,11 @@ class Episode:
     Args:
         client: Sends the requests.
         model: The policy, with or without a version.
-        explore: Sample actions instead of taking the most likely ones.
+        explore: See `Client.act`.
         seed: Seed of the episode. The seed of step t is derived from it and t.
     """
 
-    def __init__(self, client: Sender, model: Model, *, explore: bool, seed: int | None) -> None:
+    def __init__(self, client: Sender, model: Model, *, explore: bool | None, seed: int | None) -> None:
         self._client = client
         self._model = model
         self._explore = explore

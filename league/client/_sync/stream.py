@@ -59,7 +59,7 @@ class Stream:
         observation: Any,
         *,
         reset: bool = False,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | None = None,
         probabilities: bool = False,
     ) -> Any:
@@ -91,7 +91,7 @@ class Stream:
         observations: Any,
         *,
         reset: bool | Sequence[bool] = False,
-        explore: bool = False,
+        explore: bool | None = None,
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
     ) -> list[Any]:

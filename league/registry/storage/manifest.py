@@ -4,10 +4,11 @@ from typing import Any, Self
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
 from league.errors import ArtifactCorrupt
 from league.interface import Interface
-from league.spaces import Space
+from league.spaces import Box, Space
 
 MANIFEST = "manifest.json"
 TRAINING = "training"
@@ -82,6 +83,16 @@ class Manifest(_Record):
     def agents(self) -> dict[str, str]:
         """agent → policy id"""
         return self.interface.policies
+
+    def has_distribution(self, policy: str) -> bool:
+        """Return whether actions of a policy can be sampled.
+
+        The graphs of value-based algorithms have action values in place of logits, and in MADDPG the deviation of a Box
+        action is the noise of exploration.
+        """
+        if self.algorithm == "maddpg":
+            return not isinstance(self.policies[policy].action, Box)
+        return self.algorithm not in VALUE_BASED
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> Self:

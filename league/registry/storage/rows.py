@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
+from league.conditions import Conditions, action_selection
 from league.histograms import Histogram
 from league.interface import Interface
 from league.registry.storage.manifest import Manifest
@@ -32,6 +33,11 @@ class LeagueRow:
     interface_digest: str
     environment_digest: str
     registered_at: datetime
+
+    @property
+    def conditions(self) -> Conditions:
+        """Those of the games that count."""
+        return Conditions(self.environment_digest, action_selection(self.config, self.interface))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +177,7 @@ class ShadowCounts:
     observations: int
     """Observations in those requests."""
     agreed: int
-    """Observations with the same greedy action."""
+    """Observations with the same action; if actions are sampled, with the same random numbers."""
     failed: int
     """Requests that failed on the candidate."""
     dropped: int

@@ -68,6 +68,7 @@ def test_snapshots_equal_the_report(registry: Registry, report: LeagueReport) ->
         "matches": report.games // 2,
         "unique_games": report.unique_games,
         "scoring": "game",
+        "actions": "greedy",
         "sides": ["player_1", "player_2"],
         "environment": "pettingzoo.classic.tictactoe_v3",
         "environment_digest": report.environment_digest,

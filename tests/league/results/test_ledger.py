@@ -94,9 +94,9 @@ def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
         BlockResult(SCHEDULE.id, 1, ("tictactoe@1", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
         BlockResult(SCHEDULE.id, 2, ("tictactoe@2", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
     ]
-    assert ledger.results(LEAGUE, SCHEDULE.environment_digest) == mine
+    assert ledger.results(LEAGUE, SCHEDULE.conditions) == mine
     assert [result.schedule for result in ledger.results(LEAGUE)] == [other.id] * 2 + [SCHEDULE.id] * 2
-    assert ledger.results(LEAGUE, "1" * 64) == []
+    assert ledger.results(LEAGUE, SCHEDULE.conditions._replace(actions="sampled")) == []
     with pytest.raises(UnknownLeague):
         ledger.results("chess")
 

@@ -19,7 +19,7 @@ def test_one_observation_is_a_batch_of_one() -> None:
     assert (request.observations, request.is_batch, request.explore, request.seed, request.probabilities) == (
         [[1, 2]],
         False,
-        False,
+        None,
         None,
         False,
     )

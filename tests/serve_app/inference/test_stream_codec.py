@@ -52,7 +52,7 @@ def request_data(draw: st.DrawFn) -> dict[str, Any]:
     return {
         "rows": rows,
         "seed": draw(st.none() | st.integers(0, 2**63 - 1)),
-        "explore": draw(st.booleans()),
+        "explore": draw(st.none() | st.booleans()),
         "reset": draw(st.booleans()),
         "tensors": [draw(leaves(dtype, rows)) for dtype in DTYPES],
     }

@@ -8,6 +8,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
 from league.interface import AgentInterface, Interface
 from league.policies.probes import Probes
@@ -81,15 +82,24 @@ def interface(policies: dict[str, AgentInterface]) -> Interface:
     )
 
 
-def register(registry: Registry, league: str, policies: dict[str, AgentInterface]) -> None:
-    registry.leagues.register(_config(league), interface(policies))
+def register(
+    registry: Registry, league: str, policies: dict[str, AgentInterface], actions: ActionSelection | None = None
+) -> None:
+    registry.leagues.register(_config(league, actions), interface(policies))
 
 
 def publish(
-    registry: Registry, league: str, graphs: dict[str, bytes], source: str, probes: dict[str, Probes] | None = None
+    registry: Registry,
+    league: str,
+    graphs: dict[str, bytes],
+    source: str,
+    probes: dict[str, Probes] | None = None,
+    algorithm: str = "ppo",
 ) -> VersionRow:
     """Publish a version of a registered league with these graphs, by policy, and optionally their probes."""
-    return registry.publisher.publish(league, _builder(registry, league, graphs, probes or {}), source=source)
+    return registry.publisher.publish(
+        league, _builder(registry, league, graphs, probes or {}, algorithm), source=source
+    )
 
 
 def promote(registry: Registry, league: str, version: int) -> None:
@@ -124,12 +134,13 @@ def build_everything(storage: Storage) -> Registry:
     return registry
 
 
-def _config(league: str) -> LeagueConfig:
-    return LeagueConfig.from_mapping({"league": league, "environment": {"entry_point": "games.none:none"}})
+def _config(league: str, actions: ActionSelection | None = None) -> LeagueConfig:
+    environment, play = {"entry_point": "games.none:none"}, {"actions": actions}
+    return LeagueConfig.from_mapping({"league": league, "environment": environment, "play": play})
 
 
 def _builder(
-    registry: Registry, league: str, graphs: dict[str, bytes], probes: dict[str, Probes]
+    registry: Registry, league: str, graphs: dict[str, bytes], probes: dict[str, Probes], algorithm: str
 ) -> Callable[[Path, int], Manifest]:
     row = registry.leagues.get(league)
 
@@ -151,7 +162,7 @@ def _builder(
             },
             environment=row.config.environment,
             environment_digest=row.environment_digest,
-            algorithm="ppo",
+            algorithm=algorithm,
             settings={},
             seed=0,
             steps=number,

@@ -1,0 +1,78 @@
+"""The conditions under which the games of a league are played: its environment, and how versions select actions.
+
+A version with greedy actions takes the most likely ones, which its opponents can predict. From them they can infer what
+they do not see. A version with sampled actions draws them from its distribution. In zero-sum games with hidden
+information or simultaneous moves, usually only such mixed strategies are optimal.
+"""
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from league.config.league import LeagueConfig
+    from league.interface import Interface
+
+ActionSelection = Literal["greedy", "sampled"]
+"""Versions take the mode of their action distributions, or samples from them. Scripts do not depend on it."""
+
+HIDDEN_INFORMATION = frozenset(
+    (
+        "gin_rummy_v4",
+        "hanabi_v5",
+        "leduc_holdem_v4",
+        "rps_v2",
+        "texas_holdem_v4",
+        "texas_holdem_no_limit_v6",
+    )
+)
+"""Names (`metadata["name"]`) of PettingZoo's environments in which observations hide cards or the opponent's move."""
+
+VALUE_BASED = frozenset(("dqn", "qmix"))
+"""Algorithms that learn action values. Their versions have no action distribution, and are always greedy."""
+
+
+class Conditions(NamedTuple):
+    """Results of games under different conditions are never combined."""
+
+    environment_digest: str
+    actions: ActionSelection
+
+
+def action_selection(config: "LeagueConfig", interface: "Interface") -> ActionSelection:
+    """Return `play.actions`, by default `sampled` if the environment hides information from opponents.
+
+    A single side has no opponents.
+    """
+    if config.play.actions is not None:
+        return config.play.actions
+    return "sampled" if interface.hidden_information and len(interface.sides) > 1 else "greedy"
+
+
+def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
+    """Return a sentence for people: how versions select actions, and why."""
+    chosen, algorithm = action_selection(config, interface), config.training.algorithm
+    if chosen == "sampled" and algorithm in VALUE_BASED:
+        return f"Versions play with greedy actions: those of {algorithm} have no action distribution."
+    if config.play.actions is not None:
+        return f"Versions play with {chosen} actions, as play.actions says."
+    if len(interface.sides) == 1:
+        reason = "there is only one side"
+    elif interface.hidden_information:
+        reason = "the environment hides information from opponents"
+    else:
+        reason = "the environment is not known to hide information"
+    return f"Versions play with {chosen} actions: {reason} (play.actions)."
+
+
+def hides_information(env: Any) -> bool:
+    """Return whether observations hide parts of the state, or opponents move simultaneously without seeing the move.
+
+    Environments declare it by `metadata["hidden_information"]`, a boolean. Without it, the environments of
+    HIDDEN_INFORMATION are recognised by their names, and games of OpenSpiel by their types.
+    """
+    metadata = getattr(env, "metadata", None) or {}
+    if "hidden_information" in metadata:
+        return bool(metadata["hidden_information"])
+    game = getattr(getattr(env, "unwrapped", env), "game_type", None)  # of Shimmy's adapter, a pyspiel.GameType
+    if game is not None and hasattr(game, "information"):
+        return game.information.name != "PERFECT_INFORMATION" or game.dynamics.name == "SIMULTANEOUS"
+    return metadata.get("name") in HIDDEN_INFORMATION
