@@ -149,13 +149,14 @@ class BatchActionRequest:
         state: Sequence[str | None] | None = None,
     ) -> "BatchActionRequest":
         """For the arguments see `Client.act_batch`. Raises InvalidInput."""
-        used_seed = _used_seed(explore, list(seed) if isinstance(seed, Sequence) else seed)
+        given: int | list[int] | None = list(seed) if isinstance(seed, Sequence) else seed
+        used_seed = _used_seed(explore, given)
         states = None if state is None else list(state)
         body = {"observations": [encode(row, encoding) for row in split_batch(observations)]}
         return cls(_body(body, explore, used_seed, probabilities, states), used_seed)
 
 
-Seed = TypeVar("Seed", int, int | list[int])
+Seed = TypeVar("Seed", bound=int | list[int])
 
 
 def _used_seed(explore: bool | None, seed: Seed | None) -> Seed | int | None:
