@@ -14,7 +14,7 @@ import random
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import orjson
@@ -149,16 +149,17 @@ class BatchActionRequest:
         state: Sequence[str | None] | None = None,
     ) -> "BatchActionRequest":
         """For the arguments see `Client.act_batch`. Raises InvalidInput."""
-        used_seed = _used_seed(explore, list(seed) if isinstance(seed, Sequence) else seed)
+        used_seed: int | list[int] | None = None
+        if isinstance(seed, Sequence):
+            used_seed = None if explore is False else list(seed)
+        else:
+            used_seed = _used_seed(explore, seed)
         states = None if state is None else list(state)
         body = {"observations": [encode(row, encoding) for row in split_batch(observations)]}
         return cls(_body(body, explore, used_seed, probabilities, states), used_seed)
 
 
-Seed = TypeVar("Seed", int, int | list[int])
-
-
-def _used_seed(explore: bool | None, seed: Seed | None) -> Seed | int | None:
+def _used_seed(explore: bool | None, seed: int | None) -> int | None:
     """The seed of the request: none for greedy actions."""
     if explore is False:
         return None

@@ -86,7 +86,7 @@ class Manifest(_Record):
 
     @property
     def has_distribution(self) -> bool:
-        """Whether actions can be sampled. The graphs of value-based algorithms have action values in place of logits."""
+        """Whether actions can be sampled. Graphs of value-based algorithms have action values in place of logits."""
         return self.algorithm not in VALUE_BASED
 
     @model_validator(mode="after")
