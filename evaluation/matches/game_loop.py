@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.game_state import ActionNumbers, AgentGenerators, AgentStates
+from evaluation.matches.game_state import ActionNumbers, AgentGenerators, AgentStates, action_keys
 from evaluation.matches.match_recorder import MatchRecorder
 from evaluation.matches.openings import OpeningMoves
 from evaluation.matches.policy_calls import PolicyFault, Randomness, call_policy
@@ -204,11 +205,17 @@ class _GameLoop:
             self._log_forfeit(ref, fault)
         return answer.actions
 
+    @cached_property
+    def _keys(self) -> NDArray[np.uint64]:
+        return action_keys(self._plans.seeds, self._plans.indices, len(self._agents))
+
     def _randomness(self, group: int, batch: Batch, games: Indices) -> Randomness:
-        seated, seeds, indices = self._seating.policies[group], self._plans.seeds[games], self._plans.indices[games]
+        seated = self._seating.policies[group]
         if seated.is_script:
-            return self._generators.get(batch, seeds, indices)
-        return ActionNumbers(seeds, indices, batch.agents, self._steps[batch.envs]) if seated.samples else None
+            return self._generators.get(batch, self._plans.seeds[games], self._plans.indices[games])
+        if seated.samples:
+            return ActionNumbers(self._keys[games, batch.agents], self._steps[batch.envs])
+        return None
 
     def _log_forfeit(self, ref: str, fault: PolicyFault) -> None:
         """Log the details of a forfeit once. The record contains only the reason."""

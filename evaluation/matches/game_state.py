@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from league.environments.stepping import Batch, Indices
 from league.policies.draws import UniformNumbers
-from league.random import pcg64
+from league.random import pcg64, splitmix64
+from league.random.seed_sequence import generate_state
 from league.seeds import generators, spawn_key
 
 State = dict[str, NDArray]
@@ -41,33 +42,37 @@ class AgentGenerators:
 
 @dataclass(frozen=True, slots=True)
 class ActionNumbers(UniformNumbers):
-    """The random numbers with which versions sample the actions of k rows.
+    """The random numbers with which versions sample the actions of k rows, a function of game, agent and step.
 
-    They are those of `generator(seed, "action", index, agent, step)`, a function of the game, the agent and the step.
     Nothing is kept between steps, and one game's numbers do not depend on the others in its batch.
 
     Attributes:
-        seeds: Seeds of the games, (k,).
-        indices: Numbers of the games in their blocks, (k,).
-        agents: Agents that act, (k,).
+        keys: Seeds of the agents' generators in their games, (k,); see `action_keys`.
         steps: Steps of the games, from 0, (k,).
     """
 
-    seeds: Indices
-    indices: Indices
-    agents: Indices
+    keys: NDArray[np.uint64]
     steps: Indices
 
     def draw(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return the first numbers of each row, (k, *shape). Repeated calls return the same ones."""
-        key = spawn_key("action", self.indices, self.agents, self.steps)
-        outputs = pcg64.outputs(self.seeds, int(np.prod(shape, dtype=int)), key)
-        return pcg64.uniform(outputs, 0.0, 1.0).T.reshape(-1, *shape)
+        """Return the numbers of this step, (k, *shape). Repeated calls return the same ones."""
+        count = int(np.prod(shape, dtype=int))
+        numbers = self.steps[:, np.newaxis] * count + np.arange(count)
+        outputs = splitmix64.outputs(self.keys[:, np.newaxis], numbers)
+        return pcg64.uniform(outputs, 0.0, 1.0).reshape(-1, *shape)
 
     def row(self, row: int) -> ActionNumbers:
         """Return the numbers of one row."""
-        one = slice(row, row + 1)
-        return ActionNumbers(self.seeds[one], self.indices[one], self.agents[one], self.steps[one])
+        return ActionNumbers(self.keys[row : row + 1], self.steps[row : row + 1])
+
+
+def action_keys(seeds: Indices, indices: Indices, agents: int) -> NDArray[np.uint64]:
+    """Return the seeds of the generators with which the agents of some games sample their actions, (g, agents).
+
+    seeds, indices: of the games, and their numbers in their blocks, (g,).
+    """
+    each = np.repeat(seeds, agents), np.repeat(indices, agents), np.tile(np.arange(agents), len(seeds))
+    return generate_state(each[0], spawn_key("action", *each[1:]))[0].reshape(len(seeds), agents)
 
 
 class AgentStates:

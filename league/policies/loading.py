@@ -85,7 +85,7 @@ def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Poli
         raise UnknownPolicy(f"{problem}; known: {', '.join(known)}")
     manifest = known[policy]
     graph = registry.artifacts.read(version.manifest, manifest.file)
-    return OnnxPolicy(graph, manifest, version.manifest.has_distribution(policy))
+    return OnnxPolicy(graph, manifest, version.manifest.has_distribution)
 
 
 def pinned(ref: str, league: str, registry: Registry) -> str:

@@ -79,7 +79,7 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.
         graph = registry.artifacts.read(version.manifest, manifest.file)
-        policy = OnnxPolicy(graph, manifest, version.manifest.has_distribution(name))
+        policy = OnnxPolicy(graph, manifest, version.manifest.has_distribution)
         if manifest.probes is not None:
             probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
             probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")

@@ -8,7 +8,7 @@ from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
 from league.errors import ArtifactCorrupt
 from league.interface import Interface
-from league.spaces import Box, Space
+from league.spaces import Space
 
 MANIFEST = "manifest.json"
 TRAINING = "training"
@@ -84,14 +84,9 @@ class Manifest(_Record):
         """agent → policy id"""
         return self.interface.policies
 
-    def has_distribution(self, policy: str) -> bool:
-        """Return whether actions of a policy can be sampled.
-
-        The graphs of value-based algorithms have action values in place of logits, and in MADDPG the deviation of a Box
-        action is the noise of exploration.
-        """
-        if self.algorithm == "maddpg":
-            return not isinstance(self.policies[policy].action, Box)
+    @property
+    def has_distribution(self) -> bool:
+        """Whether actions can be sampled. Graphs of value-based algorithms have action values in place of logits."""
         return self.algorithm not in VALUE_BASED
 
     @model_validator(mode="after")

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binomtest, kstest
 
 from evaluation.matches.game_loop import play_matches
-from evaluation.matches.game_state import ActionNumbers
+from evaluation.matches.game_state import ActionNumbers, action_keys
 from evaluation.playback.replay import replay
 from evaluation.schedules.builders import round_robin
 from league.config.league import LeagueConfig
@@ -19,7 +19,7 @@ from league.policies.draws import probabilities
 from league.policies.onnx import OnnxPolicy
 from league.policies.scripted import script
 from league.results.records import Match, Schedule
-from league.seeds import generator
+from league.seeds import derive
 from league.spaces import Discrete
 from tests.support.environments.kinds import KINDS
 from tests.support.policies.graphs import masked_mlp
@@ -55,12 +55,15 @@ def schedule_of(blocks: int, seed: int = 0) -> Schedule:
     return round_robin(CONFIG, INTERFACE, CONTESTANTS, blocks, seed)
 
 
-def test_numbers_are_those_of_the_derived_generators() -> None:
-    numbers = ActionNumbers(np.array([5, 2**62]), np.array([0, 1]), np.array([1, 0]), np.array([3, 70_000]))
-    expected = [generator(5, "action", 0, 1, 3).random(3), generator(2**62, "action", 1, 0, 70_000).random(3)]
-    np.testing.assert_array_equal(numbers.draw((3,)), expected)
-    np.testing.assert_array_equal(numbers.draw(()), [each[0] for each in expected])
-    np.testing.assert_array_equal(numbers.row(1).draw((3,)), expected[1:])
+def test_numbers_differ_between_games_agents_and_steps_only() -> None:
+    keys = action_keys(np.array([5, 5, 2**62]), np.array([0, 1, 0]), agents=2)
+    assert (keys[0] >> np.uint64(1)).tolist() == [derive(5, "action", 0, agent) for agent in (0, 1)]
+    numbers = ActionNumbers(np.repeat(keys.ravel(), 100), np.tile(np.arange(100), 6))
+    drawn = numbers.draw((3,))
+    assert drawn.shape == (600, 3)
+    assert len(np.unique(drawn)) == 1800
+    assert kstest(drawn.ravel(), "uniform").pvalue > 0.01
+    np.testing.assert_array_equal(numbers.row(7).draw((3,)), drawn[7:8])
 
 
 def test_games_are_equal_in_any_number_of_environments() -> None:

@@ -1,0 +1,27 @@
+"""SplitMix64 has the outputs of its reference implementation."""
+
+import numpy as np
+
+from league.random import splitmix64
+
+SEED = 1234567
+EXPECTED = [
+    6457827717110365317,
+    3203168211198807973,
+    9817491932198370423,
+    4593380528125082431,
+    16408922859458223821,
+]
+"""Of Vigna's splitmix64.c."""
+
+
+def test_outputs_are_those_of_the_reference() -> None:
+    seeds = np.array([[SEED], [0]], np.uint64)
+    found = splitmix64.outputs(seeds, np.arange(5))
+    assert found[0].tolist() == EXPECTED
+    assert found[1, 0] == 0xE220A8397B1DCDAF
+
+
+def test_outputs_do_not_depend_on_the_others() -> None:
+    numbers = np.array([4, 0, 2])
+    assert splitmix64.outputs(np.full(3, SEED, np.uint64), numbers).tolist() == [EXPECTED[i] for i in (4, 0, 2)]
