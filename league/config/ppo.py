@@ -2,9 +2,9 @@
 
 from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from league.config.base import Part
+from league.config.base import Part, check_contestant
 from league.config.network import RecurrenceConfig
 from league.config.schedules import Scheduled, ScheduledPositive
 from league.config.training import TrainingSettings
@@ -48,6 +48,21 @@ class MagnetConfig(Part):
         return None if self.ref in (UNIFORM, PREVIOUS) else self.ref
 
 
+class TeacherConfig(Part):
+    """A policy whose actions are imitated, and the weight of the imitation in the loss."""
+
+    ref: str
+    """A script (`script:one_ply`), a bot (`script:my_package.module:name`), a version (`connect_four@3`), or an alias,
+    which is resolved when training starts. `@3` and `@champion` refer to the league itself."""
+    weight: Scheduled
+    """Coefficient of the cross-entropy of the teacher's actions."""
+
+    @field_validator("ref")
+    @classmethod
+    def _is_reference(cls, value: str) -> str:
+        return check_contestant(value)
+
+
 class PPOConfig(TrainingSettings):
     """Proximal policy optimisation (Schulman et al., 2017, arXiv 1707.06347)."""
 
@@ -70,6 +85,8 @@ class PPOConfig(TrainingSettings):
     """Coefficient of the value loss."""
     magnet: MagnetConfig | None = None
     """Pull towards a reference policy; null for none."""
+    teacher: TeacherConfig | None = None
+    """Imitation of another policy's actions; null for none."""
     recurrence: RecurrenceConfig | None = None
     """Recurrent layer; null for none."""
     shared_encoder: bool = False

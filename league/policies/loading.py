@@ -7,6 +7,7 @@ would be compared on a task that they were not trained for, even if the spaces a
 from contextlib import closing
 
 from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
 from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, LeagueError, UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
@@ -116,6 +117,8 @@ def check_scripts(config: LeagueConfig, interface: Interface) -> None:
     """
     named = [("gate.anchors", anchor.ref) for anchor in config.gate.anchors]
     named += [("training.opponents", opponent.ref) for opponent in config.training.opponents]
+    if isinstance(config.training, PPOConfig) and config.training.teacher is not None:
+        named.append(("training.teacher", config.training.teacher.ref))
     for key, ref in named:
         parsed = parse_ref(of_league(ref, config.league))
         if isinstance(parsed, ScriptRef):

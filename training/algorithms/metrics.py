@@ -28,7 +28,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.interface import Interface
-from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, SCHEDULES
+from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, SCHEDULES, TEACHER_LOSS, TEACHER_WEIGHT
 from training.sampling.closed_transitions import JOINT
 from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 
@@ -49,7 +49,8 @@ PPO_METRICS = {
     "explained_variance": "vf_explained_var",
     "gradient_norm": "gradient_norm",
 }
-
+REFERENCE_METRICS = (MAGNET_KL, MAGNET_WEIGHT, TEACHER_LOSS, TEACHER_WEIGHT)
+"""Reported only with a magnet or a teacher."""
 OFF_POLICY_METRICS = ("loss", "value", "error", "gradient_norm")
 ACTOR_METRICS = ("policy_loss", "critic_gradient_norm")
 """With critics, `loss`, `value` and `error` are the critic's and `gradient_norm` is the actor's."""
@@ -95,7 +96,7 @@ def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[st
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
         found |= {f"{key}/{name}": learned.get(metric) for name, metric in PPO_METRICS.items()}
-        found |= {f"{key}/{name}": learned.get(name) for name in (*SCHEDULES.values(), MAGNET_KL, MAGNET_WEIGHT)}
+        found |= {f"{key}/{name}": learned.get(name) for name in (*SCHEDULES.values(), *REFERENCE_METRICS)}
         found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
     return {name: float(value) for name, value in found.items() if value is not None}
 

@@ -34,6 +34,7 @@ from training.algorithms import setup
 from training.algorithms.setup import configure, reset_episodes, rl_module_specs
 from training.learners.magnet import check_magnet
 from training.learners.ppo import PPOLearner, hyperparameters
+from training.learners.teacher import check_teacher
 from training.modules.actor_critic import ActorCritic, SharedEncoder
 from training.rllib_compat import NoResultsDirectory
 from training.sampling.env_runner import LEAGUE, BatchedEnvRunner
@@ -101,6 +102,8 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
     settings = league.training
     assert isinstance(settings, PPOConfig)
     hyperparameters(settings, interface.policy_ids)
+    if settings.teacher is not None:
+        check_teacher(interface)
     if settings.magnet is not None:
         check_magnet(settings.magnet, interface)
     config = ppo.PPOConfig(algo_class=PPO)

@@ -18,6 +18,7 @@ from league.config.schedules import Scheduled, ScheduleProgress, scheduled_value
 from league.errors import ConfigError
 from league.interface import Interface
 from training.learners.magnet import Magnet, Previous, magnet, states
+from training.learners.teacher import Teacher
 from training.learners.train_batch import (
     Bootstraps,
     Minibatch,
@@ -81,6 +82,8 @@ class PPOLoss(NamedTuple):
     """Fraction of the steps whose probability ratio is outside the clip range."""
     magnet_kl: Tensor
     """Mean divergence from the magnet's reference policy; 0 without a magnet."""
+    teacher: Tensor
+    """Mean cross-entropy of the teacher's actions; 0 without a teacher."""
 
 
 def ppo_loss(
@@ -93,13 +96,16 @@ def ppo_loss(
     entropy: float,
     value_loss: float,
     magnet: float = 0.0,
+    teacher: float = 0.0,
 ) -> PPOLoss:
-    """Return the clipped surrogate loss. With r = π(a|s) / π_old(a|s), the advantage A and the magnet's policy ρ:
+    """Return the clipped surrogate loss. With r = π(a|s) / π_old(a|s), the advantage A, the magnet's policy ρ and the
+    teacher's actions b:
 
-        L = −mean(min(r A, clip(r, 1 − ε, 1 + ε) A)) + c_v mean((V − V_target)²) − c_e mean(H(π)) + c_m mean(KL(π ‖ ρ))
+        L = −mean(min(r A, clip(r, 1 − ε, 1 + ε) A)) + c_v mean((V − V_target)²) − c_e mean(H(π))
+            + c_m mean(KL(π ‖ ρ)) − c_t mean(log π(b|s))
 
     Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347, equations 7 and 9. The last
-    term: see `training.learners.magnet`.
+    terms: see `training.learners.magnet` and `training.learners.teacher`.
 
     Args:
         minibatch: k steps.
@@ -110,6 +116,7 @@ def ppo_loss(
         entropy: c_e.
         value_loss: c_v.
         magnet: c_m; not used if the minibatch has no reference policy.
+        teacher: c_t; not used if the minibatch has no actions of a teacher.
     """
     log_p, entropies = distribution.evaluate(dist_inputs, minibatch.actions)
     ratio = torch.exp(log_p - minibatch.log_p)
@@ -122,13 +129,19 @@ def ppo_loss(
     if minibatch.magnet is not None:
         magnet_kl = distribution.divergence(dist_inputs, minibatch.magnet).mean()
         total = total + magnet * magnet_kl
-    return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean(), magnet_kl)
+    cross_entropy = torch.zeros(())
+    if minibatch.taught is not None:
+        cross_entropy = -distribution.evaluate(dist_inputs, minibatch.taught)[0].mean()
+        total = total + teacher * cross_entropy
+    return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean(), magnet_kl, cross_entropy)
 
 
 logger = logging.getLogger(__name__)
 
 MAGNET_KL, MAGNET_WEIGHT = "magnet_kl", "magnet_weight"
 """Logged only with a magnet, the weight only if it has a schedule."""
+TEACHER_LOSS, TEACHER_WEIGHT = "teacher_loss", "teacher_weight"
+"""Logged only with a teacher: the loss as long as the weight is not 0, the weight only if it has a schedule."""
 STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", "gradient_norm")
 """Logged per policy: means over the minibatches of an update."""
 EXPLAINED_VARIANCE = "vf_explained_var"
@@ -166,10 +179,14 @@ class PPOLearner(FixedPoliciesLearner):
         self.settings = settings
         self._set_hyperparameters(NOT_STARTED)
         super().build()
+        interface = Interface.model_validate(self.config.env_config[INTERFACE])
+        storage = self.config.env_config.get(STORAGE)
         self._magnet: Magnet | None = None
         if settings.magnet is not None:
-            interface = Interface.model_validate(self.config.env_config[INTERFACE])
-            self._magnet = magnet(settings.magnet, self.module, interface, self.config.env_config.get(STORAGE))
+            self._magnet = magnet(settings.magnet, self.module, interface, storage)
+        self._teacher: Teacher | None = None
+        if settings.teacher is not None:
+            self._teacher = Teacher(settings.teacher, interface, storage, settings.seed)
 
     @classmethod
     def rl_module_required_apis(cls) -> list[type]:
@@ -228,6 +245,7 @@ class PPOLearner(FixedPoliciesLearner):
         self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies), progress)
         self._common_lr = scheduled_value(self.settings.lr, progress)
         self._magnet_weight = scheduled_value(self.settings.magnet.weight, progress) if self.settings.magnet else 0.0
+        self._teacher_weight = scheduled_value(self.settings.teacher.weight, progress) if self.settings.teacher else 0.0
 
     def _batches(self, sampled: Iterable[EpisodeChunks], policies: Collection[str]) -> dict[str, TrainBatch]:
         chunks = defaultdict(list)
@@ -247,15 +265,18 @@ class PPOLearner(FixedPoliciesLearner):
             for policy, module in self.module.items()
             if policy in chunks
         }
-        reference = self._magnet
-        if reference is None:
-            return batches
-        return {
-            policy: replace(batch, magnet=reference.dist_inputs(policy, batch)) for policy, batch in batches.items()
-        }
+        return {policy: self._with_references(policy, batch) for policy, batch in batches.items()}
+
+    def _with_references(self, policy: str, batch: TrainBatch) -> TrainBatch:
+        """Return a batch with what the magnet and the teacher would do."""
+        if self._magnet is not None:
+            batch = replace(batch, magnet=self._magnet.dist_inputs(policy, batch))
+        if self._teacher is not None and self._teacher_weight:
+            batch = replace(batch, taught=self._teacher.actions(policy, batch, self.weights_version))
+        return batch
 
     def _gradient_step(self, minibatch: dict[str, Minibatch]) -> dict[str, Tensor]:
-        """Take a gradient step on the sum of the policies' losses; return policy id → STATISTICS and MAGNET_KL."""
+        """Take a gradient step on the sum of the losses; return policy id → STATISTICS, MAGNET_KL and TEACHER_LOSS."""
         for parameters in self._parameters.values():
             for parameter in parameters:
                 parameter.grad = None
@@ -269,7 +290,7 @@ class PPOLearner(FixedPoliciesLearner):
             name: self._clip_and_step(name) for name in self._parameters if name in minibatch or name == ALL_MODULES
         }
         return {
-            policy: torch.stack([*loss[1:-1], norms[policy], loss.magnet_kl]).detach()
+            policy: torch.stack([*loss[1:-2], norms[policy], loss.magnet_kl, loss.teacher]).detach()
             for policy, loss in losses.items()
         }
 
@@ -286,6 +307,7 @@ class PPOLearner(FixedPoliciesLearner):
             entropy=self.hyperparameters[module_id].entropy,
             value_loss=self.settings.value_loss,
             magnet=self._magnet_weight,
+            teacher=self._teacher_weight,
         )
 
     def _clip_and_step(self, name: str) -> Tensor:
@@ -331,7 +353,7 @@ class PPOLearner(FixedPoliciesLearner):
         divergences = self._divergences(batches)
         for policy, batch in batches.items():
             means = torch.stack(statistics[policy]).mean(0).tolist()
-            logged = dict(zip((*STATISTICS, MAGNET_KL), means, strict=True))
+            logged = dict(zip((*STATISTICS, MAGNET_KL, TEACHER_LOSS), means, strict=True))
             logged |= {EXPLAINED_VARIANCE: batch.explained_variance, KL: divergences[policy]}
             scheduled = scheduled_hyperparameters(self.settings, policy)
             logged |= {SCHEDULES[name]: getattr(self.hyperparameters[policy], name) for name in scheduled}
@@ -339,6 +361,10 @@ class PPOLearner(FixedPoliciesLearner):
                 del logged[MAGNET_KL]
             elif not isinstance(self.settings.magnet.weight, float):
                 logged[MAGNET_WEIGHT] = self._magnet_weight
+            if not self._teacher_weight:
+                del logged[TEACHER_LOSS]
+            if self.settings.teacher is not None and not isinstance(self.settings.teacher.weight, float):
+                logged[TEACHER_WEIGHT] = self._teacher_weight
             self.metrics.log_dict(logged, key=policy, window=1)
             self.metrics.log_value((policy, NUM_MODULE_STEPS_TRAINED), len(batch), reduce="sum")
 

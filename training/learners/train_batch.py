@@ -100,6 +100,8 @@ class TrainBatch:
     """1 − Var(target − value) / Var(target) of the values before the update."""
     magnet: Tensor | None = None
     """Inputs of the action distribution of the magnet's reference policy, (n, d)."""
+    taught: Tensor | None = None
+    """Raw actions of the teacher, (n,) or (n, m)."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -128,6 +130,7 @@ class TrainBatch:
             advantages=self.advantages[steps],
             targets=self.targets[steps],
             magnet=None if self.magnet is None else self.magnet[steps],
+            taught=None if self.taught is None else self.taught[steps],
         )
 
 
@@ -142,6 +145,7 @@ class Minibatch:
     advantages: Tensor
     targets: Tensor
     magnet: Tensor | None = None
+    taught: Tensor | None = None
 
 
 def bootstrap_unless_terminated(chunks: EpisodeChunks) -> NDArray:

@@ -55,13 +55,13 @@ def locked(directory: Path, what: str) -> Iterator[None]:
 
 
 def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface) -> dict[str, str]:
-    """Resolve each opponent of `training.opponents`, and the version of `training.magnet`: reference as written →
-    `script:name` or `league@number`.
+    """Resolve each opponent of `training.opponents`, the version of the magnet and the teacher: reference as written
+    → `script:name` or `league@number`.
 
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for written in (*(opponent.ref for opponent in config.training.opponents), *_magnet_versions(config)):
+    for written in (*(opponent.ref for opponent in config.training.opponents), *_references(config.training)):
         ref = parse_ref(of_league(written, config.league))
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
         contestant(pinned, registry, interface)
@@ -69,10 +69,12 @@ def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface
     return pins
 
 
-def _magnet_versions(config: LeagueConfig) -> tuple[str, ...]:
-    settings = config.training
-    magnet = settings.magnet if isinstance(settings, PPOConfig) else None
-    return () if magnet is None or magnet.version is None else (magnet.version,)
+def _references(settings: TrainingSettings) -> list[str]:
+    """The version of the magnet, and the teacher."""
+    if not isinstance(settings, PPOConfig):
+        return []
+    found = [settings.magnet.version if settings.magnet else None, settings.teacher.ref if settings.teacher else None]
+    return [ref for ref in found if ref is not None]
 
 
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
@@ -84,6 +86,10 @@ def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
     changes: dict[str, Any] = {"opponents": opponents}
     if isinstance(settings, PPOConfig) and settings.magnet is not None:
         changes["magnet"] = settings.magnet.model_dump() | {"ref": pins.get(settings.magnet.ref, settings.magnet.ref)}
+    if isinstance(settings, PPOConfig) and settings.teacher is not None:
+        changes["teacher"] = settings.teacher.model_dump() | {
+            "ref": pins.get(settings.teacher.ref, settings.teacher.ref)
+        }
     return config.with_training(**changes)
 
 

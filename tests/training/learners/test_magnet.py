@@ -7,46 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ray.rllib.core.learner.training_data import TrainingData
 from torch import Tensor
 
-from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
 from tests.support.leagues import tictactoe
 from tests.support.leagues.training_leagues import solvable
+from tests.support.learners import episodes_of, learner_of, update
 from training.algorithms.ppo import algorithm_config
 from training.learners.magnet import Uniform, magnet
-from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, PPOLearner, ppo_loss
+from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, ppo_loss
 from training.learners.train_batch import Minibatch, TrainBatch, train_batch
 from training.modules.distributions import TorchCategorical
 from training.modules.policy_module import MASKED_LOGIT
-from training.sampling.env_runner import BatchedEnvRunner
-from training.sampling.episode_chunks import EpisodeChunks
 
 pytestmark = pytest.mark.usefixtures("ray_session")
-
-
-def learner_of(league: LeagueConfig, **options: Any) -> PPOLearner:
-    config = algorithm_config(league, interface(league), **options)
-    learner = PPOLearner(config=config, module_spec=config.rl_module_spec)
-    learner.build()
-    return learner
-
-
-def episodes_of(league: LeagueConfig) -> list[EpisodeChunks]:
-    runner = BatchedEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
-    try:
-        return runner.sample_chunks(num_timesteps=256)
-    finally:
-        runner.stop()
-
-
-def update(learner: PPOLearner, episodes: list[EpisodeChunks]) -> dict[str, float]:
-    metrics = learner.update(training_data=TrainingData(episodes=episodes), num_epochs=2, minibatch_size=64)
-    (policy,) = metrics
-    return {name: float(stats.peek()) for name, stats in metrics[policy].items()}
 
 
 def minibatch(old: Tensor, reference: Tensor) -> Minibatch:

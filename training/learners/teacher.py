@@ -1,0 +1,77 @@
+"""The teacher of PPO: a script, bot or version whose actions the policy imitates, usually at the start of training.
+
+The teacher acts on the observations that the policy itself reaches, and the loss contains the cross-entropy of its
+actions: kickstarting (Schmitt et al., 2018, arXiv 1803.03835). With a weight that decreases to 0, the policy first
+learns what the teacher knows, and then improves on it by reinforcement learning.
+"""
+
+from contextlib import closing
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from league.config.ppo import TeacherConfig
+from league.errors import ConfigError
+from league.interface import Interface
+from league.policies.loading import contestant
+from league.policies.policy import Policy
+from league.refs import ScriptRef, parse_ref
+from league.registry.registry import Registry
+from league.settings import Storage
+from league.spaces import Discrete, MultiDiscrete, Space
+from training.learners.train_batch import TrainBatch
+
+
+class Teacher:
+    """The policies of a teacher."""
+
+    def __init__(self, settings: TeacherConfig, interface: Interface, storage: Storage | None, seed: int) -> None:
+        """Raises ConfigError for an unsuitable teacher, and what loading it raises."""
+        self._seed = seed
+        self._spaces = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
+        self._policies = dict(_load(settings.ref, interface, storage).values())
+        for policy in self._policies.values():
+            initial_state = getattr(policy, "initial_state", None)
+            if initial_state is not None and initial_state(1):
+                raise ConfigError(
+                    f"training.teacher.ref: {settings.ref} has a memory, which a teacher does not support"
+                )
+
+    def actions(self, policy: str, batch: TrainBatch, update: int) -> Tensor:
+        """Return the teacher's raw actions at the steps of a batch, (n,) or (n, m) int64.
+
+        Args:
+            policy: The policy id.
+            batch: n steps.
+            update: Number of the update, from which the teacher's random choices are derived.
+        """
+        rows = batch.acted.cpu().numpy()
+        observations = {name: value.cpu().numpy()[rows] for name, value in batch.observations.items()}
+        rng = np.random.default_rng((self._seed, update))
+        chosen = self._policies[policy].act(observations, rng=[rng] * len(rows)).actions
+        return torch.from_numpy(_raw(chosen, self._spaces[policy])).to(batch.acted.device)
+
+
+def check_teacher(interface: Interface) -> None:
+    """Raise ConfigError if a policy's actions do not support a teacher."""
+    for policy in interface.policy_ids:
+        if not isinstance(interface.of_policy(policy).action, Discrete | MultiDiscrete):
+            raise ConfigError(f"training.teacher needs discrete actions, but those of {policy} are not")
+
+
+def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:
+    if isinstance(parse_ref(ref), ScriptRef):
+        return contestant(ref, None, interface)
+    if storage is None:
+        raise ConfigError(f"training.teacher.ref: {ref} is a version, but no storage is given to load it from")
+    with closing(Registry.open(storage)) as registry:
+        return contestant(ref, registry, interface)
+
+
+def _raw(actions: NDArray, space: Space) -> NDArray:
+    """The inverse of `league.policies.actions.to_environment` for discrete actions."""
+    assert isinstance(space, Discrete | MultiDiscrete)
+    raw = (actions - np.asarray(space.start)).astype(np.int64)
+    return raw if isinstance(space, Discrete) else raw.reshape(len(raw), -1)
