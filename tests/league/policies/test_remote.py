@@ -94,7 +94,7 @@ def test_a_batch_is_sent_as_rows(url: str) -> None:
     assert (answer.actions.tolist(), answer.actions.dtype, answer.state) == ([3, 4], np.int64, None)
     board = {"observation": np.zeros((6, 7, 2), int).tolist(), "action_mask": [1] * 7}
     assert Handler.requests == [
-        ("/v1/policies/board.left/action?version=7", {"observations": [board, board], "state": {}})
+        ("/v1/policies/board.left/action?version=7", {"observations": [board, board], "explore": False, "state": {}})
     ]
 
 
