@@ -167,7 +167,8 @@ def _is_greedy(ref: str, storage: Storage | None) -> bool:
     if isinstance(parsed, ScriptRef) or storage is None:
         return False
     with closing(Registry.open(storage)) as registry:
-        return registry.versions.resolve(parsed).manifest.algorithm in VALUE_BASED_ALGORITHMS
+        manifest = registry.versions.resolve(parsed).manifest
+    return manifest.algorithm in VALUE_BASED_ALGORITHMS or manifest.settings.get("greedy", False)
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:
