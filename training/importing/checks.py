@@ -29,7 +29,7 @@ TARGET_OBSERVATIONS = 10_000
 MIN_OBSERVATIONS = 256
 MAX_MEGABYTES = 256
 """Large observations are limited to this size, but not below MIN_OBSERVATIONS."""
-ENOUGH_SECONDS, MOST_SECONDS = 60.0, 180.0
+ENOUGH_SECONDS, MOST_SECONDS = 300.0, 600.0
 """Seconds of play after which MIN_OBSERVATIONS suffice, and after which a policy with fewer has failed."""
 NUM_ENVS = 8
 PROBES, MAX_PROBE_BYTES = 32, 2**20

@@ -15,7 +15,7 @@ from league.errors import ConfigError, EnvironmentMismatch, one_line
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, OBSERVATION, Box
 from training.importing.adapted_graph import check
-from training.importing.graph_mapping import GraphMapping, InputMapping
+from training.importing.graph_mapping import GraphMapping, InputMapping, Kind
 from training.importing.source import Source
 from training.importing.torch_source import Examples, ModuleOriginal, converted
 
@@ -31,9 +31,9 @@ class InferenceGraph(nn.Module):
         super().__init__()
         self.module, self._key = module, key
 
-    def forward(self, *arrays: Tensor) -> Tensor:
-        observation = arrays[0] if self._key is None else {self._key: arrays[0], ACTION_MASK: arrays[1]}
-        answer = self.module.forward_inference({Columns.OBS: observation})
+    def forward(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        observed = observation if self._key is None else {self._key: observation, ACTION_MASK: action_mask}
+        answer = self.module.forward_inference({Columns.OBS: observed})
         return answer[Columns.ACTION_DIST_INPUTS] if Columns.ACTION_DIST_INPUTS in answer else answer[Columns.ACTIONS]
 
 
@@ -73,7 +73,7 @@ def rllib_source(path: Path, module_id: str, spaces: AgentInterface, origin: dic
     graph = InferenceGraph(module, key).eval()
     answer = module.forward_inference({Columns.OBS: _batch(examples, key)})
     finished = Columns.ACTION_DIST_INPUTS not in answer
-    kind = "action" if finished else "gaussian" if isinstance(spaces.action, Box) else "logits"
+    kind: Kind = "action" if finished else "gaussian" if isinstance(spaces.action, Box) else "logits"
     mapping = GraphMapping(inputs=inputs, output=OUTPUT, kind=kind)
     model = converted(graph, examples, OUTPUT, where)
     check(model, mapping, spaces, where)

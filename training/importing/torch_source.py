@@ -1,6 +1,5 @@
 """Import of PyTorch modules and `torch.export` programs: converted to ONNX, compared with the module itself."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, one_line
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, DictSpace
+from training.export.onnx_export import quiet
 from training.importing.adapted_graph import BATCH, check, decoded
 from training.importing.graph_mapping import GraphMapping, inferred
 from training.importing.source import Source, State
@@ -53,8 +53,7 @@ def converted(module: nn.Module, examples: Examples, output: str, source: str) -
     # Two rows: torch.export treats a batch of one as constant.
     tensors = tuple(torch.zeros((2, *shape), dtype=dtype) for shape, dtype in examples.values())
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             program = torch.onnx.export(
                 module.eval(),
                 tensors,
@@ -95,8 +94,7 @@ def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origi
     outputs = program.graph_signature.user_outputs
     if len(outputs) != 1:
         raise EnvironmentMismatch(f"{path}: the program has {len(outputs)} outputs, expected the one that decides")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with quiet():
         exported = torch.onnx.export(
             program, (), dynamo=True, input_names=names, output_names=["output"], verbose=False
         )
@@ -119,7 +117,7 @@ class _Called(nn.Module):
 
 
 def _example(path: Path, name: str, value: Tensor) -> tuple[tuple[int, ...], torch.dtype]:
-    if isinstance(value.shape[0], int):
+    if not isinstance(value.shape[0], torch.SymInt):
         raise EnvironmentMismatch(
             f"{path}: input {name} has a fixed batch size of {value.shape[0]}; "
             "export it with dynamic_shapes={0: torch.export.Dim('batch')}"
