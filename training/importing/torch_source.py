@@ -117,9 +117,10 @@ class _Called(nn.Module):
 
 
 def _example(path: Path, name: str, value: Tensor) -> tuple[tuple[int, ...], torch.dtype]:
-    if not isinstance(value.shape[0], torch.SymInt):
+    batch: Any = value.shape[0]
+    if type(batch) is int:
         raise EnvironmentMismatch(
-            f"{path}: input {name} has a fixed batch size of {value.shape[0]}; "
+            f"{path}: input {name} has a fixed batch size of {batch}; "
             "export it with dynamic_shapes={0: torch.export.Dim('batch')}"
         )
     return tuple(int(size) for size in value.shape[1:]), value.dtype
