@@ -21,7 +21,7 @@ def export(
     The files are verified against their digests. docs/exporting.md shows how to run them in a browser, Unity, Godot and
     C++. `league import` reads the directory.
     """
-    from league.registry.exports import export_version
+    from league.registry.storage.exports import export_version
 
     registry = open_registry()
     version = registry.versions.resolve(CheckpointRef.parse(ref))
