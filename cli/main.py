@@ -45,6 +45,8 @@ PANELS = {
         "versions": Subcommand("cli.versions:versions", "List a league's versions with their aliases and ratings."),
         "history": Subcommand("cli.versions:history", "Show when and why an alias moved, and who moved it."),
         "note": Subcommand("cli.versions:note", "Set or clear the note of a version."),
+        "import": Subcommand("cli.importing:import_model", "Publish a model that was trained elsewhere as a version."),
+        "export": Subcommand("cli.exporting:export", "Write the ONNX files and the manifest of a version."),
         "promote": Subcommand("cli.versions:promote", "Make a version the champion, or move another alias to it."),
         "retire": Subcommand("cli.retire:retire", "Remove files of old versions, and old access logs."),
         "rollback": Subcommand("cli.versions:rollback", "Restore the previous champion."),

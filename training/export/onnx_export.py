@@ -95,7 +95,7 @@ def export_policy(module: PolicyModule, spaces: AgentInterface, path: Path) -> N
     # Two rows: torch.export treats a batch of one as constant.
     examples = tuple(torch.zeros([size or 2 for size in tensor.shape], dtype=_dtype(tensor.dtype)) for tensor in taken)
     graph = PolicyGraph(module, tuple(inputs(spaces.observation)), spaces.action).eval()
-    with _quiet():
+    with quiet():
         program = torch.onnx.export(
             graph,
             examples,
@@ -157,7 +157,7 @@ def _dtype(name: str) -> torch.dtype:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Suppress the exporter's notes on optional packages and its own deprecation warnings."""
     exporter = logging.getLogger("torch.onnx")
     level = exporter.level

@@ -17,7 +17,6 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
 from torch import Tensor
 
-from league.conditions import VALUE_BASED
 from league.config.ppo import PREVIOUS, UNIFORM, MagnetConfig
 from league.errors import ConfigError
 from league.interface import Interface
@@ -129,11 +128,10 @@ def check_magnet(settings: MagnetConfig, interface: Interface) -> None:
 
 
 def _graphs(ref: str, registry: Registry, interface: Interface) -> dict[str, OnnxPolicy]:
-    algorithm = registry.versions.resolve(CheckpointRef.parse(ref)).manifest.algorithm
-    if algorithm in VALUE_BASED:
+    manifest = registry.versions.resolve(CheckpointRef.parse(ref)).manifest
+    if not manifest.has_distribution:
         raise ConfigError(
-            f"training.magnet.ref: {ref} was trained by {algorithm}, whose graphs output action values: expected a"
-            " version with an action distribution"
+            f"training.magnet.ref: {ref} ({manifest.algorithm}) has no action distribution, which a magnet needs"
         )
     graphs = {}
     for policy, graph in contestant(ref, registry, interface).values():

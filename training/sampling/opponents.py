@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from league.conditions import VALUE_BASED
 from league.config.training import OpponentConfig
 from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError, GameCrashed, one_line
@@ -129,7 +128,6 @@ class Opponents:
             for config in configs
             for policy_id, policy in _load(config.ref, interface, storage).values()
         }
-        self._greedy = {config.ref for config in configs if _is_greedy(config.ref, storage)}
         self._recurrent_states = {
             opponent: RecurrentStates(
                 {key: np.asarray(rows[0], rows.dtype) for key, rows in initial.items()}, num_envs, len(interface.agents)
@@ -144,7 +142,7 @@ class Opponents:
         answer = policy.act(
             batch.observations,
             state=states.get(batch) if states else None,
-            explore=isinstance(policy, OnnxPolicy) and opponent.ref not in self._greedy,
+            explore=isinstance(policy, OnnxPolicy),
             rng=[rng] * len(batch),
         )
         for fault in answer.faults.values():
@@ -157,14 +155,6 @@ class Opponents:
         """The episodes in `envs` are over."""
         for states in self._recurrent_states.values():
             states.forget(envs)
-
-
-def _is_greedy(ref: str, storage: Storage | None) -> bool:
-    parsed = parse_ref(ref)
-    if isinstance(parsed, ScriptRef) or storage is None:
-        return False
-    with closing(Registry.open(storage)) as registry:
-        return registry.versions.resolve(parsed).manifest.algorithm in VALUE_BASED
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:

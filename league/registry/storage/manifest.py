@@ -86,8 +86,9 @@ class Manifest(_Record):
 
     @property
     def has_distribution(self) -> bool:
-        """Whether actions can be sampled. Graphs of value-based algorithms have action values in place of logits."""
-        return self.algorithm not in VALUE_BASED
+        """Whether actions can be sampled. Graphs of value-based algorithms have action values in place of logits, and
+        imported models may output finished actions."""
+        return self.algorithm not in VALUE_BASED and not self.settings.get("greedy", False)
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> Self:

@@ -1,0 +1,86 @@
+"""Importing models into a league."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import onnx
+import pytest
+
+from evaluation.matches.tournament import evaluate
+from league.errors import ConfigError, EnvironmentMismatch, ParityError
+from league.policies import load
+from league.registry.registry import Registry
+from league.registry.storage.rows import VersionRow
+from tests.support.leagues import tictactoe
+from tests.support.policies.foreign_graphs import foreign
+from training.importing import checks
+from training.importing.open_source import open_sources
+from training.importing.publish import publish
+
+
+@pytest.fixture(autouse=True)
+def few_observations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "TARGET_OBSERVATIONS", 400)
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    opened = tictactoe.registry(tmp_path / "home")
+    yield opened
+    opened.close()
+
+
+def imported(registry: Registry, path: Path, mapping: Path | None = None) -> VersionRow:
+    interface = registry.leagues.get(tictactoe.LEAGUE).interface
+    sources, digest = open_sources(path, interface, mapping=mapping)
+    return publish(tictactoe.LEAGUE, sources, digest=digest, registry=registry)
+
+
+def test_an_imported_graph_is_a_version_like_others(registry: Registry, tmp_path: Path) -> None:
+    path = tmp_path / "foreign.onnx"
+    path.write_bytes(foreign(18, 9, shape=(3, 3, 2)))
+    version = imported(registry, path)
+    policy = version.manifest.policies["shared"]
+    assert (policy.parity.mismatches, policy.parity.observations >= 400) == (0, True)
+    assert [tensor.name for tensor in policy.inputs] == ["observation", "action_mask"]
+    assert version.manifest.settings["origin"]["shared"]["file"] == "foreign.onnx"
+    load(version.ref, registry=registry)
+    report = evaluate(tictactoe.LEAGUE, [version.ref, "script:random"], registry=registry, blocks=4, workers=0)
+    assert {standing.ref for standing in report.leaderboard} >= {version.ref, "script:random"}
+    assert imported(registry, path).number == version.number
+
+
+def test_weights_in_another_file_are_included(registry: Registry, tmp_path: Path) -> None:
+    path = tmp_path / "foreign.onnx"
+    onnx.save(
+        onnx.load_from_string(foreign(18, 9, shape=(3, 3, 2))), str(path), save_as_external_data=True,
+        location="weights.bin", size_threshold=0,
+    )  # fmt: skip
+    assert (tmp_path / "weights.bin").exists()
+    version = imported(registry, path)
+    (tmp_path / "weights.bin").unlink()
+    load(version.ref, registry=registry)
+
+
+def test_a_mapping_file_names_the_tensors(registry: Registry, tmp_path: Path) -> None:
+    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
+    path.write_bytes(foreign(18, 9))
+    with pytest.raises(EnvironmentMismatch, match="mapping file"):
+        imported(registry, path)
+    mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: values\n")
+    assert imported(registry, path, mapping).number == 1
+
+
+def test_illegal_actions_are_refused(registry: Registry, tmp_path: Path) -> None:
+    path = tmp_path / "foreign.onnx"
+    path.write_bytes(foreign(18, 9, shape=(3, 3, 2), kind="action"))
+    with pytest.raises(ParityError, match=r"policy shared: action [0-9] is illegal, where action_mask"):
+        imported(registry, path)
+    assert registry.versions.all(tictactoe.LEAGUE) == []
+
+
+@pytest.mark.parametrize(("name", "content"), [("graph.onnx", b"text"), ("graph.h5", b"text")])
+def test_other_files_are_refused(registry: Registry, tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=name):
+        imported(registry, tmp_path / name)

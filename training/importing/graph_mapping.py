@@ -1,0 +1,154 @@
+"""How the inputs and outputs of a foreign graph correspond to those of a policy: given in a file, or inferred."""
+
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import onnx
+import yaml
+from onnx.helper import tensor_dtype_to_np_dtype
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
+
+from league.errors import ConfigError, EnvironmentMismatch, one_line
+from league.interface import AgentInterface
+from league.policies.actions import dist_inputs_size
+from league.spaces import ACTION_MASK, Box, DictSpace, Leaf, inputs
+
+Kind = Literal["logits", "values", "gaussian", "action"]
+
+
+class InputMapping(BaseModel):
+    """What an input of a graph receives."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    """`observation`, `observation.<key>` or `action_mask`."""
+    transpose: tuple[int, ...] = ()
+    """Order of the axes without the batch: [2, 0, 1] turns (height, width, channels) into (channels, height, width)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_yaml(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @field_validator("transpose")
+    @classmethod
+    def _is_permutation(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if sorted(value) != list(range(len(value))):
+            raise ValueError(f"expected each of the axes 0 to {len(value) - 1} once, got {list(value)}")
+        return value
+
+    def shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape of an observation after the transposition."""
+        return tuple(shape[axis] for axis in self.transpose) if self.transpose else shape
+
+
+class GraphMapping(BaseModel):
+    """Names of a graph's tensors and the meaning of its output."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    inputs: dict[str, InputMapping]
+    """Input of the graph → what it receives."""
+    output: str
+    """The output that determines the action."""
+    kind: Kind
+    """logits or action values of Discrete and MultiDiscrete actions; means, then log standard deviations; or a finished
+    action in the units of the action space."""
+    units: Literal["normalized", "environment"] = "normalized"
+    """Units of a Gaussian for actions with bounds: [-1, 1] stands for the bounds, or the units of the action space."""
+    state: dict[str, str] = {}
+    """Recurrent input → the output with its next value."""
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a YAML file. Raises ConfigError, which names the file and the key."""
+        try:
+            return cls.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror or error}") from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"])) or "mapping"
+            raise ConfigError(f"{path}: {key}: {first['msg']}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not a YAML file: {one_line(error)}") from error
+
+
+Shape = tuple[int | None, ...]
+
+
+def tensors(nodes: list[onnx.ValueInfoProto]) -> dict[str, tuple[str, Shape]]:
+    """Return name → dtype and shape of a graph's inputs or outputs. Free dimensions are None."""
+    found = {}
+    for node in nodes:
+        kind = node.type.tensor_type
+        shape = tuple(size.dim_value or None if size.HasField("dim_value") else None for size in kind.shape.dim)
+        found[node.name] = (tensor_dtype_to_np_dtype(kind.elem_type).name, shape)
+    return found
+
+
+def inferred(model: onnx.ModelProto, spaces: AgentInterface, source: str) -> GraphMapping:
+    """Match the tensors of `model` by name, else by shape and dtype.
+
+    Raises:
+        EnvironmentMismatch: A tensor has no match or several; the message names it and `source`.
+    """
+    given, results = graph_inputs(model), tensors(list(model.graph.output))
+    wanted = inputs(spaces.observation)
+    matched: dict[str, str] = {}
+    state = {name: name.replace("_in", "_out") for name in given if name.replace("_in", "_out") in results}
+    for name, (dtype, shape) in given.items():
+        if name in state:
+            continue
+        open_leaves = {own: leaf for own, leaf in wanted.items() if own not in matched.values()}
+        if name in open_leaves:
+            matched[name] = name
+            continue
+        fits = [own for own, leaf in open_leaves.items() if shape[1:] == leaf.shape]
+        if len(fits) > 1:
+            fits = [own for own in fits if open_leaves[own].dtype == dtype] or fits
+        if len(fits) > 1:
+            fits = [own for own in fits if (own == ACTION_MASK) == ("mask" in name)]
+        if len(fits) != 1:
+            known = ", ".join(f"{own} {leaf.dtype} {list(leaf.shape)}" for own, leaf in open_leaves.items())
+            raise EnvironmentMismatch(
+                f"{source}: input {name} is {dtype} {list(shape[1:])}: expected {'one' if fits else 'one of'} "
+                f"{known or 'no further input'}; use a mapping file"
+            )
+        matched[name] = fits[0]
+    output, kind = _output({name: each for name, each in results.items() if name not in state.values()}, spaces, source)
+    return GraphMapping(
+        inputs={name: InputMapping(name=own) for name, own in matched.items()}, output=output, kind=kind, state=state
+    )
+
+
+def graph_inputs(model: onnx.ModelProto) -> dict[str, tuple[str, Shape]]:
+    """Return name → dtype and shape of the inputs that are not weights."""
+    weights = {weight.name for weight in model.graph.initializer}
+    return {name: each for name, each in tensors(list(model.graph.input)).items() if name not in weights}
+
+
+def _output(results: dict[str, tuple[str, Shape]], spaces: AgentInterface, source: str) -> tuple[str, Kind]:
+    """The output that determines the action: distribution inputs are preferred to a finished action."""
+    action = spaces.action
+    if isinstance(action, DictSpace):
+        raise EnvironmentMismatch(f"{source}: dict actions are not supported")
+    distribution: Kind = "gaussian" if isinstance(action, Box) else "logits"
+    width = dist_inputs_size(action)
+    floats = [name for name, (dtype, shape) in results.items() if dtype.startswith("float") and shape[1:] == (width,)]
+    finished = [name for name, (dtype, shape) in results.items() if _is_action(dtype, shape, action)]
+    kinds: tuple[tuple[list[str], Kind], ...] = ((floats, distribution), (finished, "action"))
+    for names, kind in kinds:
+        if len(names) == 1:
+            return names[0], kind
+    found = ", ".join(f"{name} {dtype} {list(shape[1:])}" for name, (dtype, shape) in results.items())
+    raise EnvironmentMismatch(
+        f"{source}: outputs are {found}: expected one float output [{width}] or one {action.dtype} action "
+        f"{list(action.shape)}; use a mapping file"
+    )
+
+
+def _is_action(dtype: str, shape: Shape, action: Leaf) -> bool:
+    kinds = ("float",) if isinstance(action, Box) else ("int", "uint")
+    return dtype.startswith(kinds) and shape[1:] == action.shape

@@ -1,0 +1,159 @@
+"""Import of a file of Stable-Baselines3: PPO, A2C and DQN with one Box observation, and TD3, DDPG and SAC actors."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from league.errors import ConfigError, EnvironmentMismatch, one_line
+from league.interface import AgentInterface
+from league.spaces import ACTION_MASK, OBSERVATION, Box, DictSpace, Discrete, inputs
+from training.importing.adapted_graph import check
+from training.importing.graph_mapping import GraphMapping, InputMapping, Kind
+from training.importing.source import Source, State
+from training.importing.torch_source import Examples, converted
+
+OUTPUT = "output"
+FORMATS = ("PPO", "A2C", "DQN", "TD3", "DDPG", "SAC")
+
+
+class Logits(nn.Module):
+    """Logits of PPO's and A2C's policies; means and log standard deviations for continuous actions."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, observation: Tensor) -> Tensor:
+        features = self.policy.extract_features(observation, self.policy.pi_features_extractor)
+        means = self.policy.action_net(self.policy.mlp_extractor.forward_actor(features))
+        if not hasattr(self.policy, "log_std"):
+            return means
+        return torch.cat([means, self.policy.log_std.expand_as(means)], dim=1)
+
+
+class Values(nn.Module):
+    """Action values of DQN."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.policy.q_net(observation)
+
+
+class Chosen(nn.Module):
+    """Deterministic actions of TD3, DDPG and SAC in the units of the action space."""
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.actor = policy.actor
+        self.register_buffer("low", torch.as_tensor(policy.action_space.low))
+        self.register_buffer("high", torch.as_tensor(policy.action_space.high))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        if hasattr(self.actor, "get_action_dist_params"):  # SAC's Gaussian before it is squashed
+            within = torch.tanh(self.actor.get_action_dist_params(observation)[0])
+        else:
+            within = self.actor(observation)
+        return self.low + 0.5 * (within + 1.0) * (self.high - self.low)
+
+
+class PredictOriginal:
+    """The model as Stable-Baselines3 runs it: `predict(…, deterministic=True)`."""
+
+    def __init__(self, model: Any, graph: nn.Module, kind: Kind, spaces: AgentInterface) -> None:
+        self._model, self._graph, self._kind, self._spaces = model, graph, kind, spaces
+
+    def initial_state(self, rows: int) -> State:  # noqa: ARG002
+        """Return no state."""
+        return {}
+
+    def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
+        """Call `predict`. With a mask, which Stable-Baselines3 does not know, the best legal logit decides."""
+        shape = self._model.observation_space.shape
+        seen = observations[OBSERVATION].reshape(-1, *shape)
+        logits = None
+        if self._kind != "gaussian" and self._kind != "action":
+            with torch.no_grad():
+                logits = self._graph(torch.from_numpy(seen.astype(np.float32))).numpy()
+        action, mask = self._spaces.action, observations.get(ACTION_MASK)
+        if mask is not None and logits is not None:
+            assert isinstance(action, Discrete)
+            return np.where(mask != 0, logits, -np.inf).argmax(axis=1) + action.start, logits, state
+        actions, _ = self._model.predict(seen.astype(self._model.observation_space.dtype), deterministic=True)
+        assert not isinstance(action, DictSpace)
+        if isinstance(action, Discrete) and self._model.action_space.start != action.start:
+            actions = actions - self._model.action_space.start + action.start
+        return actions.reshape(-1, *action.shape).astype(action.dtype), logits, state
+
+
+def sb3_source(path: Path, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
+    """Read a file that `model.save` wrote. This unpickles parts of the file.
+
+    Args:
+        path: The file.
+        spaces: Spaces of the policy.
+        origin: Recorded in the manifest.
+
+    Raises:
+        ConfigError: Stable-Baselines3 is not installed, or the file is not of a supported algorithm.
+        EnvironmentMismatch: The model does not fit the spaces.
+    """
+    model = _load(path)
+    policy = model.policy.to("cpu").eval()
+    policy.set_training_mode(False)
+    observed = inputs(spaces.observation)
+    space = model.observation_space
+    if OBSERVATION not in observed or type(space).__name__ != "Box":
+        raise EnvironmentMismatch(f"{path}: observations are {space}: expected one Box, as in the league")
+    graph: nn.Module
+    kind: Kind
+    if hasattr(policy, "q_net"):
+        graph, kind = Values(policy), "values"
+    elif hasattr(policy, "actor"):
+        graph, kind = Chosen(policy), "action"
+    else:
+        graph, kind = Logits(policy), "gaussian" if isinstance(spaces.action, Box) else "logits"
+    mapping = GraphMapping(
+        inputs={OBSERVATION: InputMapping(name=OBSERVATION)},
+        output=OUTPUT,
+        kind=kind,
+        units="environment" if kind == "gaussian" else "normalized",
+    )
+    examples: Examples = {OBSERVATION: (space.shape, torch.float32)}
+    onnx_model = converted(graph.eval(), examples, OUTPUT, str(path))
+    check(onnx_model, mapping, spaces, str(path))
+    return Source(onnx_model, mapping, PredictOriginal(model, graph, kind, spaces), origin)
+
+
+def _load(path: Path) -> Any:
+    try:
+        import stable_baselines3
+        from stable_baselines3.common.save_util import load_from_zip_file
+    except ImportError as error:
+        raise ConfigError(f"--sb3 requires Stable-Baselines3: pip install 'policy-league[sb3]' ({error})") from error
+    try:
+        data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
+    except Exception as error:
+        raise ConfigError(f"{path}: not a file of Stable-Baselines3: {one_line(error)}") from error
+    policy_class = str(getattr((data or {}).get("policy_class"), "__module__", ""))
+    found = [name for name in FORMATS if f".{name.lower()}." in policy_class]
+    candidates = found or (["PPO", "A2C"] if "common.policies" in policy_class else [])
+    for name in candidates:
+        try:
+            return getattr(stable_baselines3, name).load(path, device="cpu")
+        except Exception as error:
+            problem = one_line(error)
+    raise ConfigError(
+        f"{path}: cannot be loaded: {problem if candidates else f'policy of {policy_class or None}'}; "
+        f"supported: {', '.join(FORMATS)}"
+    )

@@ -1,0 +1,118 @@
+"""A model to import: its graph, how the graph corresponds to a policy, and the original to compare with."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+
+from league.errors import ConfigError, InvalidInput, one_line
+from league.interface import AgentInterface
+from league.policies.actions import dist_inputs_size
+from league.spaces import ACTION_MASK, DictSpace
+from training.importing.adapted_graph import check, decoded
+from training.importing.graph_mapping import GraphMapping, graph_inputs, inferred
+
+State = dict[str, NDArray]
+"""Recurrent input of the source's graph → (k, …)"""
+
+
+class Original(Protocol):
+    """The model in the program that it was made with."""
+
+    def initial_state(self, rows: int) -> State:
+        """Return the state at the start of episodes."""
+
+    def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
+        """Return greedy actions (k, …), the logits or None, and the states after."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A model to import as one policy.
+
+    origin: what the manifest records: format, file, digest, mapping.
+    """
+
+    model: onnx.ModelProto
+    mapping: GraphMapping
+    original: Original
+    origin: dict[str, Any]
+
+
+class OnnxOriginal:
+    """A foreign graph, run by ONNX Runtime. Actions are computed from its output in NumPy."""
+
+    def __init__(self, model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface, source: str) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            self._session = onnxruntime.InferenceSession(
+                model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:
+            raise InvalidInput(f"{source}: ONNX Runtime cannot load the graph: {one_line(error)}") from error
+        assert not isinstance(spaces.action, DictSpace)
+        self._given, self._mapping, self._action, self._source = graph_inputs(model), mapping, spaces.action, source
+
+    def initial_state(self, rows: int) -> State:
+        """Return zeros."""
+        return {
+            name: np.zeros((rows, *(size or 1 for size in self._given[name][1][1:])), self._given[name][0])
+            for name in self._mapping.state
+        }
+
+    def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
+        """Run the graph. Raises InvalidInput if it fails."""
+        feed = dict(state)
+        for name, own in self._mapping.inputs.items():
+            dtype, shape = self._given[name]
+            value = observations[own.name].astype(dtype)
+            if own.transpose:
+                value = value.transpose(0, *(axis + 1 for axis in own.transpose))
+            feed[name] = value if None in shape[1:] else value.reshape(-1, *shape[1:])
+        try:
+            value, *after = self._session.run([self._mapping.output, *self._mapping.state.values()], feed)
+        except Exception as error:
+            raise InvalidInput(f"{self._source}: the graph fails on observations: {one_line(error)}") from error
+        actions = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)
+        logits = value if self._mapping.kind in ("logits", "values") else None
+        return actions, logits, dict(zip(self._mapping.state, after, strict=True))
+
+
+def onnx_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
+    """Read an ONNX file.
+
+    Args:
+        path: The file. Weights in separate files next to it are included.
+        mapping: File with a GraphMapping; by default `path` with the suffix .yaml if it exists, else it is inferred.
+        spaces: Spaces of the policy.
+        origin: Recorded in the manifest.
+
+    Raises:
+        ConfigError: A file cannot be read.
+        EnvironmentMismatch: The graph does not fit the spaces.
+    """
+    try:
+        model = onnx.load(str(path))
+        onnx.checker.check_model(model)
+    except Exception as error:
+        raise ConfigError(f"{path}: not an ONNX model: {one_line(error)}") from error
+    beside = path.with_suffix(".yaml")
+    file = mapping or (beside if beside.exists() else None)
+    names = GraphMapping.load(file) if file else inferred(model, spaces, str(path))
+    check(model, names, spaces, str(path))
+    return Source(model, names, OnnxOriginal(model, names, spaces, str(path)), origin)
+
+
+def known_logits(logits: NDArray | None, actions: NDArray, spaces: AgentInterface) -> NDArray:
+    """Logits for the search for near ties; without logits, no difference is excused."""
+    if logits is not None:
+        return logits
+    widths = np.arange(dist_inputs_size(spaces.action), dtype=np.float32)
+    return np.tile(widths, (len(actions), 1))

@@ -1,0 +1,126 @@
+"""Import of PyTorch modules and `torch.export` programs: converted to ONNX, compared with the module itself."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, one_line
+from league.interface import AgentInterface
+from league.spaces import ACTION_MASK, DictSpace
+from training.export.onnx_export import quiet
+from training.importing.adapted_graph import BATCH, check, decoded
+from training.importing.graph_mapping import GraphMapping, inferred
+from training.importing.source import Source, State
+
+Examples = dict[str, tuple[tuple[int, ...], torch.dtype]]
+"""Input of a module → shape without the batch, and dtype"""
+
+
+class ModuleOriginal:
+    """A PyTorch module without state. Actions are computed from its output in NumPy."""
+
+    def __init__(self, module: nn.Module, examples: Examples, mapping: GraphMapping, spaces: AgentInterface) -> None:
+        assert not isinstance(spaces.action, DictSpace)
+        self._module, self._examples, self._mapping, self._action = module, examples, mapping, spaces.action
+
+    def initial_state(self, rows: int) -> State:  # noqa: ARG002
+        """Return no state."""
+        return {}
+
+    def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
+        """Run the module."""
+        arguments = []
+        for name, (shape, dtype) in self._examples.items():
+            own = self._mapping.inputs[name]
+            value = torch.from_numpy(np.ascontiguousarray(observations[own.name])).to(dtype)
+            if own.transpose:
+                value = value.permute(0, *(axis + 1 for axis in own.transpose))
+            arguments.append(value.reshape(-1, *shape))
+        with torch.no_grad():
+            value = self._module(*arguments).numpy()
+        actions = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)
+        return actions, value if self._mapping.kind in ("logits", "values") else None, state
+
+
+def converted(module: nn.Module, examples: Examples, output: str, source: str) -> onnx.ModelProto:
+    """Return the graph of a module with these inputs and one output. Raises InvalidInput if it cannot be converted."""
+    # Two rows: torch.export treats a batch of one as constant.
+    tensors = tuple(torch.zeros((2, *shape), dtype=dtype) for shape, dtype in examples.values())
+    try:
+        with quiet():
+            program = torch.onnx.export(
+                module.eval(),
+                tensors,
+                dynamo=True,
+                input_names=list(examples),
+                output_names=[output],
+                dynamic_shapes=tuple({0: torch.export.Dim(BATCH)} for _ in tensors),
+                verbose=False,
+            )
+    except Exception as error:
+        cause = one_line(error.__cause__ or error)[:300]
+        raise InvalidInput(f"{source}: the model cannot be converted to ONNX: {cause}") from error
+    assert program is not None, "the exporter returns a program unless it is told to write one"
+    return program.model_proto
+
+
+def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
+    """Read a program that `torch.export.save` wrote, with a dynamic batch size and one output.
+
+    Args:
+        path: The file.
+        mapping: File with a GraphMapping; by default it is inferred.
+        spaces: Spaces of the policy.
+        origin: Recorded in the manifest.
+
+    Raises:
+        ConfigError: The file cannot be read.
+        EnvironmentMismatch: The program does not fit the spaces.
+        InvalidInput: The program cannot be converted to ONNX.
+    """
+    try:
+        program = torch.export.load(str(path))
+    except Exception as error:
+        raise ConfigError(f"{path}: not a torch.export program: {one_line(error)}") from error
+    names = [spec.arg.name for spec in program.graph_signature.input_specs if spec.kind.name == "USER_INPUT"]
+    placeholders = {node.name: node.meta["val"] for node in program.graph.nodes if node.op == "placeholder"}
+    examples: Examples = {name: _example(path, name, placeholders[name]) for name in names}
+    outputs = program.graph_signature.user_outputs
+    if len(outputs) != 1:
+        raise EnvironmentMismatch(f"{path}: the program has {len(outputs)} outputs, expected the one that decides")
+    with quiet():
+        exported = torch.onnx.export(
+            program, (), dynamo=True, input_names=names, output_names=["output"], verbose=False
+        )
+    assert exported is not None, "the exporter returns a program unless it is told to write one"
+    model = exported.model_proto
+    given = GraphMapping.load(mapping) if mapping else inferred(model, spaces, str(path))
+    check(model, given, spaces, str(path))
+    return Source(model, given, ModuleOriginal(_Called(program.module()), examples, given, spaces), origin)
+
+
+class _Called(nn.Module):
+    """The module of a program, which cannot be set to evaluation mode."""
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self._called = module
+
+    def forward(self, *arguments: Tensor) -> Tensor:
+        return self._called(*arguments)
+
+
+def _example(path: Path, name: str, value: Tensor) -> tuple[tuple[int, ...], torch.dtype]:
+    batch: Any = value.shape[0]
+    if type(batch) is int:
+        raise EnvironmentMismatch(
+            f"{path}: input {name} has a fixed batch size of {batch}; "
+            "export it with dynamic_shapes={0: torch.export.Dim('batch')}"
+        )
+    return tuple(int(size) for size in value.shape[1:]), value.dtype
