@@ -185,11 +185,11 @@ class _NightlyRun:
     def rate(self) -> None:
         """Play the missing or unfinished rating gauntlet of each version."""
         ledger = Ledger(self._registry)
-        digest = self._league.environment_digest
+        digest = self._league.game_digest
         begun = {
             schedule.contestants[0]: schedule
             for schedule in ledger.schedules(self._league.slug)
-            if schedule.kind == "gauntlet" and schedule.environment_digest == digest
+            if schedule.kind == "gauntlet" and schedule.game_digest == digest
         }
         versions = eligible(self._registry, self._league.slug)
         for previous, version in zip([None, *versions], versions, strict=False):

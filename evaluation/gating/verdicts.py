@@ -208,8 +208,8 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
     if now != tested_champion(verdict):
         holder = "there is no champion" if now is None else f"the champion is {verdict.league}@{now}"
         return f"{holder} now, but the test was against {verdict.champion}"
-    if _schedule(registry, verdict).environment_digest != registry.leagues.get(verdict.league).environment_digest:
-        return "the league's environment has changed"
+    if _schedule(registry, verdict).game_digest != registry.leagues.get(verdict.league).game_digest:
+        return "the league's game has changed"
     return None if now is None else _below_floor(registry, verdict, now)
 
 
@@ -345,13 +345,13 @@ def confirm(
 ) -> Confirmation | None:
     """Play the confirmation match of a promotion to its end and return the measured improvement.
 
-    None if nothing was promoted, no confirmation is configured, or the environment has changed.
+    None if nothing was promoted, no confirmation is configured, or the game has changed.
     """
     schedule = verdict.settings.get("confirmation")
     if verdict.outcome != "promote" or not is_effective(verdict) or schedule is None:
         return None
     whole = Ledger(registry).schedule(schedule)
-    if whole.environment_digest != registry.leagues.get(verdict.league).environment_digest:
+    if whole.game_digest != registry.leagues.get(verdict.league).game_digest:
         return None
     tournament.play_schedule(whole, registry=registry, workers=workers, listener=listener)
     return confirmation(registry, verdict)

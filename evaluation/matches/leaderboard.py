@@ -18,8 +18,8 @@ from league.results.records import BlockResult, Game, Match
 
 
 def compute_leaderboard(registry: Registry, league: str) -> tuple[Standing, ...]:
-    """All contestants in the league's current environment, best first. Raises UnknownLeague."""
-    digest = registry.leagues.get(league).environment_digest
+    """All contestants by the results of the league's current game, best first. Raises UnknownLeague."""
+    digest = registry.leagues.get(league).game_digest
     return rank_contestants(Ledger(registry).results(league, digest))
 
 
@@ -120,8 +120,7 @@ class CountedGames:
         schedules = {
             schedule.id: schedule
             for schedule in ledger.schedules(league.slug)
-            if schedule.id not in purged
-            and (schedule.environment_digest, schedule.sides) == (league.environment_digest, self._sides)
+            if schedule.id not in purged and (schedule.game_digest, schedule.sides) == (league.game_digest, self._sides)
         }
         leaderboard = rank_contestants(result for result in ledger.results(league.slug) if result.schedule in schedules)
         self._best = [standing.ref for standing in leaderboard[:MOST_CONTESTANTS]]

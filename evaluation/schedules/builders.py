@@ -254,13 +254,15 @@ def _schedule(
     }
     if of is not None:
         content |= {"kind": kind, "of": of}
-    name = digest(content)
+    game = config.game_digest()
     return Schedule(
-        id=f"{config.league}-{kind}-{name[:16]}",
+        id=f"{config.league}-{kind}-{digest(content | {'game': game})[:16]}",
         league=config.league,
         kind=kind,
-        seed=derive(seed, name),
+        # Without the game, so that the same games are played before and after a change of the code.
+        seed=derive(seed, digest(content)),
         environment_digest=config.environment.digest(),
+        game_digest=game,
         sides=tuple(interface.sides),
         contestants=tuple(contestants),
         pairings=tuple(pairings),

@@ -176,8 +176,8 @@ class Ledger:
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
-    def results(self, league: str, environment_digest: str | None = None) -> list[BlockResult]:
-        """Return the matches of a league without moves, in schedule order; of one environment if given.
+    def results(self, league: str, game_digest: str | None = None) -> list[BlockResult]:
+        """Return the matches of a league without moves, in schedule order; of one game (`LeagueConfig.game`) if given.
 
         Excludes purged schedules, and cross-play in one team, which does not show who is stronger.
         """
@@ -187,7 +187,7 @@ class Ledger:
             schedules = {
                 known.id: known
                 for known in _schedules(session, league)
-                if environment_digest in (None, known.environment_digest) and known.scoring != "team"
+                if game_digest in (None, known.game_digest) and known.scoring != "team"
             }
             found = session.execute(_in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None)))
             return [

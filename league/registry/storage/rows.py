@@ -31,6 +31,8 @@ class LeagueRow:
     interface: Interface
     interface_digest: str
     environment_digest: str
+    game_digest: str
+    """Of what decides results. Only results with the same digest are combined."""
     registered_at: datetime
 
 

@@ -86,7 +86,7 @@ def test_several_matches_are_stored_together_or_not_at_all(ledger: Ledger) -> No
 
 
 def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
-    other = replace(SCHEDULE, id="of another environment", environment_digest="0" * 64)
+    other = replace(SCHEDULE, id="of another game", game_digest="0" * 64)
     for schedule in (other, SCHEDULE):
         ledger.open(schedule)
         ledger.extend([play_match(schedule, position) for position in (2, 1)])
@@ -94,7 +94,7 @@ def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
         BlockResult(SCHEDULE.id, 1, ("tictactoe@1", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
         BlockResult(SCHEDULE.id, 2, ("tictactoe@2", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
     ]
-    assert ledger.results(LEAGUE, SCHEDULE.environment_digest) == mine
+    assert ledger.results(LEAGUE, SCHEDULE.game_digest) == mine
     assert [result.schedule for result in ledger.results(LEAGUE)] == [other.id] * 2 + [SCHEDULE.id] * 2
     assert ledger.results(LEAGUE, "1" * 64) == []
     with pytest.raises(UnknownLeague):
