@@ -9,9 +9,7 @@ down_revision = "0009"
 
 def upgrade() -> None:
     """Adds two columns."""
-    op.add_column("leagues", sa.Column("game", sa.JSON(), nullable=True))
-    op.add_column("leagues", sa.Column("game_digest", sa.String(length=64), nullable=True))
-    op.execute("UPDATE leagues SET game = '{}', game_digest = environment_digest")
-    with op.batch_alter_table("leagues") as leagues:
-        leagues.alter_column("game", existing_type=sa.JSON(), nullable=False)
-        leagues.alter_column("game_digest", existing_type=sa.String(length=64), nullable=False)
+    # With defaults: SQLite would remove them by replacing the table, which fails while others refer to it.
+    op.add_column("leagues", sa.Column("game", sa.JSON(), nullable=False, server_default="{}"))
+    op.add_column("leagues", sa.Column("game_digest", sa.String(length=64), nullable=False, server_default=""))
+    op.execute("UPDATE leagues SET game_digest = environment_digest")
