@@ -1,4 +1,4 @@
-"""The conditions under which the games of a league are played: its environment, and how versions select actions.
+"""The conditions under which the games of a league are played: which game it is, and how versions select actions.
 
 A version with greedy actions takes the most likely ones, which its opponents can predict. From them they can infer what
 they do not see. A version with sampled actions draws them from its distribution. In zero-sum games with hidden
@@ -33,7 +33,8 @@ VALUE_BASED = frozenset(("dqn", "qmix"))
 class Conditions(NamedTuple):
     """Results of games under different conditions are never combined."""
 
-    environment_digest: str
+    game_digest: str
+    """See `LeagueConfig.game`."""
     actions: ActionSelection
 
 

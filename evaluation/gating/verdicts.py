@@ -209,8 +209,8 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
         holder = "there is no champion" if now is None else f"the champion is {verdict.league}@{now}"
         return f"{holder} now, but the test was against {verdict.champion}"
     then, current = _schedule(registry, verdict).conditions, registry.leagues.get(verdict.league).conditions
-    if then.environment_digest != current.environment_digest:
-        return "the league's environment has changed"
+    if then.game_digest != current.game_digest:
+        return "the league's game has changed"
     if then.actions != current.actions:
         return f"the league plays with {current.actions} actions now, but the test was with {then.actions} ones"
     return None if now is None else _below_floor(registry, verdict, now)

@@ -21,7 +21,7 @@ from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, InvalidInput, LedgerConflict, VerdictRefuted
 from league.registry.registry import Registry
-from league.registry.storage.rows import VerdictRow
+from league.registry.storage.rows import LeagueRow, VerdictRow
 from league.registry.verdicts import VOID
 from league.results.ledger import Ledger
 from league.results.records import Match
@@ -116,5 +116,12 @@ def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], repla
                 for _ in replay(environment, league.config, league.interface, match, index):
                     pass
             except EnvironmentMismatch as error:
-                raise VerdictRefuted(f"verdict {row.id}: {error}") from error
+                raise VerdictRefuted(f"verdict {row.id}: {error}{_cause(registry, league, match)}") from error
     return wanted
+
+
+def _cause(registry: Registry, league: LeagueRow, match: Match) -> str:
+    """Name a changed environment as the cause of a game that cannot be replayed."""
+    if Ledger(registry).schedule(match.schedule).game_digest == league.config.game_digest():
+        return ""
+    return "; the environment has changed since then: its settings or code, a library, or the rules of play"

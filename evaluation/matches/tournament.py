@@ -174,7 +174,7 @@ def evaluate(
         LeagueError: UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and the errors of
             `play_schedule`.
     """
-    row = registry.leagues.get(league)
+    row = registry.leagues.follow_code(league)
     _check_options(schedule, against, budget)
     requested = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
     opponents: list[str] = []

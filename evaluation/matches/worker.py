@@ -47,9 +47,10 @@ class MatchWorker:
         Raises EnvironmentMismatch if the schedule is for another environment, and the errors of `play_matches` and of
         loading.
         """
-        if schedule.environment_digest != self.config.environment.digest():
+        if schedule.game_digest != self.config.game_digest():
             raise EnvironmentMismatch(
-                f"schedule {schedule.id} was created for another environment than league {schedule.league} has now"
+                f"schedule {schedule.id} was created for another game than league {schedule.league} has now: its"
+                " environment's settings or code, a library or the rules of play have changed"
             )
         positions = list(positions)
         refs = dict.fromkeys(ref for position in positions for ref in schedule.contestants_at(position))

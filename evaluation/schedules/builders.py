@@ -259,13 +259,15 @@ def _schedule(
         content |= {"kind": kind, "of": of}
     if actions != "greedy":  # otherwise the ids of the schedules that were created before there was a choice
         content["actions"] = actions
-    name = digest(content)
+    game = config.game_digest()
     return Schedule(
-        id=f"{config.league}-{kind}-{name[:16]}",
+        id=f"{config.league}-{kind}-{digest(content | {'game': game})[:16]}",
         league=config.league,
         kind=kind,
-        seed=derive(seed, name),
+        # Without the game, so that the same games are played before and after a change of the code.
+        seed=derive(seed, digest(content)),
         environment_digest=config.environment.digest(),
+        game_digest=game,
         sides=tuple(interface.sides),
         contestants=tuple(contestants),
         pairings=tuple(pairings),

@@ -1,10 +1,12 @@
 """The `environment` section, which each manifest repeats."""
 
+from importlib.metadata import version
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from league.config.base import JSON, Part
+from league.environment_code import environment_code
 from league.interface import digest
 
 
@@ -40,9 +42,20 @@ class EnvironmentConfig(Part):
     """A faster implementation of the environment, `package.module:Class`, a subclass of
     league.environments.vector.vector_env.VectorEnv. Some environments of PettingZoo and MPE2 have one by default."""
 
-    def digest(self) -> str:
-        """Return the SHA-256 of the environment. Results of environments with different digests are never combined.
+    revision: str | None = None
+    """Identifies the rules of the game. It replaces the digest of the source files, so that editing them does not start
+    a new game. Change it with the rules, and with data files that the environment reads."""
 
-        `vector` is no part of it, because it changes the speed only.
+    def digest(self) -> str:
+        """Return the SHA-256 of the settings. Versions only play in the environment that they were trained in.
+
+        `vector` is no part of it, because it changes the speed only, and `revision` identifies the code.
         """
-        return digest(self.model_dump(mode="json", exclude={"vector"}))
+        return digest(self.model_dump(mode="json", exclude={"vector", "revision"}))
+
+    def code(self) -> JSON:
+        """Return what identifies the environment's code: revision or source digest, and the versions of libraries."""
+        found = environment_code(self.entry_point)
+        identity: JSON = {"source": found.source} if self.revision is None else {"revision": self.revision}
+        libraries = found.libraries | ({"supersuit": version("supersuit")} if self.wrappers else {})
+        return {f"environment.{name}": value for name, value in identity.items()} | libraries

@@ -8,7 +8,7 @@ import yaml
 from pydantic import Field, ValidationError, field_validator
 
 from league.config.algorithms import TrainingConfig
-from league.config.base import Part
+from league.config.base import JSON, Part
 from league.config.environment import EnvironmentConfig
 from league.config.gate import GateConfig
 from league.config.play import PlayConfig
@@ -16,6 +16,7 @@ from league.config.ppo import PPOConfig
 from league.config.sweep import SweepConfig
 from league.config.validation_errors import describe_validation_error
 from league.errors import ConfigError, InvalidReference, one_line
+from league.interface import digest
 from league.refs import check_slug
 
 ONE_POLICY: dict[str, tuple[str, ...]] = {"shared": ("*",)}
@@ -73,6 +74,18 @@ class LeagueConfig(Part):
             return cls.model_validate(document)
         except ValidationError as error:
             raise ConfigError(f"{source}: {describe_validation_error(cls, error)}") from error
+
+    def game(self) -> JSON:
+        """Return what decides results: the environment's settings and code, and the rules of play, as flat JSON.
+
+        Results of different games are never combined.
+        """
+        rules = {f"play.{name}": value for name, value in self.play.rules().items()}
+        return {"environment": self.environment.digest(), **self.environment.code(), **rules}
+
+    def game_digest(self) -> str:
+        """Return the SHA-256 of `game`."""
+        return digest(self.game())
 
     def with_training(self, **settings: Any) -> Self:
         """Return the configuration with some training settings replaced. Raises ConfigError if it is invalid."""

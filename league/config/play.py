@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from league.config.base import Part
+from league.config.base import JSON, Part
 
 
 class PlayConfig(Part):
@@ -29,3 +29,10 @@ class PlayConfig(Part):
     are one step."""
     game_seconds: float = Field(default=600.0, gt=0, allow_inf_nan=False)
     """Seconds of environment time (resets and steps of this game alone) after which a game counts as hung."""
+
+    def rules(self) -> JSON:
+        """Return the settings that decide results: all but those of speed and of hung processes.
+
+        `actions` is not part of the game, because its default depends on the interface; see `league.conditions`.
+        """
+        return self.model_dump(mode="json", exclude={"num_envs", "game_seconds", "actions"})

@@ -122,11 +122,10 @@ def _current_marks(session: Session) -> dict[str, str]:
         for league, *values in session.execute(query):
             counts[league].append(f"{name}: {' '.join(map(str, values))}")
     table = LeagueTable
-    registered = session.execute(select(table.slug, table.config, table.interface).order_by(table.slug))
-    return {
-        league: "; ".join([str(FORMAT), digest({"config": config, "interface": interface})[:12], *counts[league]])
-        for league, config, interface in registered
-    }
+    registered = session.execute(
+        select(table.slug, table.config, table.interface, table.game_digest).order_by(table.slug)
+    )
+    return {league: "; ".join([str(FORMAT), digest(values)[:12], *counts[league]]) for league, *values in registered}
 
 
 def _row(snapshot: SnapshotTable) -> SnapshotRow:

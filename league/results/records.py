@@ -43,6 +43,9 @@ class Schedule:
     """`verdict`, `anchor`, `confirmation`, `gauntlet`; `round_robin`, `challenge`, `adaptive` or `cross_play`"""
     seed: int
     environment_digest: str
+    game_digest: str
+    """Of what decides results, see LeagueConfig.game; in schedules from before it was recorded, that of the
+    environment."""
     sides: tuple[str, ...]
     contestants: tuple[str, ...]
     """Pinned references: `connect_four@3`, `script:random`; never an alias."""
@@ -58,7 +61,7 @@ class Schedule:
     @property
     def conditions(self) -> Conditions:
         """Those under which the matches are played."""
-        return Conditions(self.environment_digest, self.actions)
+        return Conditions(self.game_digest, self.actions)
 
     def contestants_at(self, position: int) -> tuple[str, ...]:
         """Return the contestants of match `position`."""
@@ -234,6 +237,7 @@ def dump_schedule(schedule: Schedule) -> str:
 def load_schedule(text: str) -> Schedule:
     """Return the schedule that `dump_schedule` wrote."""
     fields = json.loads(text)
+    fields.setdefault("game_digest", fields["environment_digest"])
     fields["pairings"] = tuple(tuple(pairing) for pairing in fields["pairings"])
     return Schedule(**fields | {name: tuple(fields[name]) for name in ("sides", "contestants")})
 

@@ -32,12 +32,14 @@ class LeagueRow:
     interface: Interface
     interface_digest: str
     environment_digest: str
+    game_digest: str
+    """Of what decides results. Only results with the same digest are combined."""
     registered_at: datetime
 
     @property
     def conditions(self) -> Conditions:
         """Those of the games that count."""
-        return Conditions(self.environment_digest, action_selection(self.config, self.interface))
+        return Conditions(self.game_digest, action_selection(self.config, self.interface))
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,6 +67,9 @@ class LeagueTable(Base):
     interface: Mapped[dict[str, Any]] = mapped_column(JSON)
     interface_digest: Mapped[str] = mapped_column(String(64))
     environment_digest: Mapped[str] = mapped_column(String(64))
+    game: Mapped[dict[str, Any]] = mapped_column(JSON)
+    """What decides results, see LeagueConfig.game; empty if the league was registered before it was recorded."""
+    game_digest: Mapped[str] = mapped_column(String(64))
     last_version: Mapped[int]
     """The highest number ever reserved. Numbers are never reused."""
     registered_at: Mapped[datetime] = mapped_column(Utc)

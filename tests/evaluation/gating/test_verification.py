@@ -129,6 +129,22 @@ def test_a_modified_game_is_detected_by_replay(registry: Registry) -> None:
         verify(row.id, registry=registry, replays=2)
 
 
+def test_a_changed_environment_is_named_as_the_cause(registry: Registry) -> None:
+    """The moves stand for a changed `step`: either way the game does not end as recorded."""
+    row = verdicts(registry)[0]
+
+    def change(moves: list[Any]) -> None:
+        for game in moves[2]:
+            game[1] = game[1][:-1]
+
+    change_moves(registry, row.id, change)
+    league = registry.leagues.get(tictactoe.LEAGUE)
+    environment = league.config.environment.model_copy(update={"revision": "2"})
+    registry.leagues.register(league.config.model_copy(update={"environment": environment}), league.interface)
+    with pytest.raises(VerdictRefuted, match=r"cannot be replayed.*the environment has changed since then"):
+        verify(row.id, registry=registry, replays=2)
+
+
 def test_a_void_verdict_is_verified_as_far_as_it_was_tested(tmp_path: Path) -> None:
     registry = league_of(tmp_path, STRONG, WEAK)
     row = registry.leagues.get(tictactoe.LEAGUE)

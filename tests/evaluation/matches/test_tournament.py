@@ -88,7 +88,16 @@ def test_a_schedule_of_another_environment_is_rejected(registry: Registry) -> No
     row = registry.leagues.get(tictactoe.LEAGUE)
     environment = {**row.config.environment.model_dump(), "kwargs": {"screen_height": 500}}
     registry.leagues.register(tictactoe.config(environment=environment), row.interface)
-    with pytest.raises(EnvironmentMismatch, match="another environment"):
+    with pytest.raises(EnvironmentMismatch, match="another game than league tictactoe has now"):
+        play_schedule(schedule, registry=registry)
+
+
+def test_a_schedule_of_other_openings_is_rejected(registry: Registry) -> None:
+    schedule = tournament_schedule(registry)
+    Ledger(registry).open(schedule)
+    row = registry.leagues.get(tictactoe.LEAGUE)
+    registry.leagues.register(tictactoe.config(play={"opening_plies": 5}), row.interface)
+    with pytest.raises(EnvironmentMismatch, match="another game than league tictactoe has now"):
         play_schedule(schedule, registry=registry)
 
 

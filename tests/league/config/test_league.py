@@ -97,6 +97,30 @@ def test_the_environment_digest_depends_on_the_environment_only() -> None:
     assert config.environment.digest() != other_environment.environment.digest()
 
 
+@pytest.mark.parametrize(
+    ("change", "is_other_game"),
+    [
+        ({"play": {"opening_plies": 2}}, True),
+        ({"play": {"max_moves": 100}}, True),
+        ({"environment": MINIMAL["environment"] | {"kwargs": {"screen_height": 500}}}, True),
+        ({"environment": MINIMAL["environment"] | {"revision": "2"}}, True),
+        ({"environment": MINIMAL["environment"] | {"vector": "my_games.fast:Fast"}}, False),
+        ({"play": {"num_envs": 3, "game_seconds": 5.0}}, False),
+        ({"training": {"lr": 1e-5}}, False),
+    ],
+)
+def test_the_game_is_what_decides_results(change: dict, is_other_game: bool) -> None:
+    before, after = (LeagueConfig.from_mapping(document) for document in (MINIMAL, MINIMAL | change))
+    assert (before.game_digest() != after.game_digest()) == is_other_game
+
+
+def test_the_revision_and_the_rules_of_play_do_not_exclude_versions() -> None:
+    plain = LeagueConfig.from_mapping(MINIMAL)
+    environment = MINIMAL["environment"] | {"revision": "2"}
+    revised = LeagueConfig.from_mapping(MINIMAL | {"environment": environment, "play": {"opening_plies": 2}})
+    assert plain.environment.digest() == revised.environment.digest()
+
+
 def test_wrappers_can_have_arguments() -> None:
     environment = MINIMAL["environment"] | {"wrappers": ["flatten_v0", {"frame_stack_v1": {"stack_size": 3}}]}
     wrappers = LeagueConfig.from_mapping(MINIMAL | {"environment": environment}).environment.wrappers

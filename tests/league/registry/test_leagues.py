@@ -1,7 +1,12 @@
+import logging
+
 import pytest
 
+from league.config.league import LeagueConfig
 from league.errors import InterfaceChanged, UnknownLeague
 from league.registry.registry import Registry
+from league.results.ledger import Ledger
+from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, config, interface, publish, registered
 
 
@@ -11,6 +16,7 @@ def test_a_league_is_stored_as_registered(registry: Registry) -> None:
     assert row.interface == interface()
     assert row.interface_digest == interface().digest()
     assert row.environment_digest == config().environment.digest()
+    assert row.game_digest == config().game_digest()
 
 
 def test_leagues_are_listed_by_name(registry: Registry) -> None:
@@ -45,3 +51,35 @@ def test_an_unknown_league_is_reported_with_the_known_ones(empty: Registry) -> N
     registered(empty)
     with pytest.raises(UnknownLeague, match=f"no league 'chess'; known: {LEAGUE}"):
         empty.versions.all("chess")
+
+
+def test_a_change_of_the_game_is_reported_once_it_concerns_results(
+    registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = LeagueConfig.from_mapping(config().model_dump(by_alias=True) | {"play": {"opening_plies": 4}})
+    with caplog.at_level(logging.WARNING):
+        registry.leagues.register(other, interface())
+        registry.leagues.register(config(), interface())
+        assert caplog.messages == []
+        ledger = Ledger(registry)
+        ledger.open(SCHEDULE)
+        ledger.append(play_match(SCHEDULE, 0))
+        registry.leagues.register(config(), interface())
+        assert caplog.messages == []
+        registry.leagues.register(other, interface())
+    assert len(caplog.messages) == 1
+    assert "the game has changed: play.opening_plies 0 → 4. Earlier results can be viewed" in caplog.messages[0]
+    row = registry.leagues.get(LEAGUE)
+    assert ledger.results(LEAGUE, row.game_digest) == []
+    assert len(ledger.results(LEAGUE)) == 1
+    assert row.environment_digest == SCHEDULE.environment_digest
+
+
+def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = registry.leagues.get(LEAGUE)
+    assert registry.leagues.follow_code(LEAGUE) == before
+    changed = config(revision="2").game()
+    monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
+    after = registry.leagues.follow_code(LEAGUE)
+    assert after.game_digest == config().game_digest() != before.game_digest
+    assert after.config == before.config

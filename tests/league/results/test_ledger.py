@@ -86,7 +86,7 @@ def test_several_matches_are_stored_together_or_not_at_all(ledger: Ledger) -> No
 
 
 def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
-    other = replace(SCHEDULE, id="of another environment", environment_digest="0" * 64)
+    other = replace(SCHEDULE, id="of another game", game_digest="0" * 64)
     for schedule in (other, SCHEDULE):
         ledger.open(schedule)
         ledger.extend([play_match(schedule, position) for position in (2, 1)])

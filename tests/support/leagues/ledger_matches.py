@@ -13,6 +13,7 @@ SCHEDULE = Schedule(
     kind="round_robin",
     seed=2**63 - 1,
     environment_digest=config().environment.digest(),
+    game_digest=config().game_digest(),
     sides=("player_1", "player_2"),
     contestants=("tictactoe@1", "tictactoe@2", "script:random"),
     pairings=((0, 1), (0, 2), (1, 2)),

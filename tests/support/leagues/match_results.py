@@ -18,6 +18,7 @@ SCHEDULE = Schedule(
     kind="round_robin",
     seed=7,
     environment_digest="0" * 64,
+    game_digest="0" * 64,
     sides=("player_0", "player_1"),
     contestants=("board@1", "board@2", "script:random"),
     pairings=((0, 1), (0, 2), (1, 2)),

@@ -107,6 +107,7 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
             "matches": ("league", "first", "second"),
             "acknowledgements": ("event",),
             "versions": ("retired_at",),
+            "leagues": ("game", "game_digest"),
         }
         for table, columns in added.items():
             for column in columns:
@@ -117,6 +118,8 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
     registry.close()
     upgraded = Registry.open(storage)
     assert Ledger(upgraded).page(LEAGUE) == expected
+    row = upgraded.leagues.get(LEAGUE)
+    assert row.game_digest == row.environment_digest
     assert Ledger(upgraded).page(LEAGUE, contestants=("script:random", "tictactoe@1"), limit=1) == expected[:1]
     upgraded.close()
 

@@ -1,0 +1,111 @@
+"""The code that decides what happens in an environment: its source files, and the versions of libraries it imports.
+
+Modules are found as Python would import them, but are not executed. Data files and modules whose names are computed at
+run time are not found: `environment.revision` covers them.
+"""
+
+import ast
+import hashlib
+import sys
+import sysconfig
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+from importlib.machinery import SOURCE_SUFFIXES, FileFinder, ModuleSpec, SourceFileLoader
+from importlib.util import find_spec, resolve_name
+from pathlib import Path
+
+WITHOUT_INFLUENCE = frozenset(
+    {"PIL", "cv2", "farama_notifications", "imageio", "matplotlib", "pygame", "pyglet", "typing_extensions"}
+)
+"""Packages that show games or annotate code and do not decide results."""
+_LIBRARIES = tuple(Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib"))
+
+
+@dataclass(frozen=True, slots=True)
+class EnvironmentCode:
+    """source: SHA-256 of the source files that are not installed libraries. libraries: distribution → version."""
+
+    source: str
+    libraries: dict[str, str]
+
+
+@cache
+def environment_code(entry_point: str) -> EnvironmentCode:
+    """Return the code behind an entry point, `package.module` or `package.module:function`.
+
+    It is read once per process, which also imports the environment once. Source files are the entry point's module and
+    every module outside of the installed libraries that it imports, directly or through others. An entry point that
+    does not exist has no code.
+    """
+    start = entry_point.partition(":")[0]
+    package = start.partition(".")[0]
+    source, libraries = hashlib.sha256(), set[str]()
+    seen, waiting = set[str](), [start]
+    texts: dict[str, str] = {}
+    while waiting:
+        name = waiting.pop()
+        top = name.partition(".")[0]
+        if name in seen or top in sys.stdlib_module_names or top in WITHOUT_INFLUENCE:
+            continue
+        seen.add(name)
+        spec = _spec(name)
+        if spec is None or not spec.origin or not Path(spec.origin).is_file():
+            continue
+        is_library = any(Path(spec.origin).is_relative_to(folder) for folder in _LIBRARIES)
+        if is_library:
+            libraries.add(top)
+        if (is_library and top != package) or not spec.origin.endswith(".py"):
+            continue
+        text = Path(spec.origin).read_text(encoding="utf-8")
+        if not is_library:
+            texts[name] = text
+        waiting += [name.rpartition(".")[0]] if "." in name else []
+        waiting += _imports(text, name, is_package=spec.submodule_search_locations is not None)
+    for name in sorted(texts):
+        source.update(f"{name}\0{texts[name]}\0".encode())
+    return EnvironmentCode(source.hexdigest(), dict(sorted(_versions(libraries))))
+
+
+def _spec(name: str) -> ModuleSpec | None:
+    """Find a module without importing its parents."""
+    parent, _, _ = name.rpartition(".")
+    if not parent:
+        try:
+            return find_spec(name)
+        except ValueError:  # A module without a specification, such as __main__.
+            return None
+    above = _spec(parent)
+    folders = above.submodule_search_locations if above else None
+    found = (FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name) for folder in folders or ())
+    return next(filter(None, found), None)
+
+
+def _imports(text: str, module: str, *, is_package: bool) -> Iterator[str]:
+    """Yield the modules that a source text imports, and names that may be modules."""
+    package = module if is_package else module.rpartition(".")[0]
+    try:
+        tree = ast.parse(text)
+    except SyntaxError:  # The module cannot be imported either.
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            origin = resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module or ""
+            yield origin
+            yield from (f"{origin}.{alias.name}" for alias in node.names if alias.name != "*")
+
+
+def _versions(packages: set[str]) -> Iterator[tuple[str, str]]:
+    """Yield distribution and version of each installed package."""
+    unknown = set[str]()
+    for package in packages:
+        try:
+            yield package, metadata.version(package)
+        except metadata.PackageNotFoundError:
+            unknown.add(package)
+    if unknown:
+        names = metadata.packages_distributions()
+        yield from ((name, metadata.version(name)) for package in unknown for name in names.get(package, ()))
