@@ -250,14 +250,17 @@ def _entries(session: Session, found: Subquery, limit: int) -> list[LedgerEntry]
     """Join rows of the ledger with their schedules, newest first."""
     schedule, newest_first = tables.ScheduleTable, (found.c[column.key].desc() for column in _PLAYED)
     query = select(*found.c, schedule.kind, schedule.purged_at).join(schedule, schedule.id == found.c.schedule)
+    rows = session.execute(query.order_by(*newest_first).limit(limit)).all()
+    schedules = {name: _schedule(session, name) for name in {each.schedule for each in rows}}
     return [
         LedgerEntry(
             _result(each, (each.first, each.second)),
             kind=each.kind,
             played_at=each.played_at,
             is_purged=each.purged_at is not None,
+            conditions=schedules[each.schedule].conditions,
         )
-        for each in session.execute(query.order_by(*newest_first).limit(limit))
+        for each in rows
     ]
 
 

@@ -171,6 +171,7 @@ class LedgerEntry:
     """Kind of its schedule."""
     played_at: datetime
     is_purged: bool
+    conditions: Conditions
     """Whether it is excluded from results."""
 
     @property

@@ -15,6 +15,7 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import Response
 
+from league.conditions import Conditions
 from league.errors import InvalidInput, UnknownMatch
 from league.refs import check_slug
 from league.registry.registry import Registry
@@ -39,7 +40,8 @@ class ResultRoutes:
         def query(registry: Registry) -> dict[str, Any]:
             rows = Ledger(registry).page(league, contestants=pair, before=before, limit=limit + 1)
             page, more = parsing.paginate(rows, limit, lambda row: row.id)
-            return {"league": league, "matches": list(map(_listed, page)), "next": more}
+            current = registry.leagues.get(league).conditions
+            return {"league": league, "matches": [_listed(entry, current) for entry in page], "next": more}
 
         return await parsing.query_response(self._models, query)
 
@@ -90,7 +92,7 @@ def _pair(request: Request) -> tuple[str, str] | None:
     return first, second
 
 
-def _listed(entry: LedgerEntry) -> dict[str, Any]:
+def _listed(entry: LedgerEntry, current: Conditions) -> dict[str, Any]:
     result = entry.result
     return {
         "match": entry.id,
@@ -101,20 +103,20 @@ def _listed(entry: LedgerEntry) -> dict[str, Any]:
         "scores": list(result.scores),
         "returns": result.returns and list(result.returns),
         "games": result.games,
-        "counts": not entry.is_purged,
+        "counts": not entry.is_purged and entry.conditions == current,
         "played_at": entry.played_at.isoformat(),
     }
 
 
 def _one(registry: Registry, league: str, name: str) -> dict[str, Any]:
     ledger = Ledger(registry)
-    registry.leagues.get(league)
+    current = registry.leagues.get(league).conditions
     entry = ledger.entry(name)
     schedule, match = ledger.scheduled_match(name)
     if match.league != league:
         raise UnknownMatch(f"league {league} has no match {name!r}")
     games = [_game(number, game, match, schedule) for number, game in enumerate(match.games)]
-    return {"league": league} | _listed(entry) | {"seed": match.seed, "games": games}
+    return {"league": league} | _listed(entry, current) | {"seed": match.seed, "games": games}
 
 
 def _game(number: int, game: Game, match: Match, schedule: Schedule) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The data for web pages of a league: leaderboard, verdicts, matches, training runs, alias history."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,19 @@ def test_matches_are_listed_newest_first(reader: TestClient) -> None:
     assert newest["contestants"] == ["board@2", "script:random"]
     assert (newest["scores"], newest["returns"], newest["games"]) == ([1.5, 0.5], None, 2)
     assert (matches[2]["returns"], matches[2]["counts"]) == ([1.25, -0.75], True)
+
+
+def test_matches_of_another_game_are_listed_but_not_counted(storage: Storage, reader: TestClient) -> None:
+    with closing(Registry.open(storage)) as registry:
+        row = registry.leagues.get("board")
+        play = row.config.play.model_copy(update={"opening_plies": 3})
+        registry.leagues.register(row.config.model_copy(update={"play": play}), row.interface)
+        try:
+            matches = get(reader, f"{BOARD}/matches", "Matches")["matches"]
+        finally:
+            registry.leagues.register(row.config, row.interface)
+    assert len(matches) == 7
+    assert not any(match["counts"] for match in matches)
 
 
 def test_matches_of_a_pair_are_listed_in_either_order(reader: TestClient) -> None:

@@ -39,12 +39,13 @@ def record(registry: Registry) -> None:
 def _matches(registry: Registry) -> None:
     """Six matches, the last with a forfeited game, and one match of a purged schedule."""
     ledger = Ledger(registry)
-    purged = replace(SCHEDULE, id="board-gauntlet-2", kind="gauntlet")
-    for schedule in (SCHEDULE, purged):
+    current = replace(SCHEDULE, game_digest=registry.leagues.get(LEAGUE).game_digest)
+    purged = replace(current, id="board-gauntlet-2", kind="gauntlet")
+    for schedule in (current, purged):
         ledger.open(schedule)
     for position in range(5):
-        ledger.append(play_match(SCHEDULE, position))
-    last = play_match(SCHEDULE, 5)
+        ledger.append(play_match(current, position))
+    last = play_match(current, 5)
     forfeit = Forfeit(contestant=1, agent="player_1", reason="illegal_action")
     ledger.append(replace(last, games=(replace(last.games[0], forfeits=(forfeit,)), last.games[1])))
     ledger.append(play_match(purged, 0))
@@ -99,6 +100,7 @@ def snapshots() -> dict[str, Any]:
             "matches": 6,
             "unique_games": 12,
             "scoring": "game",
+            "actions": "greedy",
             "sides": ["player_0", "player_1"],
             "environment": "games.none:none",
             "environment_digest": "0" * 64,
