@@ -35,6 +35,9 @@ PANELS = {
     },
     "Evaluate": {
         "evaluate": Subcommand("cli.evaluation:evaluate", "Play a tournament; print leaderboard and payoff matrix."),
+        "exploitability": Subcommand(
+            "cli.exploitability:exploitability", "Play a version against its exploiters; print their scores."
+        ),
         "nightly": Subcommand("cli.nightly:nightly", "Test new versions, promote the best and update the ratings."),
         "report": Subcommand("cli.report:report", "Write a league's leaderboard, verdicts and upsets as one page."),
         "replay": Subcommand("cli.replay:replay", "Record a game as an animated image, or show it in a window."),

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
@@ -94,9 +94,20 @@ Job = Annotated[
 ]
 
 
+RoleName = Annotated[
+    Literal["main", "exploiter"], typer.Option("--role", help="`exploiter`: a run against one version only.")
+]
+Against = Annotated[
+    str | None,
+    typer.Option(metavar="REF", help="The opponent of an exploiter in all episodes, such as connect_four@champion."),
+]
+
+
 def train(
     config: Config,
     parent: Parent = None,
+    role: RoleName = "main",
+    against: Against = None,
     resume: Resume = False,
     address: Address = None,
     job: Job = False,
@@ -115,6 +126,9 @@ def train(
     trained network. TensorBoard logs are written to LEAGUE_HOME/runs. Ctrl-C publishes the current state and exits;
     `league train CONFIG --resume` continues after an interruption.
 
+    With --role exploiter, the version named by --against is the opponent in all episodes, and the published versions
+    cannot become champion. `--resume --role exploiter` continues the newest exploiter's run.
+
     A job continues when this command exits. Custom environments must be installed on the cluster.
 
     Next step: `league nightly CONFIG` finds the strongest version and promotes it.
@@ -122,7 +136,9 @@ def train(
     settings = _without_none(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus)
     league = _load(config, settings)
     if job:
-        options = _without_none(**{"from": parent}, **settings)
+        options = _without_none(
+            **{"from": parent, "role": None if role == "main" else role}, against=against, **settings
+        )
         _submit(address, find(config), options, resume, (cpus, object_store, dashboard))
         return
     from league.ray_cluster import LocalRay
@@ -132,7 +148,9 @@ def train(
         published = run(
             league,
             registry=open_registry(),
-            parent=None if parent is None else CheckpointRef.parse(of_league(parent, league.league)),
+            parent=_version(parent, league),
+            role=role,
+            target=_version(against, league),
             resume=resume,
             address=address,
             local=LocalRay(cpus, object_store, dashboard),
@@ -279,6 +297,10 @@ def _load(config: str, settings: dict[str, object]) -> "LeagueConfig":
     from league.config.league import LeagueConfig
 
     return LeagueConfig.load(find(config)).with_training(**settings)
+
+
+def _version(ref: str | None, league: "LeagueConfig") -> CheckpointRef | None:
+    return None if ref is None else CheckpointRef.parse(of_league(ref, league.league))
 
 
 def _without_none(**options: object) -> dict[str, object]:

@@ -37,11 +37,12 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
         say(f"{league} has no versions yet. Create one: league train CONFIG")
         return
     table(
-        ("version", "aliases", "rating", "games", "steps", "parent", "created", "note"),
+        ("version", "aliases", "role", "rating", "games", "steps", "parent", "created", "note"),
         [
             (
                 row.number,
                 ", ".join(row.aliases) if row.retired_at is None else "retired",
+                row.role if row.exploits is None else f"{row.role} of {row.exploits}",
                 elo(document["rating"], document["interval"]),
                 document["games"],
                 row.steps,
@@ -74,6 +75,8 @@ def _document(row: "VersionRow", standing: Any) -> dict[str, Any]:
         "games": standing.games if standing else 0,
         "steps": row.steps,
         "parent": row.parent,
+        "role": row.role,
+        "exploits": row.exploits,
         "sha256": row.sha256,
         "created_at": row.created_at,
         "retired_at": row.retired_at,

@@ -78,6 +78,34 @@ class Difference(Document):
 
 
 @dataclass(frozen=True, slots=True)
+class ExploiterScore(Document):
+    """Mean score of an exploiter over its games against a version, in [0, 1], with an interval.
+
+    gain: mean return of the exploiter minus that of the version; None without a game that ended.
+    """
+
+    ref: str
+    games: int
+    score: float
+    low: float
+    high: float
+    gain: Difference | None
+
+
+@dataclass(frozen=True, slots=True)
+class Exploitability(Document):
+    """Learned exploitability of a version. The intervals hold jointly with 95 %.
+
+    bound: what a best response scores at least: the highest lower bound of the exploiters. exploiters: by lower bound,
+    highest first.
+    """
+
+    ref: str
+    bound: float
+    exploiters: tuple[ExploiterScore, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Payoff(Document):
     """Payoff matrix. score[i][j]: mean score of i against j over games[i][j] games; None if they did not meet.
 

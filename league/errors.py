@@ -130,6 +130,10 @@ class NameTaken(Conflict, code="name_taken"):
     """A name that must be unique is already in use."""
 
 
+class NotPromotable(Conflict, code="not_promotable"):
+    """The version's role excludes it from promotion."""
+
+
 class KeyReused(Conflict, code="idempotency_key_reused"):
     """An Idempotency-Key was already used for a different request."""
 

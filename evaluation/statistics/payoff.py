@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 
 from evaluation.results import CrossPlay, Difference, Estimate, Payoff
 from league.results.records import Game, Match
@@ -43,6 +43,27 @@ def paired_difference(matches: Iterable[Match], contestant: str, confidence: flo
         if mine is not None and other is not None:
             gaps.append(mine - other)
     return student_interval(gaps, confidence) if gaps else None
+
+
+def score_interval(scores: Sequence[float], confidence: float = 0.95) -> tuple[float, float, float]:
+    """Mean of independent scores in [0, 1] with Wilson's interval.
+
+    A score in [0, 1] with the mean μ has at most the variance μ(1 − μ) of a Bernoulli variable, for which the interval
+    is made, so it is conservative. Unlike Student's, it has a width if all scores are equal. E. B. Wilson, "Probable
+    inference, the law of succession, and statistical inference" (1927).
+
+    Args:
+        scores: At least one score.
+        confidence: Coverage of the interval.
+
+    Returns:
+        Mean, lower and upper bound.
+    """
+    number, mean = len(scores), float(np.mean(scores))
+    z2 = float(ndtri(0.5 + confidence / 2)) ** 2
+    centre = (mean + z2 / (2 * number)) / (1 + z2 / number)
+    half = math.sqrt(z2 * (mean * (1 - mean) / number + z2 / (4 * number**2))) / (1 + z2 / number)
+    return mean, max(centre - half, 0.0), min(centre + half, 1.0)
 
 
 def student_interval(values: Sequence[float], confidence: float = 0.95) -> Difference:

@@ -15,6 +15,7 @@ from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.refs import CheckpointRef, ScriptRef, of_league, parse_ref
 from league.registry.registry import Registry
+from league.registry.storage.manifest import MAIN
 from league.registry.storage.rows import VersionRow
 
 
@@ -161,9 +162,14 @@ def check_plays(ref: ScriptRef, interface: Interface) -> None:
 
 
 def eligible(registry: Registry, league: str) -> list[VersionRow]:
-    """Return the versions trained in the league's current environment, except retired ones. Raises UnknownLeague."""
+    """Return the versions trained in the league's current environment, except retired ones and exploiters.
+
+    Raises UnknownLeague.
+    """
     now = registry.leagues.get(league).config.environment.digest()
-    present = (version for version in registry.versions.all(league) if version.retired_at is None)
+    present = (
+        version for version in registry.versions.all(league) if version.retired_at is None and version.role == MAIN
+    )
     return [version for version in present if version.manifest.environment_digest == now]
 
 

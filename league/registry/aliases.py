@@ -63,8 +63,8 @@ class AliasRepository(Repository):
 
         Returns the event in force. A repeated `call` changes nothing and returns its event. An alias already
         at `version` keeps its event, because a rollback must lead to another version.
-        Raises UnknownLeague, UnknownVersion, KeyReused, Conflict if `verdict` is closed, or AliasMoved if the alias
-        points elsewhere.
+        Raises UnknownLeague, UnknownVersion, NotPromotable for an exploiter as champion, KeyReused, Conflict if
+        `verdict` is closed, or AliasMoved if the alias points elsewhere.
         """
         check_alias(alias)
         with self._database.write() as session:
@@ -142,7 +142,8 @@ def _set(
 ) -> AliasEvent:
     if verdict is not None:
         verdicts.require_open(session, verdict)
-    versions.require_files(session, league, version)
+    require = versions.require_promotable if alias == CHAMPION else versions.require_files
+    require(session, league, version)
     last = _in_force(session, league, alias)
     _require(last, league, alias, expected)
     if last and last.version == version:

@@ -132,7 +132,13 @@ def finish(session: Session, manifest: Manifest, text: str, source: str) -> int:
         raise InterfaceChanged(f"version {manifest.version} has other spaces or policies than league {manifest.league}")
     if (faster := versions.find_by_source(session, manifest.league, source)) is not None:
         return faster
-    values = {"state": READY, "manifest": text, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    values = {
+        "state": READY,
+        "role": manifest.role,
+        "exploits": manifest.exploits,
+        "manifest": text,
+        "sha256": hashlib.sha256(text.encode()).hexdigest(),
+    }
     if not _leave_publishing(session, manifest.league, manifest.version, values):
         raise StorageError(f"publishing {manifest.league}@{manifest.version} took too long: its files were removed")
     return manifest.version
@@ -176,7 +182,7 @@ def is_dead(publisher: str, reserved_at: datetime) -> bool:
     return host == socket.gethostname() and not (_exists(int(pid)) and _start(int(pid)) == start)
 
 
-def _leave_publishing(session: Session, league: str, number: int, values: dict[str, str]) -> bool:
+def _leave_publishing(session: Session, league: str, number: int, values: dict[str, str | None]) -> bool:
     statement = update(VersionTable).filter_by(league=league, number=number, state=PUBLISHING).values(**values)
     return row_count(session, statement) == 1
 

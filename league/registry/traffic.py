@@ -53,7 +53,8 @@ class TrafficRepository(Repository):
         """Set the canary and the shadow of a league; None ends one, KEEP leaves it unchanged.
 
         Returns the setting in force, which is the old one if nothing differs. A repeated `call` changes nothing and
-        returns its setting. Raises UnknownLeague, UnknownVersion, UnknownAlias, InvalidInput or KeyReused.
+        returns its setting. Raises UnknownLeague, UnknownVersion, UnknownAlias, NotPromotable, InvalidInput or
+        KeyReused.
         """
         with self._database.write() as session:
             leagues.lock(session, league)
@@ -146,7 +147,7 @@ def _check(session: Session, league: str, portion: Portion) -> None:
     if not 0 <= portion.share <= 1:
         raise InvalidInput(f"share {portion.share:g} must be from 0 to 1")
     version = versions.resolve(session, CheckpointRef(league, portion.version))
-    versions.require_files(session, league, version.number)
+    versions.require_promotable(session, league, version.number)
 
 
 def _row(event: TrafficEventTable) -> Traffic:

@@ -7,12 +7,12 @@ from pathlib import Path
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
-from league.errors import InvalidInput, UnknownAlias, UnknownVersion, VersionRetired
+from league.errors import InvalidInput, NotPromotable, UnknownAlias, UnknownVersion, VersionRetired
 from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.manifest import Manifest
+from league.registry.storage.manifest import EXPLOITER, Manifest
 from league.registry.storage.rows import Note, VersionRow, detached
 from league.registry.storage.tables import READY, AliasTable, VersionNoteTable, VersionTable
 
@@ -58,6 +58,13 @@ class VersionRepository(Repository):
         with self._database.read() as session:
             leagues.require(session, league)
             return _rows(session, league, list(session.scalars(query)))
+
+    def exploiters(self, league: str, targets: Collection[str]) -> list[VersionRow]:
+        """Return the exploiters of the versions `targets`, except retired ones, oldest first. Raises UnknownLeague."""
+        query = _ready(league).where(VersionTable.exploits.in_(targets), VersionTable.retired_at.is_(None))
+        with self._database.read() as session:
+            leagues.require(session, league)
+            return _rows(session, league, list(session.scalars(query.order_by(VersionTable.number))))
 
     def numbers(self, league: str | None = None) -> dict[str, list[int]]:
         """Return league → version numbers, ascending, of one league or of all that have versions.
@@ -138,6 +145,16 @@ def require_files(session: Session, league: str, number: int) -> None:
     require(session, league, number)
     if session.get_one(VersionTable, (league, number)).retired_at is not None:
         _retired(league, number)
+
+
+def require_promotable(session: Session, league: str, number: int) -> None:
+    """Raise NotPromotable if the version is an exploiter. Raises what `require_files` raises."""
+    require_files(session, league, number)
+    version = session.get_one(VersionTable, (league, number))
+    if version.role == EXPLOITER:
+        raise NotPromotable(
+            f"{league}@{number} has the role {EXPLOITER} (of {version.exploits}): it cannot be promoted"
+        )
 
 
 def _retired(league: str, number: int) -> None:

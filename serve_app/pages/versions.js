@@ -51,7 +51,8 @@ function List({ league, versions, rated, champion, promote, edit, disabledReason
 function Row({ league, version: each, rated, champion, promote, edit, disabledReason }) {
   const others = each.aliases.filter((alias) => alias !== "champion");
   return html`<tr class=${each.version === champion ? "champion-row" : ""}>
-    <th scope="row"><${Ref} value="${league}@${each.version}" champion=${champion} />${others.map((alias) => html` <${Badge}>${alias}<//>`)}</th>
+    <th scope="row"><${Ref} value="${league}@${each.version}" champion=${champion} />${others.map((alias) => html` <${Badge}>${alias}<//>`)}
+      ${each.exploits && html` <${Badge}>exploiter of ${each.exploits}<//>`}</th>
     <td class="number strong">${signed(rated?.rating)}</td>
     <td class="nowrap muted">${interval(rated?.interval)}</td>
     <td class="number">${count(rated?.games)}</td>
@@ -60,7 +61,7 @@ function Row({ league, version: each, rated, champion, promote, edit, disabledRe
     <td>${each.parent == null ? html`<span class="muted">–</span>` : `@${each.parent}`}</td>
     <td class="nowrap"><${Time} at=${each.created_at} /></td>
     <td class="wrap"><${Note} note=${each.note} name="${league}@${each.version}" edit=${() => edit(each)} disabledReason=${disabledReason} /></td>
-    <td>${each.version !== champion && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
+    <td>${each.version !== champion && each.role === "main" && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
       aria-label="Promote ${league}@${each.version}">Promote …</button>`}</td>
   </tr>`;
 }

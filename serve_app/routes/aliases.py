@@ -66,7 +66,10 @@ class AliasRoutes:
         return await parsing.query_response(self._models, query)
 
     async def move(self, request: Request) -> JSONResponse:
-        """Point an alias at a version. Raises UnknownLeague, UnknownVersion, AliasMoved, KeyReused or InvalidInput."""
+        """Point an alias at a version.
+
+        Raises UnknownLeague, UnknownVersion, NotPromotable, AliasMoved, KeyReused or InvalidInput.
+        """
         league = check_slug("league", request.path_params["league"])
         alias = check_alias(request.path_params["alias"])
         body = parsing.parse_body(PromotionBody, await self._body(request))

@@ -170,6 +170,8 @@ def version_document(row: VersionRow) -> dict[str, Any]:
         "aliases": list(row.aliases),
         "sha256": row.sha256,
         "parent": row.parent,
+        "role": row.role,
+        "exploits": row.exploits,
         "steps": row.steps,
         "algorithm": row.manifest.algorithm,
         "policies": list(row.manifest.policies),

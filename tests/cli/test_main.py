@@ -19,7 +19,7 @@ def test_the_commands_are_complete() -> None:
     assert set(COMMANDS) == {
         "doctor", "check-env", "train", "sweep", "versions", "note", "evaluate", "promote", "rollback", "history",
         "nightly", "replay", "serve", "act", "demo", "replicas", "keys", "traffic", "verify", "void", "report",
-        "retire", "import", "export",
+        "retire", "import", "export", "exploitability",
     }  # fmt: skip
 
 
@@ -46,6 +46,8 @@ def test_each_command_and_option_has_help(name: str) -> None:
         (("promote", "tictactoe@1", "--alias", "12"), ("version number",)),
         (("promote", "tictactoe@1", "--expected", "x"), ("--expected",)),
         (("history", "tictactoe", "--at", "noon"), ("--at 'noon'",)),
+        (("exploitability", "tictactoe@1"), ("tictactoe@1 has no exploiters", "--role exploiter")),
+        (("train", "tictactoe", "--against", "@1"), ("--role exploiter", "--against")),
         (("evaluate", "tictactoe", "connect_four@1"), ("connect_four@1",)),
         (("evaluate", "tictactoe", "script:stockfish"), ("stockfish",)),
         (("evaluate", "tictactoe", "--against", "tictactoe@1"), ("against", "gauntlet")),

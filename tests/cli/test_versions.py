@@ -15,7 +15,7 @@ def test_versions_as_json(league: League, registry: Registry) -> None:
 
 def test_versions_as_a_table(league: League, registry: Registry) -> None:
     lines = league("versions", "tictactoe").out.splitlines()
-    assert lines[0].split()[:3] == ["version", "aliases", "rating"]
+    assert lines[0].split()[:4] == ["version", "aliases", "role", "rating"]
     assert len(lines) == 4
 
 

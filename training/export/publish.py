@@ -11,7 +11,7 @@ from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT
 from league.config.league import LeagueConfig
 from league.interface import Interface
 from league.registry.registry import Registry
-from league.registry.storage.manifest import PROBES, TRAINING, Manifest, PolicyManifest
+from league.registry.storage.manifest import EXPLOITER, MAIN, PROBES, TRAINING, Manifest, PolicyManifest
 from league.registry.storage.rows import VersionRow
 from league.stack import installed
 from training.algorithms.setup import module_spec
@@ -42,10 +42,12 @@ def publish(
     config: LeagueConfig,
     interface: Interface,
     parent: int | None,
+    exploits: str | None = None,
     git_commit: str | None,
 ) -> VersionRow:
     """Export the policies of `checkpoint`, check parity, and publish the graphs with the training state.
 
+    exploits: the version that an exploiter was trained against; None for other versions.
     Raises ParityError, and what publishing raises; no version exists then.
     """
 
@@ -70,6 +72,8 @@ def publish(
             seed=config.training.seed,
             steps=checkpoint.steps,
             parent=parent,
+            role=MAIN if exploits is None else EXPLOITER,
+            exploits=exploits,
             git_commit=git_commit,
             stack=installed(),
         )

@@ -64,6 +64,7 @@ class PublishQueue:
             config=self._run.record.config,
             interface=self._interface,
             parent=before[-1].number if before else self._run.record.parent,
+            exploits=self._run.record.exploits,
             git_commit=self._run.record.git_commit,
         )
         for directory in (path, copy):

@@ -31,6 +31,7 @@ from league.interface import Interface
 from league.policies.loading import contestant
 from league.refs import CheckpointRef, of_league, parse_ref
 from league.registry.registry import Registry
+from league.registry.storage.manifest import EXPLOITER, MAIN, Role
 from league.settings import Storage
 
 
@@ -67,6 +68,11 @@ def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface
         contestant(pinned, registry, interface)
         pins[written] = pinned
     return pins
+
+
+def against(config: LeagueConfig, target: str) -> LeagueConfig:
+    """Return the league with `target` as the opponent in all episodes."""
+    return config.with_training(opponents=[{"ref": target, "share": 1.0}])
 
 
 def _references(settings: TrainingSettings) -> list[str]:
@@ -122,9 +128,16 @@ class RunRecord(BaseModel):
     pins: dict[str, str] = {}
     """Opponents as the user wrote them → what they resolved to when the run began."""
     parent: int | None
+    exploits: str | None = None
+    """The version that an exploiter is trained against."""
     git_commit: str | None
     started_at: datetime
     complete: bool = False
+
+    @property
+    def role(self) -> Role:
+        """The role of its versions."""
+        return MAIN if self.exploits is None else EXPLOITER
 
 
 class RunDirectory:
@@ -147,29 +160,41 @@ class RunDirectory:
         parent: int | None,
         git_commit: str | None,
         pins: dict[str, str] | None = None,
+        exploits: str | None = None,
     ) -> Self:
-        """Create the directory of a new run. pins: what the opponents' references resolve to."""
+        """Create the directory of a new run.
+
+        pins: what the opponents' references resolve to. exploits: the version that an exploiter is trained against.
+        """
         pins = pins or {}
         config = with_pins(config, pins)
         now = datetime.now(UTC)
         path = _runs(storage, config.league) / f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
-        run = cls(path, RunRecord(config=config, pins=pins, parent=parent, git_commit=git_commit, started_at=now))
+        record = RunRecord(
+            config=config, pins=pins, parent=parent, exploits=exploits, git_commit=git_commit, started_at=now
+        )
+        run = cls(path, record)
         with disk_errors(path):
             path.mkdir(parents=True)
             run._write()
         return run
 
     @classmethod
-    def resume(cls, storage: Storage, config: LeagueConfig) -> Self:
-        """Open the league's newest run if it is incomplete: it was interrupted, or its budget is larger now.
+    def resume(cls, storage: Storage, config: LeagueConfig, role: Role = MAIN) -> Self:
+        """Open the league's newest run of a role if it is incomplete: it was interrupted, or its budget is larger now.
 
         Raises NotFound; ConfigError if `config` differs.
         """
         runs = _runs(storage, config.league)
-        newest = max(runs.glob(f"*/{RUN_FILE}"), default=None)
-        if newest is None:
-            raise NotFound(f"league {config.league} has no training run in {runs}: there is nothing to resume")
-        record = RunRecord.model_validate_json(newest.read_text())
+        files = sorted(runs.glob(f"*/{RUN_FILE}"), reverse=True)
+        records = ((file, RunRecord.model_validate_json(file.read_text())) for file in files)
+        newest, record = next((each for each in records if each[1].role == role), (None, None))
+        if newest is None or record is None:
+            raise NotFound(
+                f"league {config.league} has no training run with the role {role} in {runs}: there is nothing to resume"
+            )
+        if record.exploits is not None:
+            config = against(config, record.exploits)
         config = with_pins(config, record.pins)
         if (changed := changed_setting(record.config, config)) is not None:
             raise ConfigError(

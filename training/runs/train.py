@@ -15,11 +15,11 @@ from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
 from league.errors import ConfigError, InterfaceChanged
 from league.interface import Interface
-from league.policies.loading import check_scripts
+from league.policies.loading import check_eligible, check_scripts
 from league.ray_cluster import UNLIMITED, LocalRay, connected
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
-from league.registry.storage.manifest import TRAINING
+from league.registry.storage.manifest import EXPLOITER, MAIN, TRAINING, Role
 from league.registry.storage.rows import VersionRow
 from training.algorithms.off_policy import starts_with_empty_replay
 from training.algorithms.setup import algorithm_config, module_spec, num_envs
@@ -28,7 +28,7 @@ from training.rllib_compat import NotPickled, silence_tune
 from training.runs.error_messages import training_error
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
-from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, pin_opponents
+from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, against, pin_opponents
 from training.runs.run_reporter import RunReporter
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
 from training.runs.tune import Interrupted, cpu_share, fit, placement, run_config
@@ -46,6 +46,8 @@ def train(
     *,
     registry: Registry,
     parent: CheckpointRef | None = None,
+    role: Role = MAIN,
+    target: CheckpointRef | None = None,
     resume: bool = False,
     address: str | None = None,
     local: LocalRay = UNLIMITED,
@@ -64,9 +66,12 @@ def train(
         config: The league.
         registry: Where versions are published.
         parent: The version to continue from; the first version of the run records it as its parent.
-        resume: Continue the league's newest run, which was interrupted or has a larger budget now. Its versions stay,
-            and checkpoints that were saved but not published are published first. With a checkpoint interval in steps
-            and one runner, the versions equal those of an uninterrupted run.
+        role: The role of the versions.
+        target: The version that an exploiter is trained against, in all episodes and instead of `training.opponents`.
+            An alias is resolved at the start.
+        resume: Continue the league's newest run of this role, which was interrupted or has a larger budget now. Its
+            versions stay, and checkpoints that were saved but not published are published first. With a checkpoint
+            interval in steps and one runner, the versions equal those of an uninterrupted run.
         address: A running Ray cluster. None uses the Ray that this process is connected to, or starts one.
         local: Limits of a Ray that is started; it ends with the run.
         config_path: The file of `config`; its git commit is recorded in the manifests.
@@ -76,26 +81,38 @@ def train(
         All versions of this run, ascending, including those from before an interruption.
 
     Raises:
-        LeagueError: Nothing to resume, or changed settings; an unknown or incompatible parent; missing or incompatible
-            opponents; a run that another process works on; a cluster whose machines do not share storage; a fault of
-            the environment; an export that fails its parity check (earlier versions stay).
+        LeagueError: A new exploiter without a target, or a target without this role; nothing to resume, or changed
+            settings; an unknown or incompatible parent; missing or incompatible opponents; a run that another process
+            works on; a cluster whose machines do not share storage; a fault of the environment; an export that fails
+            its parity check (earlier versions stay).
     """
     if resume and parent is not None:
         raise ConfigError("a resumed run already has its parent: use either --from or --resume")
+    if (target is not None) != (role == EXPLOITER and not resume):
+        raise ConfigError(
+            "--role exploiter and --against belong together, except in a resumed run, which keeps its target"
+        )
     silence_tune()
     interface = interface_of(config)
     check(config, interface)
     check_scripts(config, interface)
     registry.leagues.register(config, interface)
+    exploits = None if target is None else _target(registry, target, config, interface)
+    if exploits is not None:
+        config = against(config, exploits)
     number = None if parent is None else _parent(registry, parent, config, interface).number
-    interrupted = RunDirectory.resume(registry.storage, config) if resume else None
+    interrupted = RunDirectory.resume(registry.storage, config, role) if resume else None
     pins = {} if interrupted else pin_opponents(config, registry, interface)
     with connected(address, registry.storage, local) as dashboard:
-        run = interrupted or RunDirectory.begin(registry.storage, config, number, git_commit(config_path), pins)
+        run = interrupted or RunDirectory.begin(
+            registry.storage, config, number, git_commit(config_path), pins, exploits
+        )
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
         with run.locked(), progress, RunReporter(registry, run) as reporter:
             progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
             progress.say(_parallel_environments(config, interface))
+            if run.record.exploits is not None:
+                progress.say(f"Role: {run.record.role}. Opponent in all episodes: {run.record.exploits}.")
             progress.say(describe_selection(config, interface))
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
@@ -142,6 +159,14 @@ def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
         raise InterfaceChanged(f"{version.ref} has other spaces or policies than the environment now")
     check_network(version, config)
     return version
+
+
+def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interface: Interface) -> str:
+    """Return the version that an exploiter is trained against, which must be able to play in the league now."""
+    if len(interface.sides) < 2:
+        raise ConfigError(f"--against: league {config.league} has one side only, so a version has no opponent")
+    check_eligible(str(ref), registry, config)
+    return registry.versions.resolve(ref).ref
 
 
 def check_network(version: VersionRow, config: LeagueConfig) -> None:

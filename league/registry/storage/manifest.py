@@ -1,6 +1,6 @@
 """The manifest of a version: `manifest.json`, the last file written and the root of all digests."""
 
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -15,6 +15,11 @@ TRAINING = "training"
 """Directory of RLlib's state, which only training reads."""
 PROBES = ".probes.npz"
 """Suffix of a policy's file of probes."""
+
+Role = Literal["main", "exploiter"]
+MAIN: Role = "main"
+EXPLOITER: Role = "exploiter"
+"""The role of a version that was trained against one version only. It cannot become champion."""
 
 
 class _Record(BaseModel):
@@ -73,6 +78,9 @@ class Manifest(_Record):
     steps: int
     """Actions of all agents during training, including its ancestors."""
     parent: int | None = None
+    role: Role = MAIN
+    exploits: str | None = None
+    """The version that an exploiter was trained against: `connect_four@3`."""
     git_commit: str | None = None
     stack: dict[str, str]
     """package → version"""
@@ -100,6 +108,8 @@ class Manifest(_Record):
                 raise ValueError(f"policy {name} has other spaces than its agents")
         if self.environment_digest != self.environment.digest():
             raise ValueError("environment_digest is not that of the environment")
+        if (self.role == EXPLOITER) != (self.exploits is not None):
+            raise ValueError(f"role {self.role} does not fit exploits {self.exploits}: exploiters name one version")
         return self
 
     def to_json(self) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 from league.conditions import Conditions, action_selection
 from league.histograms import Histogram
 from league.interface import Interface
-from league.registry.storage.manifest import Manifest
+from league.registry.storage.manifest import Manifest, Role
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -74,6 +74,15 @@ class VersionRow:
     @property
     def parent(self) -> int | None:
         return self.manifest.parent
+
+    @property
+    def role(self) -> Role:
+        return self.manifest.role
+
+    @property
+    def exploits(self) -> str | None:
+        """The version that an exploiter was trained against."""
+        return self.manifest.exploits
 
     @property
     def steps(self) -> int:

@@ -20,6 +20,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+from league.registry.storage.manifest import MAIN
+
 PUBLISHING, READY, ABANDONED = "publishing", "ready", "abandoned"
 """States of a version. Only `ready` versions are visible to others than their publisher."""
 
@@ -96,6 +98,10 @@ class VersionTable(Base):
     state: Mapped[str] = mapped_column(String(16))
     source: Mapped[str] = mapped_column(Text)
     parent: Mapped[int | None]
+    role: Mapped[str] = mapped_column(String(16), default=MAIN, server_default=MAIN)
+    """As in the manifest."""
+    exploits: Mapped[str | None] = mapped_column(Text)
+    """As in the manifest."""
     publisher: Mapped[str] = mapped_column(Text)
     """The process that writes it, see `publishing.this_process`."""
     reserved_at: Mapped[datetime] = mapped_column(Utc)

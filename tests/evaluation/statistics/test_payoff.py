@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.statistics.payoff import tabulate
+from evaluation.statistics.payoff import score_interval, tabulate
 from evaluation.statistics.population import alpha_rank, nash_averaging, resampled_interval, resampled_scores
 from tests.support.closeness import close
 from tests.support.leagues.payoff_matches import match
@@ -148,3 +148,17 @@ def test_invalid_tables_are_rejected(scores: object) -> None:
         alpha_rank(scores)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="antisymmetric"):
         nash_averaging(scores)  # type: ignore[arg-type]
+
+
+def test_the_interval_of_equal_scores_has_a_width() -> None:
+    """Wilson's interval of ten wins in ten games is [0.722, 1]."""
+    assert score_interval([1.0] * 10) == pytest.approx((1.0, 0.72247, 1.0), abs=1e-5)
+
+
+@given(st.lists(st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]), min_size=1), st.floats(0.5, 0.999))
+def test_the_interval_of_a_score_contains_it(scores: list[float], confidence: float) -> None:
+    mean, low, high = score_interval(scores, confidence)
+    assert 0 <= low <= mean + 1e-12
+    assert mean - 1e-12 <= high <= 1
+    _, other_low, other_high = score_interval([1 - score for score in scores], confidence)
+    assert (other_low, other_high) == pytest.approx((1 - high, 1 - low))

@@ -18,7 +18,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.interface import AgentInterface
 from league.registry.registry import Registry
-from league.registry.storage.manifest import Manifest, Parity, PolicyManifest, Tensor
+from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Parity, PolicyManifest, Tensor
 from league.registry.storage.rows import LeagueRow, VersionRow
 from league.settings import Storage
 from league.spaces import OBSERVATION, Box, Discrete, inputs
@@ -48,11 +48,11 @@ def registry(home: Path, **parts: object) -> Registry:
     return opened
 
 
-def publish(registry: Registry, graph: bytes, league: str = LEAGUE) -> VersionRow:
-    """Publish a version with one graph for all policies of the league."""
+def publish(registry: Registry, graph: bytes, league: str = LEAGUE, exploits: str | None = None) -> VersionRow:
+    """Publish a version with one graph for all policies of the league. exploits: it is an exploiter of this version."""
     number = len(registry.versions.all(league))
     return registry.publisher.publish(
-        league, _builder(registry.leagues.get(league), graph), source=f"hand/{number}", parent=None
+        league, _builder(registry.leagues.get(league), graph, exploits), source=f"hand/{number}", parent=None
     )
 
 
@@ -183,7 +183,7 @@ def _model(
     return bytes(model.SerializeToString())
 
 
-def _builder(row: LeagueRow, graph: bytes) -> Callable[[Path, int], Manifest]:
+def _builder(row: LeagueRow, graph: bytes, exploits: str | None) -> Callable[[Path, int], Manifest]:
     def build(directory: Path, number: int) -> Manifest:
         policies = {}
         for name in row.interface.policy_ids:
@@ -210,6 +210,8 @@ def _builder(row: LeagueRow, graph: bytes) -> Callable[[Path, int], Manifest]:
             settings={},
             seed=0,
             steps=number,
+            role=MAIN if exploits is None else EXPLOITER,
+            exploits=exploits,
             stack={},
         )
 

@@ -3,9 +3,10 @@ from pathlib import Path
 import pytest
 
 from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.registry.storage.manifest import EXPLOITER
 from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe
-from training.runs.run_directory import CHECKPOINTS, RunDirectory
+from training.runs.run_directory import CHECKPOINTS, RunDirectory, against
 
 
 @pytest.fixture
@@ -56,6 +57,19 @@ def test_opponents_remain_pinned_in_a_resumed_run(storage: Storage) -> None:
     for other in ({"ref": "@latest", "share": 0.5}, {"ref": "@champion", "share": 0.25}):
         with pytest.raises(ConfigError, match=r"training\.opponents has changed"):
             RunDirectory.resume(storage, tictactoe(opponents=[other]))
+
+
+def test_runs_are_resumed_by_role(storage: Storage) -> None:
+    """An exploiter has its target as the opponent in all episodes, also where the league's file names others."""
+    written = tictactoe(opponents=[{"ref": "script:random", "share": 0.5}])
+    main = RunDirectory.begin(storage, written, None, None)
+    with pytest.raises(NotFound, match="no training run with the role exploiter"):
+        RunDirectory.resume(storage, written, EXPLOITER)
+    exploiter = RunDirectory.begin(storage, against(written, "tictactoe@3"), None, None, exploits="tictactoe@3")
+    assert RunDirectory.resume(storage, written).id == main.id
+    resumed = RunDirectory.resume(storage, written, EXPLOITER)
+    assert (resumed.id, resumed.record) == (exploiter.id, exploiter.record)
+    assert [(each.ref, each.share) for each in resumed.record.config.training.opponents] == [("tictactoe@3", 1)]
 
 
 def test_one_driver_at_a_time(storage: Storage) -> None:

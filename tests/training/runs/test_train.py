@@ -15,9 +15,10 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from league.config.league import LeagueConfig
-from league.errors import ConfigError, LeagueError, NotFound, ParityError, UnknownVersion
+from league.errors import ConfigError, EnvironmentMismatch, LeagueError, NotFound, ParityError, UnknownVersion
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
+from league.registry.storage.manifest import EXPLOITER
 from league.registry.storage.rows import VersionRow
 from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe
@@ -106,6 +107,22 @@ def test_continued_training_has_a_parent(trained: Trained) -> None:
 
 
 @pytest.mark.slow
+def test_an_exploiter_is_trained_against_one_version(trained: Trained) -> None:
+    registry = trained.registry
+    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="test", reason="test")
+    shown = io.StringIO()
+    target, settings = CheckpointRef("tictactoe", "champion"), LEAGUE.with_training(steps=512)
+    console = Console(file=shown, width=200)
+    (version,) = train(settings, registry=registry, role=EXPLOITER, target=target, console=console)
+    assert (version.role, version.exploits, version.parent) == (EXPLOITER, "tictactoe@1", None)
+    assert version.manifest.settings["opponents"] == [{"ref": "tictactoe@1", "share": 1.0}]
+    assert "Role: exploiter. Opponent in all episodes: tictactoe@1." in shown.getvalue()
+    registry.aliases.set("tictactoe", "champion", 2, expected=1, actor="test", reason="test")
+    further = train(LEAGUE, registry=registry, role=EXPLOITER, resume=True)
+    assert [each.exploits for each in further] == ["tictactoe@1"] * 2
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_an_off_policy_run_publishes_and_continues(registry: Registry) -> None:
     """Versions, continued training with and without the replay buffer, and a version as opponent."""
@@ -161,6 +178,14 @@ def test_invalid_options_are_rejected_before_training(registry: Registry) -> Non
         train(tictactoe(per_policy={"nobody": {"lr": 1}}), registry=registry)
     with pytest.raises(UnknownVersion, match="no version 7"):
         train(tictactoe(opponents=["@7"]), registry=registry)
+    for options in ({"role": EXPLOITER}, {"target": CheckpointRef("tictactoe", 1)}):
+        with pytest.raises(ConfigError, match="--role exploiter and --against belong together"):
+            train(LEAGUE, registry=registry, **options)
+    with pytest.raises(EnvironmentMismatch, match="chess@1 is not a version of league tictactoe"):
+        train(LEAGUE, registry=registry, role=EXPLOITER, target=CheckpointRef("chess", 1))
+    team = LeagueConfig.load("configs/two_step_game.yaml")
+    with pytest.raises(ConfigError, match="--against: league two_step_game has one side only"):
+        train(team, registry=registry, role=EXPLOITER, target=CheckpointRef("two_step_game", 1))
     assert not (registry.storage.home / "runs").exists()
 
 

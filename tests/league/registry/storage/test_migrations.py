@@ -90,7 +90,7 @@ def test_a_failed_migration_is_rolled_back(storage: Storage, monkeypatch: pytest
 
 def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
     """A ledger of an earlier release identifies the contestants of matches only by the schedule."""
-    registry = registered(Registry.open(storage))
+    registry = registered(Registry.open(storage), versions=1)
     ledger = Ledger(registry)
     schedules = [SCHEDULE, replace(SCHEDULE, id="later", kind="gauntlet", contestants=SCHEDULE.contestants[::-1])]
     for schedule in schedules:
@@ -106,7 +106,7 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
             "schedules": ("kind",),
             "matches": ("league", "first", "second"),
             "acknowledgements": ("event",),
-            "versions": ("retired_at",),
+            "versions": ("retired_at", "role", "exploits"),
             "leagues": ("game", "game_digest"),
         }
         for table, columns in added.items():
@@ -121,6 +121,7 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
     row = upgraded.leagues.get(LEAGUE)
     assert row.game_digest == row.environment_digest
     assert Ledger(upgraded).page(LEAGUE, contestants=("script:random", "tictactoe@1"), limit=1) == expected[:1]
+    upgraded.aliases.set(LEAGUE, "champion", 1, expected=None, actor="test", reason="its role is main")
     upgraded.close()
 
 
