@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from league.config.training import OpponentConfig
+from league.config.opponents import OpponentConfig
 from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError, GameCrashed, one_line
 from league.interface import Interface

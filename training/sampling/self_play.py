@@ -63,9 +63,9 @@ class SelfPlay:
         self._actions = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
         self._distributions = {policy: distribution(space) for policy, space in self._actions.items()}
         self._initial_states = {policy: state for policy, state in initial_states.items() if state}
-        self._controllers = Controllers(interface, settings.opponents)
-        self._matchups = Matchups(interface, settings.opponents, stepping.agents, self._controllers)
-        self._opponents = Opponents(settings.opponents, interface, storage, stepping.num_envs)
+        self._controllers = Controllers(interface, settings.opponents.fixed)
+        self._matchups = Matchups(interface, settings.opponents.fixed, stepping.agents, self._controllers)
+        self._opponents = Opponents(settings.opponents.fixed, interface, storage, stepping.num_envs)
         self.noises: dict[str, OrnsteinUhlenbeck] = {}
         """policy id → temporally correlated exploration noise, instead of independent draws."""
         movers = self._controllers.groups([RandomMoves(policy) for policy in self._policies])
