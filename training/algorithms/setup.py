@@ -17,9 +17,11 @@ from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implemen
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
+from league.results.scoring import scoring
 from league.settings import Storage
 from training.modules.policy_module import PolicyModule
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner, module_spaces
+from training.sampling.opponent_scores import is_scored
 
 
 def learning_policies(settings: TrainingSettings, policies: tuple[str, ...], iteration: int) -> tuple[str, ...]:
@@ -56,6 +58,17 @@ def check_policies_to_train(settings: TrainingSettings, policies: tuple[str, ...
         raise _shared_encoder_error()
 
 
+def check_opponents(league: LeagueConfig, interface: Interface) -> None:
+    """Raise ConfigError if opponents are drawn by scores that training games do not have."""
+    drawn = league.training.opponents.league
+    if drawn is None or drawn.sampling != "pfsp" or is_scored(scoring(league, interface), len(interface.sides)):
+        return
+    raise ConfigError(
+        f"training.opponents.league.sampling: pfsp needs scores, but games between {len(interface.sides)} sides are"
+        " compared by side: use uniform or latest"
+    )
+
+
 def _shared_encoder_error() -> ConfigError:
     return ConfigError(
         "training.policies_to_train: with shared_encoder, all policies must learn together: training the encoder would"
@@ -75,10 +88,11 @@ def configure(
 ) -> None:
     """Set everything in `config` except the algorithm's own hyperparameters.
 
-    Raises ConfigError if `policies_to_train` does not fit the league.
+    Raises ConfigError if `policies_to_train` or `opponents` do not fit the league.
     """
     settings = league.training
     check_policies_to_train(settings, interface.policy_ids)
+    check_opponents(league, interface)
     config.environment(
         env_config={
             LEAGUE: league.model_dump(mode="json", by_alias=True),

@@ -3,6 +3,7 @@
 `league.results.scoring` defines the rule. If sides are symmetric, the learner's return is compared with the opponent's
 in each game. If they are not, two games with the learner on either side form a block, and returns on the same side are
 compared; games without a partner are dropped. Unlike those of a match, the games of such a block have different seeds.
+If there are more than two such sides, games are not scored: the learner never has all sides but one.
 """
 
 from dataclasses import dataclass
@@ -55,13 +56,18 @@ def _compare(mine: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[n
     return np.where(mine > other, 1.0, np.where(mine == other, 0.5, 0.0))
 
 
+def is_scored(scoring: Scoring, sides: int) -> bool:
+    """Return whether training games of a league with this number of sides can be scored."""
+    return scoring == "game" or (scoring == "side" and sides == 2)
+
+
 class OpponentScores:
     """Collects the returns of all agents in episodes with opponents."""
 
     def __init__(self, sides: NDArray[np.bool_], scoring: Scoring, num_envs: int) -> None:
         """sides: which agents belong to each side, (sides, agents)."""
         self._members = [np.flatnonzero(members) for members in sides]
-        self._scoring = scoring
+        self._scoring, self._is_scored = scoring, is_scored(scoring, len(sides))
         self._returns = np.zeros((num_envs, sides.shape[1]))
         self.opponents = np.full(num_envs, -1)
         """The opponent's number in each environment, -1 in self-play."""
@@ -81,7 +87,7 @@ class OpponentScores:
         for rows in turn.endings:
             self._returns[rows.envs, rows.agents] += rows.rewards
         opposed = turn.finished[self.opponents[turn.finished] >= 0]
-        if len(opposed):
+        if len(opposed) and self._is_scored:
             self._finished.append(self._games(opposed))
         self.forget(np.concatenate([turn.finished, turn.crashed]))
         for batch in turn.batches.values():
