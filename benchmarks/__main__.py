@@ -12,6 +12,7 @@ ORDER = (
     "phases",
     "learning",
     "maddpg",
+    "league_training",
     "parity",
     "serving",
     "pages",

@@ -6,8 +6,8 @@ import numpy as np
 
 from evaluation.statistics.bradley_terry import bradley_terry
 from evaluation.statistics.improvement import iqm, probability_of_improvement
-from evaluation.statistics.population import alpha_rank, nash_averaging
 from evaluation.statistics.sequential import bernoulli_interval, bounds, elo_estimate, expected_games, gsprt_llr
+from league.results.equilibria import alpha_rank, nash_averaging
 
 CYCLE = np.array([[0.5, 0.0, 1.0], [1.0, 0.5, 0.0], [0.0, 1.0, 0.5]])
 TRANSITIVE = np.array([[0.0, -1.0, -1.0], [1.0, 0.0, -1.0], [1.0, 1.0, 0.0]])

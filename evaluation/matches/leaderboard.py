@@ -8,13 +8,14 @@ from dataclasses import replace
 
 from evaluation.matches.game_records import Upset, UpsetFinder, identity
 from evaluation.results import Payoff, RatedVersion, Standing, iso_timestamp
-from evaluation.schedules.builders import ANCHOR, scoring
+from evaluation.schedules.builders import ANCHOR
 from evaluation.statistics.bradley_terry import rate
 from evaluation.statistics.payoff import only_side, tabulate
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent, LeagueRow, VersionRow
 from league.results.ledger import Ledger
 from league.results.records import BlockResult, Game, Match
+from league.results.scoring import scoring
 
 
 def compute_leaderboard(registry: Registry, league: str) -> tuple[Standing, ...]:

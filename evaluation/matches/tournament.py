@@ -26,7 +26,7 @@ from evaluation.matches.game_records import forfeits, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
 from evaluation.matches.worker import baselines, match_worker, num_envs
 from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
-from evaluation.schedules.builders import ANCHOR, scoring
+from evaluation.schedules.builders import ANCHOR
 from evaluation.schedules.tournament_plan import (
     DEFAULT_BLOCKS,
     MOST_BLOCKS,
@@ -47,6 +47,7 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow
 from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match, Schedule
+from league.results.scoring import scoring
 from league.settings import Storage
 
 T = TypeVar("T")

@@ -19,7 +19,6 @@ from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, l
 from evaluation.playback.single_game import GameStep, Move, play_game, policy_output
 from evaluation.playback.video import data_uri
 from evaluation.results import Document
-from evaluation.schedules.builders import scoring
 from league.conditions import ActionSelection, action_selection
 from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
@@ -29,7 +28,7 @@ from league.policies.loading import eligible
 from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.registry.registry import Registry
-from league.results.scoring import scores
+from league.results.scoring import scores, scoring
 from league.service_requests import HumanPlayRequest
 from league.spaces import ACTION_MASK, DictSpace, Discrete, Space
 

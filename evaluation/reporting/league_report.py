@@ -14,13 +14,13 @@ from evaluation.gating.verdict_evidence import VerdictEvidence, verdict_evidence
 from evaluation.matches.leaderboard import MOST_CONTESTANTS, CountedGames, rated_version
 from evaluation.reporting.flipbook import Flipbook, flipbooks
 from evaluation.results import Document, Payoff, RatedVersion, Standing, iso_timestamp
-from evaluation.schedules.builders import scoring
 from evaluation.statistics.population import PopulationShare, shares
 from league.conditions import ActionSelection
 from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent
 from league.results.records import Scoring
+from league.results.scoring import scoring
 
 MOST_VERDICTS = 60
 """Verdicts with all details, the newest ones."""

@@ -30,10 +30,11 @@ from evaluation.schedules import adaptive_pairing
 from league.conditions import ActionSelection, action_selection
 from league.config.gate import GateConfig
 from league.config.league import LeagueConfig
-from league.errors import ConfigError, EnvironmentMismatch
+from league.errors import EnvironmentMismatch
 from league.interface import Interface, digest
 from league.refs import ScriptRef
 from league.results.records import GAMES_PER_BLOCK, BlockResult, Schedule, Scoring
+from league.results.scoring import scoring
 from league.seeds import derive
 
 ANCHOR = str(ScriptRef("random"))
@@ -210,23 +211,6 @@ def _first_round(config: LeagueConfig, interface: Interface, contestants: Sequen
 def _turns(interface: Interface) -> int:
     """How often an adaptive round plays a pairing: once per seat if there are more than two sides."""
     return len(interface.sides) if len(interface.sides) > 2 else 1
-
-
-def scoring(config: LeagueConfig, interface: Interface) -> Scoring:
-    """`play.scoring` of the configuration; by default `game` if there are several sides with equal spaces, else `side`.
-
-    Chess has two equal sides; an adversary and its opponents have different sides; a team is one side.
-    Raises ConfigError for `game` with a single side.
-    """
-    if config.play.scoring is not None:
-        if config.play.scoring == "game" and len(interface.sides) == 1:
-            raise ConfigError("play.scoring: game compares the sides of a game, but there is only one side: remove it")
-        return config.play.scoring
-    kinds = {
-        tuple(sorted(digest(interface.agents[agent].model_dump(mode="json")) for agent in agents))
-        for agents in interface.sides.values()
-    }
-    return "game" if len(interface.sides) > 1 and len(kinds) == 1 else "side"
 
 
 def _schedule(

@@ -25,13 +25,13 @@ from typing import Any
 from evaluation.gating.verdict_evidence import verdict_evidence
 from evaluation.gating.verdicts import schedules_of
 from evaluation.matches.leaderboard import CountedGames, rated_version
-from evaluation.schedules.builders import scoring
 from evaluation.statistics.blas import single_threaded_blas
 from league.errors import AlreadyRunning, StorageError
 from league.registry.registry import Registry
 from league.registry.snapshots import FORMAT, SUMMARY
 from league.registry.storage.rows import AliasEvent, VerdictRow
 from league.results.ledger import Ledger
+from league.results.scoring import scoring
 from league.settings import Storage
 from league.subprocesses import exit_with_parent, lower_priority
 

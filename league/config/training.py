@@ -1,31 +1,12 @@
 """The `training` section: settings common to all algorithms."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field
 
-from league.config.base import Part, check_contestant
+from league.config.base import Part
 from league.config.network import ConvolutionConfig
-
-
-class OpponentConfig(Part):
-    """A fixed policy that controls the other sides in a fraction of the episodes and does not learn."""
-
-    ref: str
-    """A script (`script:random`), a bot (`script:my_package.module:name`), a version (`connect_four@3`), or an alias,
-    which is resolved when training starts. `@3` and `@champion` refer to the league itself."""
-    share: float = Field(gt=0, le=1)
-    """Fraction of the episodes. The remaining episodes are self-play."""
-
-    @field_validator("ref")
-    @classmethod
-    def _is_reference(cls, value: str) -> str:
-        return check_contestant(value)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_yaml(cls, value: Any) -> Any:
-        return {"ref": value, "share": 1.0} if isinstance(value, str) else value
+from league.config.opponents import OpponentsConfig
 
 
 class PhaseConfig(Part):
@@ -67,8 +48,8 @@ class TrainingSettings(Part):
     policies_to_train: tuple[str, ...] | tuple[PhaseConfig, ...] | None = None
     """The policies that learn, or repeated phases; null for all. Other policies keep their weights: those of the parent
     version (`--from`), or their initial weights."""
-    opponents: tuple[OpponentConfig, ...] = ()
-    """Fixed opponents. In their episodes one random side learns, and the opponent controls all others."""
+    opponents: OpponentsConfig = OpponentsConfig()
+    """Opponents. In their episodes one random side learns, and the opponent controls all others."""
     gpus: float = Field(default=0, ge=0)
     """GPUs of the learner; a fraction shares a GPU."""
     runner_gpus: float = Field(default=0, ge=0)
@@ -78,12 +59,6 @@ class TrainingSettings(Part):
     opening_plies: int = Field(default=0, ge=0)
     """Maximum number of random legal moves at the start of each episode. They are excluded from training and lead to
     positions that self-play alone would not visit."""
-
-    @model_validator(mode="after")
-    def _shares_fit(self) -> Self:
-        if (total := sum(opponent.share for opponent in self.opponents)) > 1 + 1e-9:
-            raise ValueError(f"the shares of opponents must sum to at most 1, got {total:g}")
-        return self
 
     def budget_spent(self, steps: int, seconds: float) -> float:
         """Return the fraction of the budget that a run has spent, of steps or of time, whichever is larger; at most 1.

@@ -117,7 +117,7 @@ def check_scripts(config: LeagueConfig, interface: Interface) -> None:
         ConfigError: One does not exist, cannot be imported, or does not support the spaces. Names its key.
     """
     named = [("gate.anchors", anchor.ref) for anchor in config.gate.anchors]
-    named += [("training.opponents", opponent.ref) for opponent in config.training.opponents]
+    named += [("training.opponents", opponent.ref) for opponent in config.training.opponents.fixed]
     if isinstance(config.training, PPOConfig) and config.training.teacher is not None:
         named.append(("training.teacher", config.training.teacher.ref))
     for key, ref in named:
@@ -131,7 +131,7 @@ def check_scripts(config: LeagueConfig, interface: Interface) -> None:
 
 def configured_bots(config: LeagueConfig) -> list[str]:
     """Return the bots among the anchors and opponents of a configuration."""
-    named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents]
+    named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents.fixed]
     return [ref for ref in dict.fromkeys(named) if _is_bot(ref)]
 
 

@@ -16,10 +16,29 @@ from collections.abc import Collection, Sequence
 from functools import lru_cache
 from typing import get_args
 
-from league.errors import LedgerConflict
+from league.config.league import LeagueConfig
+from league.errors import ConfigError, LedgerConflict
+from league.interface import Interface, digest
 from league.results.records import GAMES_PER_BLOCK, Game, Match, Reason, Schedule, Scoring
 
 Values = tuple[float | None, ...]
+
+
+def scoring(config: LeagueConfig, interface: Interface) -> Scoring:
+    """`play.scoring` of the configuration; by default `game` if there are several sides with equal spaces, else `side`.
+
+    Chess has two equal sides; an adversary and its opponents have different sides; a team is one side.
+    Raises ConfigError for `game` with a single side.
+    """
+    if config.play.scoring is not None:
+        if config.play.scoring == "game" and len(interface.sides) == 1:
+            raise ConfigError("play.scoring: game compares the sides of a game, but there is only one side: remove it")
+        return config.play.scoring
+    kinds = {
+        tuple(sorted(digest(interface.agents[agent].model_dump(mode="json")) for agent in agents))
+        for agents in interface.sides.values()
+    }
+    return "game" if len(interface.sides) > 1 and len(kinds) == 1 else "side"
 
 
 def scores(returns: Sequence[Values], scoring: Scoring, forfeits: Sequence[Collection[int]] = ()) -> list[Values]:

@@ -48,7 +48,7 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
     """See `training.algorithms.setup.algorithm_config`."""
     settings = league.training
     assert isinstance(settings, MADDPGConfig)
-    if settings.opponents:
+    if settings.opponents.any:
         raise ConfigError(
             "training.opponents: maddpg does not support opponents: its critics need the observations and actions"
             " of all agents; remove it"

@@ -28,9 +28,11 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.interface import Interface
+from training.algorithms.league_algorithm import SHARE
 from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, SCHEDULES, TEACHER_LOSS, TEACHER_WEIGHT
 from training.sampling.closed_transitions import JOINT
 from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
+from training.sampling.self_play import OPPONENTS, SCORE
 
 RETURN = "return"
 PHASES = {
@@ -91,6 +93,8 @@ def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[st
     for agent in interface.agents:
         found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
         found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
+    for ref, values in result.get(OPPONENTS, {}).items():
+        found |= {f"{OPPONENTS}/{ref}/{name}": values.get(name) for name in (SCORE, SHARE)}
     # RLlib reports NaN for what was logged earlier but not in this update.
     found = {name: value for name, value in found.items() if value is not None and not math.isnan(value)}
     for key in (*interface.policy_ids, JOINT):

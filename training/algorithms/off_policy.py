@@ -17,12 +17,11 @@ randomness from the seed and the number of steps so far.
 """
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core import COMPONENT_RL_MODULE
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
@@ -38,16 +37,18 @@ from ray.rllib.utils.metrics import (
 
 from league.config.league import LeagueConfig
 from league.config.off_policy import OffPolicyConfig
+from league.config.opponents import OpponentConfig
 from league.config.training import TrainingSettings
 from league.interface import Interface
 from league.seeds import derive
 from league.settings import Storage
 from training.algorithms import setup
+from training.algorithms.league_algorithm import LeagueAlgorithm
 from training.algorithms.metrics import EXPLORATION
-from training.algorithms.setup import configure, reset_episodes
+from training.algorithms.setup import configure
 from training.learners.off_policy import OffPolicyLearner
 from training.replay_buffer import ReplayBuffer, Sample, TransitionBlock
-from training.rllib_compat import ExplicitConfig, NoResultsDirectory, local_learner
+from training.rllib_compat import ExplicitConfig, local_learner
 from training.sampling.closed_transitions import JOINT
 from training.sampling.env_runner import LEAGUE
 from training.sampling.replay_runner import JointRunner, ReplayRunner
@@ -59,7 +60,7 @@ REPLAY = "replay"
 COUNTERS = "off_policy"
 
 
-class OffPolicy(NoResultsDirectory, Algorithm):
+class OffPolicy(LeagueAlgorithm):
     """An RLlib Algorithm with one replay buffer per policy, or one of joint transitions."""
 
     def setup(self, config: AlgorithmConfig) -> None:
@@ -82,7 +83,8 @@ class OffPolicy(NoResultsDirectory, Algorithm):
         """Sample and learn in rounds until ITERATION_STEPS actions were taken, and log metrics."""
         seconds = dict.fromkeys((ENV_RUNNER_SAMPLING_TIMER, LEARNER_UPDATE_TIMER, SYNCH_WORKER_WEIGHTS_TIMER), 0.0)
         learning = setup.learning_policies(self.settings, tuple(self.config.policies), self.iteration)
-        target = self.steps + ITERATION_STEPS
+        before = self.steps
+        target = before + ITERATION_STEPS
         while self.steps < target:
             for timer, part in (
                 (ENV_RUNNER_SAMPLING_TIMER, self._sample),
@@ -98,12 +100,13 @@ class OffPolicy(NoResultsDirectory, Algorithm):
         is_local = self.env_runner_group.num_remote_env_runners() == 0
         results = self.env_runner_group.foreach_env_runner(_metrics, local_env_runner=is_local)
         self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
+        self.exchange_opponents(results, self.steps - before)
         if learned := self._learner.results():
             self.metrics.aggregate([learned], key=LEARNER_RESULTS)
 
     def reset_episodes(self, steps: int) -> None:
         """Drop all open episodes, and derive all further randomness from the seed and `steps`."""
-        reset_episodes(self, steps)
+        super().reset_episodes(steps)
         self.steps = steps
         for key, replay in self.replays.items():
             replay.reseed(derive(self.config.seed or 0, key), steps)
@@ -147,7 +150,10 @@ class OffPolicy(NoResultsDirectory, Algorithm):
         group = self.env_runner_group
         remote = group.num_remote_env_runners()
         play = partial(
-            _play_round, actions=-(-self.settings.update_every // max(remote, 1)), exploration=self.exploration
+            _play_round,
+            actions=-(-self.settings.update_every // max(remote, 1)),
+            exploration=self.exploration,
+            opponents=self.opponents.active,
         )
         for actions, blocks in group.foreach_env_runner(play, local_env_runner=not remote):
             self.steps += actions
@@ -211,7 +217,10 @@ def starts_with_empty_replay(settings: TrainingSettings, checkpoint: Path) -> bo
     return not settings.replay_in_checkpoint or not (checkpoint / REPLAY).is_dir()
 
 
-def _play_round(runner: ReplayRunner, actions: int, exploration: float) -> tuple[int, dict[str, TransitionBlock]]:
+def _play_round(
+    runner: ReplayRunner, actions: int, exploration: float, opponents: Sequence[OpponentConfig]
+) -> tuple[int, dict[str, TransitionBlock]]:
+    runner.exchange_opponents(opponents)
     return runner.transitions(actions, exploration)
 
 

@@ -8,7 +8,8 @@ keeps the policy gradient valid (Huang and Ontañón, 2020, arXiv 2006.14171). A
 estimates (Schulman et al., 2016, arXiv 1506.02438).
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from functools import partial
 from typing import Any
 
 from ray.rllib.algorithms import ppo
@@ -24,6 +25,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.config.league import LeagueConfig
+from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
 from league.config.schedules import ScheduleProgress
 from league.errors import ConfigError
@@ -31,17 +33,17 @@ from league.interface import Interface
 from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
 from training.algorithms import setup
-from training.algorithms.setup import configure, reset_episodes, rl_module_specs
+from training.algorithms.league_algorithm import LeagueAlgorithm
+from training.algorithms.setup import configure, rl_module_specs
 from training.learners.magnet import check_magnet
 from training.learners.ppo import PPOLearner, hyperparameters
 from training.learners.teacher import check_teacher
 from training.modules.actor_critic import ActorCritic, SharedEncoder
-from training.rllib_compat import NoResultsDirectory
 from training.sampling.env_runner import LEAGUE, BatchedEnvRunner
 from training.sampling.episode_chunks import EpisodeChunks
 
 
-class PPO(NoResultsDirectory, ppo.PPO):
+class PPO(LeagueAlgorithm, ppo.PPO):
     """RLlib's PPO with updates restricted to the policies that currently learn."""
 
     progress = ScheduleProgress(steps=0, budget=0.0)
@@ -66,10 +68,7 @@ class PPO(NoResultsDirectory, ppo.PPO):
                 self.env_runner_group.sync_weights(
                     from_worker_or_learner_group=self.learner_group, policies=changed, inference_only=True
                 )
-
-    def reset_episodes(self, steps: int) -> None:
-        """Drop all open episodes, and derive all further randomness from the seed and `steps`."""
-        reset_episodes(self, steps)
+        self.exchange_opponents(results, sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results))
 
     def sample_train_batch(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
         """Sample a train batch from all runners; return the chunks and the runners' metrics."""
@@ -77,9 +76,10 @@ class PPO(NoResultsDirectory, ppo.PPO):
         results: list[dict[str, Any]] = []
         # With remote runners, the local one only holds weights.
         is_local = self.env_runner_group.num_remote_env_runners() == 0
+        sample = partial(_sample_chunks, opponents=self.opponents.active)
         while sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results) < self.config.total_train_batch_size:
             sampled = self.env_runner_group.foreach_env_runner(
-                _sample_chunks, local_env_runner=is_local, timeout_seconds=self.config.sample_timeout_s
+                sample, local_env_runner=is_local, timeout_seconds=self.config.sample_timeout_s
             )
             if not sampled:
                 break
@@ -93,7 +93,10 @@ class PPO(NoResultsDirectory, ppo.PPO):
         return setup.learning_policies(settings, tuple(self.config.policies), self.iteration)
 
 
-def _sample_chunks(runner: BatchedEnvRunner) -> tuple[list[EpisodeChunks], dict[str, Any]]:
+def _sample_chunks(
+    runner: BatchedEnvRunner, opponents: Sequence[OpponentConfig]
+) -> tuple[list[EpisodeChunks], dict[str, Any]]:
+    runner.exchange_opponents(opponents)
     return runner.sample_chunks(), runner.get_metrics()
 
 

@@ -1,17 +1,13 @@
 """The RLlib configuration that all algorithms share, and the choice of an algorithm by name."""
 
 from collections.abc import Sequence
-from functools import partial
 from importlib import import_module
 from typing import Any
 
-import torch
-from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.learner.learner import Learner
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.rllib.env.env_runner import EnvRunner
 
 from league.config.algorithms import AnyTraining
 from league.config.league import LeagueConfig
@@ -21,10 +17,11 @@ from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implemen
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
-from league.seeds import derive
+from league.results.scoring import scoring
 from league.settings import Storage
 from training.modules.policy_module import PolicyModule
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner, module_spaces
+from training.sampling.opponent_scores import is_scored
 
 
 def learning_policies(settings: TrainingSettings, policies: tuple[str, ...], iteration: int) -> tuple[str, ...]:
@@ -61,6 +58,17 @@ def check_policies_to_train(settings: TrainingSettings, policies: tuple[str, ...
         raise _shared_encoder_error()
 
 
+def check_opponents(league: LeagueConfig, interface: Interface) -> None:
+    """Raise ConfigError if opponents are drawn by scores that training games do not have."""
+    drawn = league.training.opponents.league
+    if drawn is None or drawn.sampling != "pfsp" or is_scored(scoring(league, interface), len(interface.sides)):
+        return
+    raise ConfigError(
+        f"training.opponents.league.sampling: pfsp needs scores, but games between {len(interface.sides)} sides are"
+        " compared by side: use uniform or latest"
+    )
+
+
 def _shared_encoder_error() -> ConfigError:
     return ConfigError(
         "training.policies_to_train: with shared_encoder, all policies must learn together: training the encoder would"
@@ -80,10 +88,11 @@ def configure(
 ) -> None:
     """Set everything in `config` except the algorithm's own hyperparameters.
 
-    Raises ConfigError if `policies_to_train` does not fit the league.
+    Raises ConfigError if `policies_to_train` or `opponents` do not fit the league.
     """
     settings = league.training
     check_policies_to_train(settings, interface.policy_ids)
+    check_opponents(league, interface)
     config.environment(
         env_config={
             LEAGUE: league.model_dump(mode="json", by_alias=True),
@@ -148,21 +157,6 @@ def rl_module_specs(
             module_class=module, observation_space=observation, action_space=action, model_config=model_config
         )
     return found
-
-
-def reset_episodes(algorithm: Algorithm, steps: int) -> None:
-    """Drop all open episodes, and derive all further randomness from the seed and `steps`.
-
-    Called at each checkpoint, and when training resumes from one, so that both continue identically.
-    """
-    # With remote runners, the local one only holds weights.
-    is_local = algorithm.env_runner_group.num_remote_env_runners() == 0
-    algorithm.env_runner_group.foreach_env_runner(partial(_reset_episodes, steps=steps), local_env_runner=is_local)
-    torch.manual_seed(derive(algorithm.config.seed or 0, "learner", steps))
-
-
-def _reset_episodes(runner: EnvRunner, steps: int) -> None:
-    runner.reset_episodes(steps)
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:

@@ -12,10 +12,14 @@ from rich.progress import Progress as Bars
 from league.config.training import TrainingSettings
 from league.registry.storage.rows import VersionRow
 from training.algorithms.metrics import OTHER_TIME, PHASES
+from training.sampling.self_play import OPPONENTS
 
 SECONDS_PER_LINE = 10.0
 MAX_POLICIES = 3
 """Policies shown individually; TensorBoard has all."""
+MAX_OPPONENTS = 3
+"""Opponents shown, the most frequent ones."""
+OPPONENT_PREFIX = f"{OPPONENTS}/"
 SHOWN_PHASES = ("time/sampling", "time/learning")
 
 
@@ -56,7 +60,7 @@ class TrainingProgress(ProgressDisplay):
         """Show a trial's latest metrics."""
         done = self._settings.budget_spent(metrics["steps"], metrics["seconds"])
         steps, pace = f"{metrics['steps']:,} steps", _pace(metrics, done)
-        doing = policy_summaries(metrics, self._policies)
+        doing = policy_summaries(metrics, self._policies) + opponent_summary(metrics)
         if self._console.is_terminal:
             self._bars.update(self._bar, completed=done, description=steps, pace=pace, doing=doing)
         elif time.monotonic() >= self._next_line or metrics.get("done"):
@@ -78,6 +82,18 @@ def policy_summaries(metrics: Mapping[str, Any], policies: tuple[str, ...]) -> s
     shown = "; ".join(_policy_summary(policy, metrics) for policy in policies[:MAX_POLICIES])
     more = len(policies) - MAX_POLICIES
     return f"{shown}; {more} more" if more > 0 else shown
+
+
+def opponent_summary(metrics: Mapping[str, Any]) -> str:
+    """Return the scores against the most frequent opponents; empty without opponents."""
+    shares = {name.rpartition("/")[0]: value for name, value in metrics.items() if _is_opponent_share(name)}
+    frequent = sorted(shares, key=lambda opponent: shares[opponent], reverse=True)[:MAX_OPPONENTS]
+    shown = [f"{name.removeprefix(OPPONENT_PREFIX)} {metrics[f'{name}/score']:.0%}" for name in frequent]
+    return f"; opponents: {', '.join(shown)}" if shown else ""
+
+
+def _is_opponent_share(name: str) -> bool:
+    return name.startswith(OPPONENT_PREFIX) and name.endswith("/share")
 
 
 def _policy_summary(policy: str, metrics: Mapping[str, Any]) -> str:

@@ -62,7 +62,7 @@ def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for written in (*(opponent.ref for opponent in config.training.opponents), *_references(config.training)):
+    for written in (*(opponent.ref for opponent in config.training.opponents.fixed), *_references(config.training)):
         ref = parse_ref(of_league(written, config.league))
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
         contestant(pinned, registry, interface)
@@ -86,10 +86,10 @@ def _references(settings: TrainingSettings) -> list[str]:
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
     """Return the league with its references replaced by what they are pinned to; others are unchanged."""
     settings = config.training
-    opponents = [
-        opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in settings.opponents
+    fixed = [
+        opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in settings.opponents.fixed
     ]
-    changes: dict[str, Any] = {"opponents": opponents}
+    changes: dict[str, Any] = {"opponents": settings.opponents.model_dump() | {"fixed": fixed}}
     if isinstance(settings, PPOConfig) and settings.magnet is not None:
         changes["magnet"] = settings.magnet.model_dump() | {"ref": pins.get(settings.magnet.ref, settings.magnet.ref)}
     if isinstance(settings, PPOConfig) and settings.teacher is not None:

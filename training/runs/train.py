@@ -219,7 +219,15 @@ def _tune(
     start = _start(run, registry, attempt / CHECKPOINTS / START)
     if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
         progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
-    plan = TrialPlan(start, attempt / CHECKPOINTS, attempt / STOP_FILE, registry.storage, cpus=share)
+    plan = TrialPlan(
+        start,
+        attempt / CHECKPOINTS,
+        attempt / STOP_FILE,
+        registry.storage,
+        cpus=share,
+        run=run.id,
+        parent=run.record.parent,
+    )
     reporter.begin(start.steps - start.steps_before_run, start.seconds)
 
     def request_stop() -> None:

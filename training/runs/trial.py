@@ -71,6 +71,7 @@ class TrialPlan:
 
     start: the initial state. checkpoints: the directory for checkpoints. stop_file: a file whose existence requests
     that the trial saves and ends. cpus: of the learner and of each runner. threads: of the learner, at most.
+    run: the id of the run, which versions are named after. parent: the version that the run started from.
     """
 
     start: StartState
@@ -79,6 +80,8 @@ class TrialPlan:
     storage: Storage
     cpus: float = 1.0
     threads: int = MAX_THREADS
+    run: str | None = None
+    parent: int | None = None
 
 
 class Trial(tune.Trainable):
@@ -97,6 +100,10 @@ class Trial(tune.Trainable):
         self.algorithm = build_algorithm(
             self.league, self.interface, start.checkpoint, self.plan.cpus, self.plan.storage
         )
+        if start.steps == start.steps_before_run:
+            self.algorithm.opponents.refresh(parent=self.plan.parent)
+        else:
+            self.algorithm.opponents.drop_removed()
         self.algorithm.reset_episodes(start.steps)
         self.steps = self.saved_steps = start.steps
         self.seconds = start.seconds
@@ -160,6 +167,8 @@ class Trial(tune.Trainable):
         target = self.plan.checkpoints / str(self.steps)
         draft = target.with_name(f"{target.name}.part")
         shutil.rmtree(draft, ignore_errors=True)
+        source = None if self.plan.run is None else f"{self.plan.run}/{self.steps}"
+        self.algorithm.opponents.refresh(checkpoint=source, parent=self.plan.parent)
         self.algorithm.save_to_path(str(draft))
         progress = {"steps": self.steps, "seconds": self.seconds}
         (draft / PROGRESS_FILE).write_text(json.dumps(progress))

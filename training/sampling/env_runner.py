@@ -1,7 +1,7 @@
 """Samples episodes: an RLlib EnvRunner on the batched stepping of environments."""
 
 import gc
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -20,10 +20,12 @@ from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME, WEIGHTS_SEQ_NO
 
 from league.config.league import LeagueConfig
+from league.config.opponents import OpponentConfig
 from league.environments.implementation import stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface
+from league.results.scoring import scoring
 from league.seeds import generator
 from league.spaces import inputs
 from league.spaces.conversion import to_gymnasium
@@ -57,6 +59,7 @@ class BatchedEnvRunner(RaisingEnvRunner):
     module: MultiRLModule
     worker_index: int
     _play: SelfPlay | None = None
+    _opponents: tuple[OpponentConfig, ...] = ()
 
     def __init__(self, config: AlgorithmConfig, **kwargs: Any) -> None:
         """Raises ConfigError if the environment, its opponents or a requested GPU are not available."""
@@ -82,7 +85,15 @@ class BatchedEnvRunner(RaisingEnvRunner):
             initial = initial_states(self.module)
             storage = self.config.env_config.get(STORAGE)
             self._chunks = EpisodeRecorder(self.interface, self.env.agents, num_envs)
-            self._play = SelfPlay(self.env, self.interface, self.league.training, self._chunks, initial, storage)
+            self._play = SelfPlay(
+                self.env,
+                self.interface,
+                self.league.training,
+                self._chunks,
+                initial,
+                storage,
+                scoring(self.league, self.interface),
+            )
         self._has_begun = False
 
     def make_module(self) -> None:
@@ -170,13 +181,22 @@ class BatchedEnvRunner(RaisingEnvRunner):
             steps=steps,
         )
         with self._errors_with_league():
-            self._play.begin(seeds, generator(seed, "play", seeds.runner, steps))
+            self._play.begin(seeds, generator(seed, "play", seeds.runner, steps), self._opponents)
         self._has_begun = True
+
+    def exchange_opponents(self, opponents: Sequence[OpponentConfig]) -> None:
+        """Replace the opponents from the league in new episodes. Raises what loading them raises."""
+        if opponents == self._opponents:
+            return
+        self._opponents = tuple(opponents)
+        if self._play is not None and self._has_begun:
+            with self._errors_with_league():
+                self._play.exchange(self._opponents)
 
     def get_metrics(self) -> dict[str, Any]:
         """Return statistics since the last call, per policy and in total."""
         if self._play is not None:
-            self._play.metrics.log(self.metrics)
+            self._play.log(self.metrics)
         self.metrics.log_value(WEIGHTS_SEQ_NO, self._weights_seq_no, window=1)
         return self.metrics.reduce()
 

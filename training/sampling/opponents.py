@@ -1,13 +1,13 @@
 """Opponents in training: matchups per episode, random openings, and the opponents' actions."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.config.training import OpponentConfig
+from league.config.opponents import OpponentConfig
 from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError, GameCrashed, one_line
 from league.interface import Interface
@@ -43,51 +43,77 @@ Controller = str | OpponentPolicy | RandomMoves
 class Controllers:
     """Numbers all controllers, for use as groups. The league's own policies come first, in the interface's order."""
 
-    def __init__(self, interface: Interface, opponents: Sequence[OpponentConfig]) -> None:
+    def __init__(self, interface: Interface) -> None:
         policies = interface.policy_ids
+        self._policies = policies
         self._all: list[Controller] = [*policies, *(RandomMoves(policy) for policy in policies)]
-        self._all += [OpponentPolicy(opponent.ref, policy) for opponent in opponents for policy in policies]
-        self._number = {controller: number for number, controller in reversed(list(enumerate(self._all)))}
+        self._number = {controller: number for number, controller in enumerate(self._all)}
 
     def __getitem__(self, group: int) -> Controller:
         return self._all[group]
+
+    def add(self, ref: str) -> None:
+        """Number the policies of an opponent."""
+        for policy in self._policies:
+            controller = OpponentPolicy(ref, policy)
+            self._number[controller] = len(self._all)
+            self._all.append(controller)
 
     def groups(self, controllers: Sequence[Controller]) -> Indices:
         """Return the numbers of some controllers."""
         return np.array([self._number[controller] for controller in controllers], dtype=np.int64)
 
 
+@dataclass(frozen=True, slots=True)
+class Pairings:
+    """Who plays m new episodes.
+
+    groups: of all agents, (m, agents). opponents: their numbers, -1 in self-play, (m,). sides: the number of the side
+    that learns, 0 in self-play, (m,).
+    """
+
+    groups: Indices
+    opponents: Indices
+    sides: Indices
+
+
 class Matchups:
     """Draws for each episode an opponent or none, by their shares, and the side that learns."""
 
-    def __init__(
-        self, interface: Interface, opponents: Sequence[OpponentConfig], agents: Sequence[str], controllers: Controllers
-    ) -> None:
-        """Raises ConfigError if opponents are configured and the league has one side only."""
-        if opponents and len(interface.sides) < 2:
-            raise ConfigError("training.opponents: the league has one side only: divide the agents into sides")
-        self._shares = np.cumsum([opponent.share for opponent in opponents])
-        policies = [interface.policies[agent] for agent in agents]
-        self._own = controllers.groups(policies)
-        # (opponents, agents)
-        self._opposing = np.array(
-            [
-                controllers.groups([OpponentPolicy(opponent.ref, policy) for policy in policies])
-                for opponent in opponents
-            ]
-        )
-        # (sides, agents)
-        self._sides = np.array([[agent in members for agent in agents] for members in interface.sides.values()])
+    def __init__(self, interface: Interface, agents: Sequence[str], controllers: Controllers) -> None:
+        self._controllers = controllers
+        self._policies = [interface.policies[agent] for agent in agents]
+        self._own = controllers.groups(self._policies)
+        self.sides = np.array([[agent in members for agent in agents] for members in interface.sides.values()])
+        """Which agents belong to each side, (sides, agents)."""
+        self.refs: list[str] = []
+        """All opponents until now; their positions are their numbers."""
+        self._opposing = np.zeros((0, len(agents)), np.int64)
+        self.exchange(())
 
-    def draw(self, episodes: int, rng: np.random.Generator) -> Indices:
-        """Return the groups of all agents in some new episodes, (episodes, agents)."""
+    def exchange(self, opponents: Sequence[OpponentConfig]) -> None:
+        """Draw from these opponents from now on."""
+        for opponent in opponents:
+            if opponent.ref not in self.refs:
+                self._controllers.add(opponent.ref)
+                self.refs.append(opponent.ref)
+                groups = self._controllers.groups([OpponentPolicy(opponent.ref, policy) for policy in self._policies])
+                self._opposing = np.concatenate([self._opposing, groups[np.newaxis]])
+        self._numbers = np.array([self.refs.index(opponent.ref) for opponent in opponents], dtype=np.int64)
+        self._shares = np.cumsum([opponent.share for opponent in opponents])
+
+    def draw(self, episodes: int, rng: np.random.Generator) -> Pairings:
+        """Draw who plays some new episodes."""
         groups = np.tile(self._own, (episodes, 1))
+        numbers, sides = np.full(episodes, -1), np.zeros(episodes, np.int64)
         if len(self._shares):
-            opponents = np.searchsorted(self._shares, rng.random(episodes), side="right")
-            opposed = np.flatnonzero(opponents < len(self._shares))
-            learning = self._sides[rng.integers(len(self._sides), size=len(opposed))]
-            groups[opposed] = np.where(learning, groups[opposed], self._opposing[opponents[opposed]])
-        return groups
+            drawn = np.searchsorted(self._shares, rng.random(episodes), side="right")
+            opposed = np.flatnonzero(drawn < len(self._shares))
+            numbers[opposed] = self._numbers[drawn[opposed]]
+            sides[opposed] = rng.integers(len(self.sides), size=len(opposed))
+            learning = self.sides[sides[opposed]]
+            groups[opposed] = np.where(learning, groups[opposed], self._opposing[numbers[opposed]])
+        return Pairings(groups, numbers, sides)
 
 
 class Openings:
@@ -116,25 +142,57 @@ class Openings:
         return ended, self._waiting[ended]
 
 
+LOADED = 16
+"""Opponents from the league that a runner keeps loaded, unless more of them play: loading one takes as long as hundreds
+of steps."""
+
+
 class Opponents:
     """The loaded policies of all opponents, with their recurrent states."""
 
     def __init__(
-        self, configs: Sequence[OpponentConfig], interface: Interface, storage: Storage | None, num_envs: int
+        self, fixed: Sequence[OpponentConfig], interface: Interface, storage: Storage | None, num_envs: int
     ) -> None:
         """Raises what loading raises, and ConfigError for versions without a storage to load them from."""
-        self._policies = {
-            OpponentPolicy(config.ref, policy_id): policy
-            for config in configs
-            for policy_id, policy in _load(config.ref, interface, storage).values()
-        }
-        self._recurrent_states = {
-            opponent: RecurrentStates(
-                {key: np.asarray(rows[0], rows.dtype) for key, rows in initial.items()}, num_envs, len(interface.agents)
-            )
-            for opponent, policy in self._policies.items()
-            if isinstance(policy, OnnxPolicy | Bot) and (initial := policy.initial_state(1))
-        }
+        self._interface, self._storage, self._num_envs = interface, storage, num_envs
+        self._policies: dict[OpponentPolicy, Policy] = {}
+        self._recurrent_states: dict[OpponentPolicy, RecurrentStates] = {}
+        self._fixed = frozenset(opponent.ref for opponent in fixed)
+        for ref in self._fixed:
+            self._load(ref)
+        self._exchanged: list[str] = []
+
+    def exchange(self, refs: Collection[str], playing: Collection[str]) -> None:
+        """Load opponents, and unload those that were not requested for longest.
+
+        playing: opponents in open episodes, which stay loaded. Raises what loading raises.
+        """
+        for ref in refs:
+            if ref in self._exchanged:
+                self._exchanged.remove(ref)
+            elif ref not in self._fixed:
+                self._load(ref)
+            if ref not in self._fixed:
+                self._exchanged.append(ref)
+        idle = [ref for ref in self._exchanged if ref not in refs and ref not in playing]
+        for ref in idle[: max(len(self._exchanged) - LOADED, 0)]:
+            self._unload(ref)
+
+    def _load(self, ref: str) -> None:
+        loaded = dict(_load(ref, self._interface, self._storage).values())
+        for policy_id, policy in loaded.items():
+            opponent = OpponentPolicy(ref, policy_id)
+            self._policies[opponent] = policy
+            if isinstance(policy, OnnxPolicy | Bot) and (initial := policy.initial_state(1)):
+                first = {key: np.asarray(rows[0], rows.dtype) for key, rows in initial.items()}
+                self._recurrent_states[opponent] = RecurrentStates(first, self._num_envs, len(self._interface.agents))
+
+    def _unload(self, ref: str) -> None:
+        self._exchanged.remove(ref)
+        for policy_id in self._interface.policy_ids:
+            opponent = OpponentPolicy(ref, policy_id)
+            del self._policies[opponent]
+            self._recurrent_states.pop(opponent, None)
 
     def act(self, opponent: OpponentPolicy, batch: Batch, rng: np.random.Generator) -> NDArray:
         """Return actions in the environment's space for the rows that an opponent controls."""

@@ -1,19 +1,24 @@
 """Plays the league's policies against each other and opponents, step by step, and records transitions."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
+from league.config.opponents import OpponentConfig
 from league.config.training import TrainingSettings
 from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts, Turn
+from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import to_environment
+from league.results.records import Scoring
 from league.settings import Storage
 from league.spaces import ACTION_MASK
 from training.modules.policy_module import PREVIOUS_ACTION
 from training.sampling.distributions import OrnsteinUhlenbeck, distribution
+from training.sampling.opponent_scores import OpponentScores
 from training.sampling.opponents import Controllers, Matchups, Openings, OpponentPolicy, Opponents, RandomMoves
 from training.sampling.play_metrics import PlayMetrics
 from training.sampling.recorder import Recorder
@@ -37,6 +42,9 @@ class ForwardOutput:
     state: State | None
 
 
+OPPONENTS, GAMES, SCORE = "opponents", "games", "score"
+"""Keys of metrics: opponent → number of finished games, and the sum of the learner's scores in them."""
+
 Forward = Callable[[Mapping[str, ForwardInput]], Mapping[str, ForwardOutput]]
 """One forward pass for all policies that must act: policy id → its rows."""
 
@@ -52,9 +60,10 @@ class SelfPlay:
         recorder: Recorder,
         initial_states: Mapping[str, Mapping[str, NDArray]],
         storage: Storage | None = None,
+        scoring: Scoring = "game",
     ) -> None:
         """recorder: receives the play of the league's own policies. initial_states: policy id → initial recurrent
-        state, empty if not recurrent.
+        state, empty if not recurrent. scoring: how games against opponents are scored.
 
         Raises ConfigError for invalid opponents, and what loading them raises.
         """
@@ -63,21 +72,49 @@ class SelfPlay:
         self._actions = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
         self._distributions = {policy: distribution(space) for policy, space in self._actions.items()}
         self._initial_states = {policy: state for policy, state in initial_states.items() if state}
-        self._controllers = Controllers(interface, settings.opponents)
-        self._matchups = Matchups(interface, settings.opponents, stepping.agents, self._controllers)
-        self._opponents = Opponents(settings.opponents, interface, storage, stepping.num_envs)
+        if settings.opponents.any and len(interface.sides) < 2:
+            raise ConfigError("training.opponents: the league has one side only: divide the agents into sides")
+        self._interface, self._scoring, self._fixed = interface, scoring, settings.opponents.fixed
+        self._opponents = Opponents(self._fixed, interface, storage, stepping.num_envs)
+        self._arrange(())
         self.noises: dict[str, OrnsteinUhlenbeck] = {}
         """policy id → temporally correlated exploration noise, instead of independent draws."""
         movers = self._controllers.groups([RandomMoves(policy) for policy in self._policies])
         self._openings = Openings(settings.opening_plies, movers, stepping.num_envs)
         self.metrics = PlayMetrics(stepping.agents, self._policies, self._distributions, stepping.num_envs)
 
-    def begin(self, seeds: ResetSeeds, rng: np.random.Generator) -> None:
-        """Restart; all further play is determined by `seeds` and `rng`."""
+    def begin(self, seeds: ResetSeeds, rng: np.random.Generator, opponents: Sequence[OpponentConfig] = ()) -> None:
+        """Restart; all further play is determined by `seeds`, `rng` and the opponents from the league."""
         self._seeds, self._rng = seeds, rng
+        self._arrange(opponents)
         self._begun = np.zeros(self._stepping.num_envs, np.int64)
         self.recorder.begin(seeds)
         self.restart()
+
+    def exchange(self, opponents: Sequence[OpponentConfig]) -> None:
+        """Replace the opponents from the league in new episodes. Open episodes continue with theirs.
+
+        Raises what loading them raises.
+        """
+        playing = {self._matchups.refs[number] for number in np.unique(self._scores.opponents) if number >= 0}
+        self._opponents.exchange([opponent.ref for opponent in opponents], playing)
+        self._matchups.exchange([*self._fixed, *opponents])
+
+    def _arrange(self, opponents: Sequence[OpponentConfig]) -> None:
+        """Number the controllers anew, so that play does not depend on earlier opponents."""
+        self._controllers = Controllers(self._interface)
+        self._matchups = Matchups(self._interface, self._stepping.agents, self._controllers)
+        self._scores = OpponentScores(self._matchups.sides, self._scoring, self._stepping.num_envs)
+        self.exchange(opponents)
+
+    def log(self, metrics: MetricsLogger) -> None:
+        """Log everything since the last call."""
+        self.metrics.log(metrics)
+        scored = self._scores.take(len(self._matchups.refs))
+        for ref, games, score in zip(self._matchups.refs, scored.games.tolist(), scored.scores.tolist(), strict=True):
+            if games:
+                metrics.log_value((OPPONENTS, ref, GAMES), games, reduce="sum")
+                metrics.log_value((OPPONENTS, ref, SCORE), score, reduce="sum")
 
     def restart(self) -> None:
         """Drop all open episodes, and start new ones in all environments."""
@@ -89,6 +126,7 @@ class SelfPlay:
         }
         everywhere = np.arange(num_envs)
         self.metrics.forget(everywhere)
+        self._scores.forget(everywhere)
         self._forget(everywhere)
         self._read(self._stepping.start(self._next_episodes))
 
@@ -127,16 +165,18 @@ class SelfPlay:
         self._read(self._stepping.step(actions))
 
     def _next_episodes(self, envs: Indices) -> Starts:
-        groups = self._matchups.draw(len(envs), self._rng)
+        pairings = self._matchups.draw(len(envs), self._rng)
+        self._scores.begin(envs, pairings.opponents, pairings.sides)
         seeds = self._seeds(envs, self._begun[envs])
         self._begun[envs] += 1
-        return Starts(envs, seeds, self._openings.begin(envs, groups, self._rng))
+        return Starts(envs, seeds, self._openings.begin(envs, pairings.groups, self._rng))
 
     def _read(self, turn: Turn) -> None:
         """Process what has ended, then what continues or starts."""
         self._turn = turn
         self.recorder.read(turn)
         self.metrics.add_turn(turn, own_policies=len(self._distributions))
+        self._scores.add_turn(turn)
         over = np.concatenate([turn.crashed, turn.finished])
         if len(over):
             self._forget(over)

@@ -5,11 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.schedules.builders import gauntlet, round_robin, scoring, verdict
+from evaluation.schedules.builders import gauntlet, round_robin, verdict
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch
 from league.results.records import Schedule
+from league.results.scoring import scoring
 from tests.support.leagues.schedules import CONFIG, INTERFACE
 from tests.support.leagues.tictactoe import config
 

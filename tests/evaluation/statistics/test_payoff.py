@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from evaluation.statistics.payoff import score_interval, tabulate
-from evaluation.statistics.population import alpha_rank, nash_averaging, resampled_interval, resampled_scores
+from evaluation.statistics.population import resampled_interval, resampled_scores
+from league.results.equilibria import alpha_rank, nash_averaging
 from tests.support.closeness import close
 from tests.support.leagues.payoff_matches import match
 

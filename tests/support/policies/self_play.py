@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from hypothesis import strategies as st
 
-from league.config.training import OpponentConfig
+from league.config.opponents import OpponentConfig
 from tests.support.environments.scripted_environment import ACTIONS
 from training.modules.policy_module import MASKED_LOGIT
 from training.sampling.self_play import ForwardInput, ForwardOutput

@@ -2,9 +2,10 @@ from typing import Any
 
 import pytest
 
+from league.environments.building import interface
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import counting, tictactoe
-from training.algorithms.setup import check_policies_to_train, learning_policies, num_envs
+from training.algorithms.setup import check_opponents, check_policies_to_train, learning_policies, num_envs
 
 POLICIES = ("a", "b", "c")
 
@@ -57,3 +58,12 @@ def test_each_agent_gets_enough_steps_of_each_vectorised_environment(training: d
 
 def test_a_stock_environment_has_the_same_number_for_every_batch() -> None:
     assert num_envs(counting([4, 6], [1], num_envs="auto", train_batch_size=65536), agents=2) == 32
+
+
+def test_opponents_are_not_drawn_by_scores_that_games_do_not_have() -> None:
+    league = counting([3, 4, 5], [1], opponents={"league": {"sampling": "pfsp"}})
+    with pytest.raises(ConfigError, match=r"^training\.opponents\.league\.sampling: pfsp needs scores.*3 sides"):
+        check_opponents(league, interface(league))
+    check_opponents(counting([3, 4, 5], [1], opponents={"league": {"sampling": "uniform"}}), interface(league))
+    two = counting([3, 4], [1], opponents={"league": {"sampling": "pfsp"}})
+    check_opponents(two, interface(two))

@@ -64,3 +64,12 @@ def test_shares_of_sampling_and_learning_are_of_all_phases() -> None:
 
 def test_durations_are_formatted_as_a_clock() -> None:
     assert [clock(seconds) for seconds in (0, 61.9, 3600, 36_061)] == ["0:00", "1:01", "1:00:00", "10:01:01"]
+
+
+def test_the_most_frequent_opponents_are_shown_with_the_scores_against_them() -> None:
+    shares = {"a@1": 0.1, "a@2": 0.2, "a@3": 0.3, "script:random": 0.4}
+    scores = {f"opponents/{ref}/score": 0.25 for ref in shares}
+    (line,) = output_of(
+        METRICS | scores | {f"opponents/{ref}/share": share for ref, share in shares.items()}
+    ).splitlines()
+    assert line.endswith("; opponents: script:random 25%, a@3 25%, a@2 25%")

@@ -52,7 +52,7 @@ def test_opponents_remain_pinned_in_a_resumed_run(storage: Storage) -> None:
     """The alias may have moved in the meantime."""
     written = tictactoe(opponents=[{"ref": "@champion", "share": 0.5}])
     run = RunDirectory.begin(storage, written, None, None, {"@champion": "tictactoe@3"})
-    assert run.record.config.training.opponents[0].ref == "tictactoe@3"
+    assert run.record.config.training.opponents.fixed[0].ref == "tictactoe@3"
     assert RunDirectory.resume(storage, written).record.config == run.record.config
     for other in ({"ref": "@latest", "share": 0.5}, {"ref": "@champion", "share": 0.25}):
         with pytest.raises(ConfigError, match=r"training\.opponents has changed"):

@@ -4,7 +4,7 @@ import pytest
 
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
-from league.errors import InvalidReference, LeagueError, UnknownVersion
+from league.errors import ConfigError, LeagueError, UnknownVersion
 from tests.support.leagues import tictactoe
 from training.runs.run_directory import pin_opponents, with_pins
 
@@ -21,7 +21,7 @@ def test_references_are_pinned_when_training_starts(tmp_path: Path) -> None:
     league = with_opponents("@champion", "tictactoe@2", "script:random")
     pins = pin_opponents(league, registry, registry.leagues.get("tictactoe").interface)
     assert pins == {"@champion": "tictactoe@1", "tictactoe@2": "tictactoe@2", "script:random": "script:random"}
-    opponents = with_pins(league, pins).training.opponents
+    opponents = with_pins(league, pins).training.opponents.fixed
     assert [opponent.ref for opponent in opponents] == ["tictactoe@1", "tictactoe@2", "script:random"]
     assert [opponent.share for opponent in opponents] == [0.3, 0.3, 0.3]
 
@@ -42,7 +42,7 @@ def test_the_magnet_is_pinned_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("ref", "error"),
-    [("@3", UnknownVersion), ("champion", InvalidReference), ("script:stockfish", LeagueError)],
+    [("@3", UnknownVersion), ("champion", ConfigError), ("script:stockfish", LeagueError)],
 )
 def test_unknown_opponents_are_rejected(tmp_path: Path, ref: str, error: type[LeagueError]) -> None:
     registry = tictactoe.registry(tmp_path)

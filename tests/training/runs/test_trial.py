@@ -1,3 +1,5 @@
+import shutil
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -5,9 +7,12 @@ import pytest
 import torch
 
 from league.environments.building import interface
+from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.environments.counting import Counting
+from tests.support.leagues import registries
 from tests.support.leagues.training_leagues import counting, tictactoe
+from tests.support.policies.graphs import masked_mlp
 from training.algorithms.metrics import metric_names
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, build_algorithm, read_progress
 
@@ -173,3 +178,34 @@ def test_a_trial_that_is_asked_to_stop_saves_its_state(tmp_path: Path) -> None:
     assert result["done"]
     assert "checkpoint" not in result, "nothing has changed since"
     at_once.stop()
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize("sampling", ["pfsp", "nash"])
+def test_restored_training_draws_the_same_opponents(tmp_path: Path, sampling: str) -> None:
+    storage = Storage.at(tmp_path / "whole")
+    with closing(Registry.open(storage)) as registry:
+        registry.leagues.register(registries.config(), registries.interface())
+        for number in range(4):
+            graph = registries.builder(graph=masked_mlp((3, 3, 2), actions=9, seed=number))
+            registry.publisher.publish("tictactoe", graph, source=f"run/{number}", parent=None)
+    shutil.copytree(tmp_path / "whole", tmp_path / "resumed")
+    league = {"share": 0.75, "sampling": sampling, "window": 3, "active": 2}
+    settings: dict[str, Any] = {"steps": 768, "checkpoint_every": 256, "opponents": {"league": league}}
+    whole = trial(tmp_path / "whole", **settings)
+    expected = run(whole)
+    start = StartState(tmp_path / "whole" / "checkpoints" / "256", 256, 0, 1.0)
+    resumed = trial(tmp_path / "resumed", start, **settings)
+    results = run(resumed)
+    for name, value in weights(whole).items():
+        assert torch.equal(weights(resumed)[name], value)
+    curves = [{name: value for name, value in each.items() if name.startswith("opponents/")} for each in results]
+    assert curves == [{name: each[name] for name in each if name.startswith("opponents/")} for each in expected[1:]]
+    assert {name.split("/")[1] for each in expected for name in each if name.startswith("opponents/")} == {
+        "tictactoe@2",
+        "tictactoe@3",
+        "tictactoe@4",
+    }
+    assert resumed.algorithm.opponents.get_state()["scores"] == whole.algorithm.opponents.get_state()["scores"]
+    whole.stop()
+    resumed.stop()

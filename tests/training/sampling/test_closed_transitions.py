@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
 
 from league.config.league import LeagueConfig
+from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
-from league.config.training import OpponentConfig
 from league.environments.building import interface as interface_of
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from league.config.training import OpponentConfig
+from league.config.opponents import OpponentConfig
 from league.environments.stepping import Batch
 from tests.support.leagues.registries import interface
 from tests.support.policies.bots import MODULE

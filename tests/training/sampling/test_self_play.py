@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
+from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
-from league.config.training import OpponentConfig
 from league.errors import ConfigError
 from league.policies.actions import to_environment
 from league.seeds import generator

@@ -1,0 +1,143 @@
+"""The candidates of a run, its scores against them, and the draws."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from league.registry.aliases import ANY
+from league.registry.registry import Registry
+from league.results.ledger import Ledger
+from league.results.records import BlockResult
+from league.settings import Storage
+from tests.support.leagues import registries
+from training.algorithms.league_opponents import HALF_LIFE, PRIOR_GAMES, LeagueOpponents, payoff_matrix
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Registry:
+    return registries.registered(Registry.open(Storage.at(tmp_path)))
+
+
+def opponents_of(registry: Registry, fixed: tuple[str, ...] = (), **league: Any) -> LeagueOpponents:
+    parts = {"fixed": [{"ref": ref, "share": 0.1} for ref in fixed], "league": league}
+    config = registries.config().with_training(opponents=parts)
+    return LeagueOpponents(config, registries.interface(), registry.storage)
+
+
+def metrics(**results: tuple[float, float]) -> list[dict[str, Any]]:
+    """Of one runner: version number → (games, score)."""
+    played = {f"tictactoe@{ref[1:]}": {"games": games, "score": score} for ref, (games, score) in results.items()}
+    return [{"opponents": played}]
+
+
+def test_an_empty_league_has_no_opponents(registry: Registry) -> None:
+    opponents = opponents_of(registry)
+    opponents.refresh()
+    opponents.reset(0)
+    assert opponents.active == ()
+    registries.publish(registry, "run/1")
+    opponents.refresh()
+    opponents.reset(1000)
+    assert [(each.ref, each.share) for each in opponents.active] == [("tictactoe@1", 0.5)]
+
+
+def test_candidates_are_the_newest_versions_and_all_champions(registry: Registry) -> None:
+    for number in range(7):
+        registries.publish(registry, f"run/{number}")
+    for champion in (1, 2):
+        registry.aliases.set("tictactoe", "champion", champion, expected=ANY, actor="me", reason="test")
+    opponents = opponents_of(registry, window=2)
+    opponents.refresh()
+    assert opponents.candidates == tuple(f"tictactoe@{number}" for number in (1, 2, 6, 7))
+    opponents = opponents_of(registry, ("tictactoe@7",), window=2, champions=False)
+    opponents.refresh()
+    assert opponents.candidates == ("tictactoe@6",)
+
+
+def test_versions_with_another_interface_are_no_candidates(registry: Registry) -> None:
+    registries.publish(registry, "run/1")
+    config = registries.config().with_training(opponents={"league": {}})
+    opponents = LeagueOpponents(config, registries.interface(squares=8), registry.storage)
+    opponents.refresh()
+    assert opponents.candidates == ()
+
+
+def test_scores_decay_towards_the_prior(registry: Registry) -> None:
+    opponents = opponents_of(registry)
+    assert opponents.add(metrics(v1=(20.0, 20.0), v2=(float("nan"), 0.0)), 100) == {"tictactoe@1": 20.0}
+    assert opponents.score("tictactoe@1") == pytest.approx((20 + PRIOR_GAMES / 2) / (20 + PRIOR_GAMES))
+    opponents.add([], HALF_LIFE)
+    assert opponents.score("tictactoe@1") == pytest.approx((10 + PRIOR_GAMES / 2) / (10 + PRIOR_GAMES))
+    assert opponents.score("tictactoe@2") == pytest.approx(0.5)
+
+
+def test_the_learners_scores_become_those_of_its_checkpoint(registry: Registry) -> None:
+    registries.publish(registry, "other/1")
+    opponents = opponents_of(registry, sampling="nash", forgotten=0, active=1)
+    opponents.refresh()
+    opponents.add(metrics(v1=(90.0, 90.0)), 0)
+    opponents.refresh(checkpoint="own/1000")
+    registries.publish(registry, "own/1000")
+    opponents.refresh(checkpoint="own/2000")
+    opponents.draw()
+    assert [each.ref for each in opponents.active] == ["tictactoe@2"]
+    expected = (90 + PRIOR_GAMES / 2) / (90 + PRIOR_GAMES)
+    np.testing.assert_allclose(opponents.get_state()["payoff"], [[0.5, 1 - expected], [expected, 0.5]])
+
+
+def test_draws_continue_from_a_saved_state(registry: Registry) -> None:
+    for number in range(6):
+        registries.publish(registry, f"run/{number}")
+    first = opponents_of(registry, sampling="pfsp", active=2)
+    first.refresh()
+    first.add(metrics(v1=(10.0, 1.0), v2=(10.0, 9.0)), 0)
+    first.refresh(checkpoint="own/1000")
+    second = opponents_of(registry, sampling="pfsp", active=2)
+    second.set_state(first.get_state())
+    draws = []
+    for opponents in (first, second):
+        opponents.reset(1000)
+        drawn = [opponents.active]
+        for _ in range(5):
+            opponents.draw()
+            drawn.append(opponents.active)
+        draws.append(drawn)
+    assert draws[0] == draws[1]
+    assert all(len(active) <= 2 for active in draws[0])
+    assert len(set(draws[0])) > 1
+
+
+def test_removed_versions_are_not_drawn_after_resuming(registry: Registry) -> None:
+    for number in range(3):
+        registries.publish(registry, f"run/{number}")
+    opponents = opponents_of(registry, sampling="uniform", window=2)
+    opponents.refresh()
+    state = opponents.get_state() | {"candidates": ("tictactoe@9", "tictactoe@3")}
+    opponents.set_state(state)
+    opponents.drop_removed()
+    opponents.draw()
+    assert [each.ref for each in opponents.active] == ["tictactoe@3"]
+
+
+def test_the_prior_is_the_parents_score_in_the_league(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(2):
+        registries.publish(registry, f"run/{number}")
+    block = BlockResult("schedule", 0, ("tictactoe@1", "tictactoe@2"), 30, (6.0, 24.0), None)
+    monkeypatch.setattr(Ledger, "results", lambda *_: [block])
+    opponents = opponents_of(registry)
+    opponents.refresh(parent=2)
+    parents_score = (24 + PRIOR_GAMES / 2) / (30 + PRIOR_GAMES)
+    assert opponents.score("tictactoe@1") == pytest.approx(parents_score)
+    opponents.add(metrics(v1=(30.0, 30.0)), 0)
+    expected = (30 + PRIOR_GAMES * parents_score) / (30 + PRIOR_GAMES)
+    assert opponents.score("tictactoe@1") == pytest.approx(expected)
+    assert opponents.score("tictactoe@2") == pytest.approx(0.5), "the parent itself"
+
+
+def test_the_payoff_matrix_has_matches_and_training_games() -> None:
+    blocks = [BlockResult("schedule", i, ("a", "b"), 2, (2.0, 0.0), None) for i in range(5)]
+    found = payoff_matrix(("a", "b", "c"), blocks, {"c": {"b": (10.0, 10.0), "unknown": (5.0, 5.0)}})
+    score = (10 + PRIOR_GAMES / 2) / (10 + PRIOR_GAMES)
+    np.testing.assert_allclose(found, [[0.5, score, 0.5], [1 - score, 0.5, 1 - score], [0.5, score, 0.5]])

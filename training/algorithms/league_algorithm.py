@@ -1,0 +1,68 @@
+"""Base of all algorithms: opponents from the league, and reproducible episodes."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.utils.metrics import NUM_EPISODES
+
+from league.config.league import LeagueConfig
+from league.config.opponents import OpponentConfig
+from league.interface import Interface
+from league.seeds import derive
+from training.algorithms.league_opponents import LeagueOpponents
+from training.rllib_compat import NoResultsDirectory
+from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner
+from training.sampling.self_play import OPPONENTS, SCORE
+
+SHARE = "share"
+"""Metric of an opponent: its share of the finished episodes."""
+
+
+class LeagueAlgorithm(NoResultsDirectory, Algorithm):
+    """An RLlib Algorithm whose runners play opponents from the league."""
+
+    def setup(self, config: AlgorithmConfig) -> None:
+        super().setup(config)
+        given = self.config.env_config
+        league, interface = LeagueConfig.model_validate(given[LEAGUE]), Interface.model_validate(given[INTERFACE])
+        self.opponents = LeagueOpponents(league, interface, given[STORAGE])
+
+    def reset_episodes(self, steps: int) -> None:
+        """Drop all open episodes, and derive all further randomness from the seed and `steps`.
+
+        Called at each checkpoint, and when training resumes from one, so that both continue identically.
+        """
+        self.opponents.reset(steps)
+        # With remote runners, the local one only holds weights.
+        is_local = self.env_runner_group.num_remote_env_runners() == 0
+        reset = partial(_reset_episodes, steps=steps, opponents=self.opponents.active)
+        self.env_runner_group.foreach_env_runner(reset, local_env_runner=is_local)
+        torch.manual_seed(derive(self.config.seed or 0, "learner", steps))
+
+    def exchange_opponents(self, results: Sequence[Mapping[str, Any]], actions: int) -> None:
+        """Add the games of an update, log the scores, and draw the opponents of the next one.
+
+        results: the runners' metrics. actions: of all agents in the update.
+        """
+        episodes = sum(float(result[NUM_EPISODES]) for result in results)
+        for ref, games in self.opponents.add(results, actions).items():
+            self.metrics.log_value((OPPONENTS, ref, SCORE), self.opponents.score(ref), window=1)
+            self.metrics.log_value((OPPONENTS, ref, SHARE), games / max(episodes, 1.0), window=1)
+        self.opponents.draw()
+
+    def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        return super().get_state(*args, **kwargs) | {OPPONENTS: self.opponents.get_state()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        super().set_state(state)
+        if OPPONENTS in state:
+            self.opponents.set_state(state[OPPONENTS])
+
+
+def _reset_episodes(runner: BatchedEnvRunner, steps: int, opponents: Sequence[OpponentConfig]) -> None:
+    runner.exchange_opponents(opponents)
+    runner.reset_episodes(steps)

@@ -1,0 +1,193 @@
+"""The opponents that a run draws from the versions of its league.
+
+The learner's scores are those of its training games. They decay, because the learner changes, and are shrunk towards a
+prior: ½, or the parent version's score in the league's matches. A version that the run publishes becomes a candidate;
+the learner's scores at its checkpoint become its row of the payoff matrix.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from math import isnan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.config.league import LeagueConfig
+from league.config.opponents import OpponentConfig
+from league.interface import Interface
+from league.registry.registry import Registry
+from league.results.ledger import Ledger
+from league.results.records import BlockResult
+from league.seeds import generator
+from league.settings import Storage
+from training.algorithms.opponent_distribution import UNKNOWN, opponent_distribution, systematic_counts
+from training.sampling.self_play import GAMES, OPPONENTS, SCORE
+
+HALF_LIFE = 200_000
+"""Actions of all agents after which a training game counts half."""
+PRIOR_GAMES = 10.0
+"""Weight of the prior, in games."""
+
+Scores = dict[str, tuple[float, float]]
+"""Opponent → number of games, and the sum of the scores in them."""
+
+
+class LeagueOpponents:
+    """The candidates, the learner's scores against them, and the opponents that are active until the next update."""
+
+    def __init__(self, league: LeagueConfig, interface: Interface, storage: Storage | None) -> None:
+        """Without a storage, there are no candidates."""
+        self._league, self._interface, self._storage = league, interface, storage
+        self._settings = league.training.opponents.league
+        self.active: tuple[OpponentConfig, ...] = ()
+        """The opponents of new episodes, with their shares."""
+        self.candidates: tuple[str, ...] = ()
+        """Versions by age, the newest last."""
+        self._scores: Scores = {}
+        self._priors: dict[str, float] = {}
+        self._rows: dict[str, Scores] = {}
+        self._unpublished: dict[str, Scores] = {}
+        self._payoff: NDArray[np.float64] = np.zeros((0, 0))
+        self.reset(0)
+
+    def reset(self, steps: int) -> None:
+        """Draw the active opponents. Further draws depend on the state, the run's seed, and `steps` only."""
+        self._rng = generator(self._league.training.seed, OPPONENTS, steps)
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw the active opponents."""
+        settings = self._settings
+        if settings is None or not self.candidates:
+            self.active = ()
+            return
+        p = opponent_distribution(settings, [self.score(ref) for ref in self.candidates], self._payoff)
+        counts = systematic_counts(p, settings.active, self._rng)
+        self.active = tuple(
+            OpponentConfig(ref=ref, share=settings.share * count / settings.active)
+            for ref, count in zip(self.candidates, counts.tolist(), strict=True)
+            if count
+        )
+
+    def score(self, ref: str) -> float:
+        """Return the estimated probability that the learner beats an opponent."""
+        games, score = self._scores.get(ref, (0.0, 0.0))
+        return _shrunk(games, score, self._priors.get(ref, UNKNOWN))
+
+    def add(self, results: Sequence[Mapping[str, Any]], actions: int) -> dict[str, float]:
+        """Add the games in the metrics of all runners, and return their number by opponent.
+
+        actions: of all agents since the last call.
+        """
+        decay = 0.5 ** (actions / HALF_LIFE)
+        self._scores = {ref: (games * decay, score * decay) for ref, (games, score) in self._scores.items()}
+        played: dict[str, float] = {}
+        for result in results:
+            for ref, values in result.get(OPPONENTS, {}).items():
+                new, won = float(values[GAMES]), float(values[SCORE])
+                if isnan(new) or not new:
+                    continue  # RLlib keeps the keys of earlier updates.
+                games, score = self._scores.get(ref, (0.0, 0.0))
+                self._scores[ref] = games + new, score + won
+                played[ref] = played.get(ref, 0.0) + new
+        return played
+
+    def refresh(self, *, checkpoint: str | None = None, parent: int | None = None) -> None:
+        """Read the candidates and their results from the registry.
+
+        Args:
+            checkpoint: The source of the version that the current state will be published as.
+            parent: The version that training started from.
+        """
+        settings = self._settings
+        if settings is None or self._storage is None:
+            return
+        with closing(Registry.open(self._storage)) as registry:
+            rows = self._versions(registry)
+            self.candidates = tuple(rows)
+            reads_results = parent is not None or settings.sampling in ("nash", "alpha_rank")
+            conditions = registry.leagues.get(self._league.league).conditions
+            results = Ledger(registry).results(self._league.league, conditions) if reads_results else []
+        for ref, source in rows.items():
+            if source in self._unpublished:
+                self._rows[ref] = self._unpublished.pop(source)
+        self._rows = {ref: row for ref, row in self._rows.items() if ref in rows}
+        if checkpoint is not None:
+            self._unpublished[checkpoint] = dict(self._scores)
+        self._payoff = payoff_matrix(self.candidates, results, self._rows)
+        if parent is not None:
+            known = tuple(dict.fromkeys((f"{self._league.league}@{parent}", *self.candidates)))
+            self._priors = dict(zip(known, payoff_matrix(known, results, self._rows)[0].tolist(), strict=True))
+
+    def drop_removed(self) -> None:
+        """Drop candidates whose files were removed since the checkpoint."""
+        if self._storage is not None and self.candidates:
+            with closing(Registry.open(self._storage)) as registry:
+                rows = self._versions(registry)
+            kept = [number for number, ref in enumerate(self.candidates) if ref in rows]
+            self.candidates = tuple(self.candidates[number] for number in kept)
+            self._payoff = self._payoff[np.ix_(kept, kept)]
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that draws depend on."""
+        return {
+            "candidates": self.candidates,
+            "scores": self._scores,
+            "priors": self._priors,
+            "rows": self._rows,
+            "unpublished": self._unpublished,
+            "payoff": self._payoff,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Restore what `get_state` returned."""
+        self.candidates, self._payoff = state["candidates"], state["payoff"]
+        self._scores, self._priors = dict(state["scores"]), dict(state["priors"])
+        self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
+
+    def _versions(self, registry: Registry) -> dict[str, str]:
+        """Return the versions that may be candidates → their sources, by age."""
+        assert self._settings is not None
+        league = self._league.league
+        numbers = registry.versions.numbers(league).get(league, [])
+        chosen = set(numbers[-self._settings.window :])
+        if self._settings.champions:
+            chosen |= {event.version for event in registry.aliases.history(league)}
+        rows = [registry.versions.get(league, number) for number in numbers if number in chosen]
+        fixed = {opponent.ref for opponent in self._league.training.opponents.fixed}
+        digest = self._interface.digest()
+        return {
+            row.ref: row.source for row in rows if row.manifest.interface.digest() == digest and row.ref not in fixed
+        }
+
+
+def payoff_matrix(
+    contestants: Sequence[str], results: Iterable[BlockResult], rows: Mapping[str, Scores]
+) -> NDArray[np.float64]:
+    """Return the mean score of each contestant against each other, shrunk towards ½, (n, n).
+
+    results: of the league's matches. rows: contestant → its scores in training games.
+    """
+    number = {ref: i for i, ref in enumerate(contestants)}
+    games, scores = np.zeros((2, len(number), len(number)))
+
+    def add(first: str, second: str, count: float, score: float) -> None:
+        if first in number and second in number:
+            i, j = number[first], number[second]
+            games[i, j] += count
+            games[j, i] += count
+            scores[i, j] += score
+            scores[j, i] += count - score
+
+    for result in results:
+        if len(result.contestants) == 2:
+            add(*result.contestants, result.games, result.scores[0])
+    for ref, row in rows.items():
+        for other, (count, score) in row.items():
+            add(ref, other, count, score)
+    return np.asarray(_shrunk(games, scores, UNKNOWN))
+
+
+def _shrunk(games: Any, score: Any, prior: float) -> Any:
+    return (score + PRIOR_GAMES * prior) / (games + PRIOR_GAMES)

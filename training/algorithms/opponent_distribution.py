@@ -1,0 +1,93 @@
+"""Probabilities of the opponents in training, from the learner's scores and their payoff matrix.
+
+x is the probability that the learner beats an opponent, where draws count ½.
+
+- **pfsp**: prioritised fictitious self-play (O. Vinyals et al., "Grandmaster level in StarCraft II using multi-agent
+  reinforcement learning", Nature 575, 2019), with the weight (1 - x)², x(1 - x) or min(½, 1 - x);
+- **nash**, **alpha_rank**: policy-space response oracles (M. Lanctot et al., "A unified game-theoretic approach to
+  multiagent reinforcement learning", NeurIPS 2017): the meta-strategy of the candidates' payoff matrix.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from league.config.opponents import LeagueOpponentsConfig, Sampling, Weighting
+from league.results.equilibria import alpha_rank, nash_averaging
+
+Floats = NDArray[np.float64]
+
+UNKNOWN = 0.5
+"""Score of a pair without games."""
+FORGOTTEN_BELOW = 0.7
+"""An opponent that the learner beats with a lower probability counts as forgotten."""
+
+
+def opponent_distribution(settings: LeagueOpponentsConfig, scores: ArrayLike, payoff: ArrayLike) -> Floats:
+    """Return the probability of each opponent.
+
+    Args:
+        settings: How opponents are drawn.
+        scores: x for each opponent in order of age, the newest last, (n,). NaN if unknown, which counts as ½.
+        payoff: Mean score of each opponent against each other, (n, n), NaN if unknown.
+
+    Returns:
+        Probabilities, (n,); empty without opponents.
+    """
+    x = known(scores)
+    if not len(x):
+        return x
+    drawn = _base(settings.sampling, settings.weighting, x, known(payoff))
+    forgotten = x < FORGOTTEN_BELOW
+    if not forgotten.any():
+        return drawn
+    return np.asarray((1 - settings.forgotten) * drawn + settings.forgotten * forgotten / forgotten.sum())
+
+
+def pfsp_weights(scores: Floats, weighting: Weighting) -> Floats:
+    """Return the weights of opponents whom the learner beats with probabilities `scores`, (n,)."""
+    match weighting:
+        case "squared":
+            return (1 - scores) ** 2
+        case "variance":
+            return scores * (1 - scores)
+        case "linear_capped":
+            return np.minimum(0.5, 1 - scores)
+
+
+def systematic_counts(probabilities: Floats, draws: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return how often each opponent is drawn, (n,).
+
+    Systematic sampling uses one random number for all draws: the expected count is `draws` times the probability, and
+    the count differs from it by less than 1.
+    """
+    points = (rng.random() + np.arange(draws)) / draws
+    bounds = np.cumsum(probabilities)
+    return np.bincount(np.searchsorted(bounds / bounds[-1], points, side="right"), minlength=len(bounds))
+
+
+def known(scores: ArrayLike) -> Floats:
+    """Return scores with ½ in place of NaN."""
+    return np.nan_to_num(np.asarray(scores, dtype=np.float64), nan=UNKNOWN)
+
+
+def _base(sampling: Sampling, weighting: Weighting, x: Floats, payoff: Floats) -> Floats:
+    uniform = np.full(len(x), 1 / len(x))
+    match sampling:
+        case "latest":
+            return np.eye(len(x))[-1]
+        case "uniform":
+            return uniform
+        case "pfsp":
+            weights = pfsp_weights(x, weighting)
+            total = weights.sum()
+            return weights / total if total > 0 else uniform
+        case "nash":
+            table = _antisymmetric(payoff)
+            return nash_averaging(2 * table - 1)[0]
+        case "alpha_rank":
+            return alpha_rank(_antisymmetric(payoff)) if len(x) > 1 else uniform
+
+
+def _antisymmetric(payoff: Floats) -> Floats:
+    """Return the payoff matrix with scores of a pair that add up to 1, and ½ on the diagonal."""
+    return (payoff + 1 - payoff.T) / 2
