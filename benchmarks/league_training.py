@@ -105,6 +105,7 @@ def blotto(quick: bool) -> bool:
             payoff = policies @ PAYOFF @ policies.T
             last.append(exploitability(policies[-1]))
             nash.append(exploitability(nash_averaging(payoff)[0] @ policies))
+            print(f"blotto, {arm}, seed {seed}: last {last[-1]:.3f}, nash {nash[-1]:.3f}", flush=True)
         for name, found in (("last", last), ("nash", nash)):
             print(f"blotto, {arm}, {name}: {statistics.mean(found):.3f} ({_each(found)})", flush=True)
     return True
