@@ -42,7 +42,7 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
             (
                 row.number,
                 ", ".join(row.aliases) if row.retired_at is None else "retired",
-                row.role if row.exploits is None else f"{row.role} of {row.exploits}",
+                row.role if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}",
                 elo(document["rating"], document["interval"]),
                 document["games"],
                 row.steps,
