@@ -11,15 +11,19 @@ contestant forfeits as well.
 The scores of a block sum to half their number and swap with the contestants, so equal policies score ½ on average.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Sequence
 from functools import lru_cache
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
-from league.config.league import LeagueConfig
 from league.errors import ConfigError, LedgerConflict
 from league.interface import Interface, digest
 from league.results.records import GAMES_PER_BLOCK, Game, Match, Reason, Schedule, Scoring
+
+if TYPE_CHECKING:
+    from league.config.league import LeagueConfig
 
 Values = tuple[float | None, ...]
 

@@ -100,6 +100,7 @@ def test_ctrl_c_publishes_the_current_checkpoint_and_a_second_one_exits_at_once(
     assert [version.steps for version in last] == sorted({version.steps for version in last})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_a_sweep_prints_its_trials_and_the_best_settings(league: League, config: Path, home: Path) -> None:
     result = league("sweep", str(config), "--steps=256", "--runners=0")

@@ -29,7 +29,9 @@ def published(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def queue_of(parent: int | None = None) -> PublishQueue:
-    run: Any = SimpleNamespace(id="run", record=SimpleNamespace(config=None, parent=parent, git_commit=None))
+    run: Any = SimpleNamespace(
+        id="run", record=SimpleNamespace(config=None, parent=parent, git_commit=None, exploits=None)
+    )
     ignore: Any = SimpleNamespace(published=lambda row: None)
     return PublishQueue(run, ignore, ignore, ignore)
 

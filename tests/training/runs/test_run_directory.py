@@ -69,7 +69,7 @@ def test_runs_are_resumed_by_role(storage: Storage) -> None:
     assert RunDirectory.resume(storage, written).id == main.id
     resumed = RunDirectory.resume(storage, written, EXPLOITER)
     assert (resumed.id, resumed.record) == (exploiter.id, exploiter.record)
-    assert [(each.ref, each.share) for each in resumed.record.config.training.opponents] == [("tictactoe@3", 1)]
+    assert [(each.ref, each.share) for each in resumed.record.config.training.opponents.fixed] == [("tictactoe@3", 1)]
 
 
 def test_one_driver_at_a_time(storage: Storage) -> None:
