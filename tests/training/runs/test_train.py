@@ -115,7 +115,7 @@ def test_an_exploiter_is_trained_against_one_version(trained: Trained) -> None:
     console = Console(file=shown, width=200)
     (version,) = train(settings, registry=registry, role=EXPLOITER, target=target, console=console)
     assert (version.role, version.exploits, version.parent) == (EXPLOITER, "tictactoe@1", None)
-    assert version.manifest.settings["opponents"] == [{"ref": "tictactoe@1", "share": 1.0}]
+    assert version.manifest.settings["opponents"]["fixed"] == [{"ref": "tictactoe@1", "share": 1.0}]
     assert "Role: exploiter. Opponent in all episodes: tictactoe@1." in shown.getvalue()
     registry.aliases.set("tictactoe", "champion", 2, expected=1, actor="test", reason="test")
     further = train(LEAGUE, registry=registry, role=EXPLOITER, resume=True)
