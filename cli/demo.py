@@ -61,7 +61,9 @@ def demo(
 def _train(config: "LeagueConfig", minutes: float) -> None:
     from training.runs.train import train
 
-    _step(1, f"Train: self-play for {minutes:g} minutes (masked PPO, RLlib, Ray Tune).")
+    _step(
+        1, f"Train for {minutes:g} minutes: self-play and games against script:one_ply (masked PPO, RLlib, Ray Tune)."
+    )
     say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
     paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS, checkpoint_every=None)
     train(paced, registry=open_registry(), config_path=find(LEAGUE), console=console)

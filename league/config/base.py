@@ -1,8 +1,8 @@
 """Base of all sections of a configuration."""
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from league.errors import InvalidReference
 from league.refs import of_league, parse_ref
@@ -16,13 +16,13 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def check_contestant(ref: str) -> str:
-    """Return `ref` if it is a reference of a version, script or bot, in which `@3` is short for a league's version.
-
-    Raises ValueError, as validators do.
-    """
+def _check_contestant(ref: str) -> str:
     try:
         parse_ref(of_league(ref, "league"))
     except InvalidReference as error:
         raise ValueError(str(error)) from error
     return ref
+
+
+ContestantRef = Annotated[str, AfterValidator(_check_contestant)]
+"""A reference of a version, script or bot, in which `@3` is short for a version of the league."""

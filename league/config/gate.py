@@ -2,9 +2,9 @@
 
 from typing import Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from league.config.base import Part, check_contestant
+from league.config.base import ContestantRef, Part
 
 MAX_NORMALIZED_ELO = 190
 """Bound for hypotheses with a usable test; see evaluation/statistics/sequential.py."""
@@ -13,16 +13,11 @@ MAX_NORMALIZED_ELO = 190
 class AnchorConfig(Part):
     """An opponent for the non-inferiority test of a candidate."""
 
-    ref: str
+    ref: ContestantRef
     """A script (`script:one_ply`), a bot (`script:my_package.module:name`), a version (`connect_four@3`), or an alias,
     which is resolved when the verdict is opened. `@3` and `@gold` refer to the league itself."""
     margin: float | None = Field(default=None, gt=0)
     """Non-inferiority margin; by default the gate's `margin`."""
-
-    @field_validator("ref")
-    @classmethod
-    def _is_reference(cls, value: str) -> str:
-        return check_contestant(value)
 
     @model_validator(mode="before")
     @classmethod

@@ -2,24 +2,19 @@
 
 from typing import Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from league.config.base import Part, check_contestant
+from league.config.base import ContestantRef, Part
 
 
 class OpponentConfig(Part):
     """A policy that controls the other sides in a fraction of the episodes and does not learn."""
 
-    ref: str
+    ref: ContestantRef
     """A script (`script:random`), a bot (`script:my_package.module:name`), a version (`connect_four@3`), or an alias,
     which is resolved when training starts. `@3` and `@champion` refer to the league itself."""
     share: float = Field(gt=0, le=1)
     """Fraction of the episodes. The remaining episodes are self-play."""
-
-    @field_validator("ref")
-    @classmethod
-    def _is_reference(cls, value: str) -> str:
-        return check_contestant(value)
 
     @model_validator(mode="before")
     @classmethod

@@ -2,9 +2,9 @@
 
 from typing import Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from league.config.base import Part, check_contestant
+from league.config.base import ContestantRef, Part
 from league.config.network import RecurrenceConfig
 from league.config.schedules import Scheduled, ScheduledPositive
 from league.config.training import TrainingSettings
@@ -51,16 +51,11 @@ class MagnetConfig(Part):
 class TeacherConfig(Part):
     """A policy whose actions are imitated, and the weight of the imitation in the loss."""
 
-    ref: str
+    ref: ContestantRef
     """A script (`script:one_ply`), a bot (`script:my_package.module:name`), a version (`connect_four@3`), or an alias,
     which is resolved when training starts. `@3` and `@champion` refer to the league itself."""
     weight: Scheduled
     """Coefficient of the cross-entropy of the teacher's actions."""
-
-    @field_validator("ref")
-    @classmethod
-    def _is_reference(cls, value: str) -> str:
-        return check_contestant(value)
 
 
 class PPOConfig(TrainingSettings):

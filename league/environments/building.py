@@ -1,7 +1,6 @@
 """Builds environments (AEC, Parallel or MultiAgentEnv) from their configuration and describes their interface."""
 
 import fnmatch
-import importlib
 import os
 from contextlib import closing
 from typing import Any
@@ -19,6 +18,7 @@ from pettingzoo.utils.wrappers import (
 from league.conditions import hides_information
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
+from league.entry_points import import_entry_point, import_module
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch
@@ -169,7 +169,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
 
 def _constructor(config: EnvironmentConfig) -> Any:
     module_name, colon, function = config.entry_point.partition(":")
-    module = _imported("environment.entry_point", module_name)
+    module = import_module("environment.entry_point", module_name)
     if colon:
         name = function
     elif config.api == "aec" or (config.api is None and not hasattr(module, "parallel_env")):
@@ -180,15 +180,6 @@ def _constructor(config: EnvironmentConfig) -> Any:
         expected = "an existing function" if colon else "a PettingZoo module with it, or package.module:function"
         raise ConfigError(f"environment.entry_point: {module_name!r} has no {name!r}: expected {expected}")
     return getattr(module, name)
-
-
-def _imported(key: str, name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ConfigError(f"{key}: cannot import {name!r}: {error}") from error
-    except (ValueError, TypeError) as error:
-        raise ConfigError(f"{key}: {name!r} is not a valid module name") from error
 
 
 def _api(env: Any) -> str | None:
@@ -210,10 +201,9 @@ def _without_checks(env: Any) -> Any:
 
 def _policies_from_function(entry_point: str, agents: list[str]) -> dict[str, str]:
     """Return agent → policy id, as defined by the user's function."""
-    module_name, _, name = entry_point.partition(":")
-    function = getattr(_imported("policies", module_name), name, None)
+    function = import_entry_point("policies", entry_point)
     if not callable(function):
-        raise ConfigError(f"policies: {module_name!r} has no function {name!r}")
+        raise ConfigError(f"policies: {entry_point} is not a function")
     mapped = {}
     for agent in agents:
         try:

@@ -1,13 +1,13 @@
 """Chooses between the stock environment in lockstep and a vectorised environment, which is faster and equal to it."""
 
-import importlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 from league.config.environment import EnvironmentConfig
+from league.entry_points import import_entry_point
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.environments.vector.vector_env import UnsupportedArguments, VectorEnv
@@ -126,11 +126,7 @@ def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation
 
 
 def _imported(entry_point: str) -> Callable[..., VectorEnv]:
-    module_name, _, name = entry_point.partition(":")
-    try:
-        found: Any = getattr(importlib.import_module(module_name), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"environment.vector: cannot import {entry_point!r}: {error}") from error
+    found = import_entry_point("environment.vector", entry_point)
     if not (isinstance(found, type) and issubclass(found, VectorEnv)):
         raise ConfigError(f"environment.vector: {entry_point} is not a subclass of VectorEnv")
     return found

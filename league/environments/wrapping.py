@@ -1,6 +1,5 @@
 """Applies SuperSuit wrappers by name, vectorised over agents where possible."""
 
-import importlib
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +15,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from supersuit.lambda_wrappers.reward_lambda import aec_reward_lambda
 
 from league.config.environment import WrapperConfig
+from league.entry_points import import_entry_point
 from league.environments.transforms import Transform, channel, transform
 from league.errors import ConfigError, one_line
 
@@ -183,10 +183,4 @@ def _argument(wrapper: WrapperConfig, key: str) -> Any:
         return tuple(value)
     if not (key.endswith("_fn") and isinstance(value, str)):
         return value
-    module_name, _, name = value.partition(":")
-    try:
-        return getattr(importlib.import_module(module_name), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(
-            f"environment.wrappers: {wrapper.name}.{key}: {value!r} is not a function package.module:function: {error}"
-        ) from error
+    return import_entry_point(f"environment.wrappers: {wrapper.name}.{key}", value)

@@ -5,7 +5,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from league.config.environment import EnvironmentConfig
 from league.errors import UnknownPolicy
+from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.manifest import PROBES, Manifest, PolicyManifest
@@ -42,32 +44,12 @@ def publish(
         raise UnknownPolicy(f"there is no model for policy {missing[0]} of {league}")
 
     def build(staging: Path, number: int) -> Manifest:
-        graphs: dict[str, OnnxPolicy] = {}
-        partial: dict[str, dict[str, Any]] = {}
-        for policy in interface.policy_ids:
-            source, spaces = sources[policy], interface.of_policy(policy)
-            file = staging / f"{policy}.onnx"
-            file.write_bytes(adapt(source.model, source.mapping, spaces, policy))
-            taken, answered, state = graph_tensors(source.model, source.mapping, spaces)
-            partial[policy] = {
-                "file": file.name, "observation": spaces.observation, "action": spaces.action,
-                "inputs": taken, "outputs": answered, "state": state, "probes": f"{policy}{PROBES}",
-            }  # fmt: skip
-            graphs[policy] = OnnxPolicy(file)
-        played = checks.collect(row.config.environment, interface, graphs, seed)
-        policies = {}
-        for policy, graph in graphs.items():
-            parity = checks.check_parity(
-                policy, graph, sources[policy].original, played[policy], interface.of_policy(policy)
-            )
-            (staging / partial[policy]["probes"]).write_bytes(checks.probes(graph, played[policy]).to_bytes())
-            policies[policy] = PolicyManifest(**partial[policy], parity=parity)
         return Manifest(
             league=league,
             version=number,
             created_at=datetime.now(UTC),
             interface=interface,
-            policies=policies,
+            policies=_write(staging, row.config.environment, interface, sources, seed),
             environment=row.config.environment,
             environment_digest=row.config.environment.digest(),
             algorithm=ALGORITHM,
@@ -81,3 +63,30 @@ def publish(
         )
 
     return registry.publisher.publish(league, build, source=f"import/{digest}")
+
+
+def _write(
+    staging: Path, environment: EnvironmentConfig, interface: Interface, sources: Mapping[str, Source], seed: int
+) -> dict[str, PolicyManifest]:
+    """Write and check the graphs and probes of all policies."""
+    graphs: dict[str, OnnxPolicy] = {}
+    partial: dict[str, dict[str, Any]] = {}
+    for policy in interface.policy_ids:
+        source, spaces = sources[policy], interface.of_policy(policy)
+        file = staging / f"{policy}.onnx"
+        file.write_bytes(adapt(source.model, source.mapping, spaces, policy))
+        taken, answered, state = graph_tensors(source.model, source.mapping, spaces)
+        partial[policy] = {
+            "file": file.name, "observation": spaces.observation, "action": spaces.action,
+            "inputs": taken, "outputs": answered, "state": state, "probes": f"{policy}{PROBES}",
+        }  # fmt: skip
+        graphs[policy] = OnnxPolicy(file)
+    played = checks.collect(environment, interface, graphs, seed)
+    policies = {}
+    for policy, graph in graphs.items():
+        parity = checks.check_parity(
+            policy, graph, sources[policy].original, played[policy], interface.of_policy(policy)
+        )
+        (staging / partial[policy]["probes"]).write_bytes(checks.probes(graph, played[policy]).to_bytes())
+        policies[policy] = PolicyManifest(**partial[policy], parity=parity)
+    return policies

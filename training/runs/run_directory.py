@@ -17,11 +17,12 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
 
+from league.config.base import JSON, Part
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.config.training import TrainingSettings
@@ -62,7 +63,7 @@ def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for written in (*(opponent.ref for opponent in config.training.opponents.fixed), *_references(config.training)):
+    for written in _references(config.training):
         ref = parse_ref(of_league(written, config.league))
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
         contestant(pinned, registry, interface)
@@ -76,26 +77,28 @@ def against(config: LeagueConfig, target: str) -> LeagueConfig:
 
 
 def _references(settings: TrainingSettings) -> list[str]:
-    """The version of the magnet, and the teacher."""
-    if not isinstance(settings, PPOConfig):
-        return []
-    found = [settings.magnet.version if settings.magnet else None, settings.teacher.ref if settings.teacher else None]
+    """The fixed opponents, the version of the magnet, and the teacher."""
+    found: list[str | None] = [opponent.ref for opponent in settings.opponents.fixed]
+    if isinstance(settings, PPOConfig):
+        found.append(settings.magnet.version if settings.magnet else None)
+        found.append(settings.teacher.ref if settings.teacher else None)
     return [ref for ref in found if ref is not None]
 
 
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
     """Return the league with its references replaced by what they are pinned to; others are unchanged."""
+
+    def pinned(part: Part) -> JSON:
+        document = part.model_dump()
+        return document | {"ref": pins.get(document["ref"], document["ref"])}
+
     settings = config.training
-    fixed = [
-        opponent.model_dump() | {"ref": pins.get(opponent.ref, opponent.ref)} for opponent in settings.opponents.fixed
-    ]
-    changes: dict[str, Any] = {"opponents": settings.opponents.model_dump() | {"fixed": fixed}}
-    if isinstance(settings, PPOConfig) and settings.magnet is not None:
-        changes["magnet"] = settings.magnet.model_dump() | {"ref": pins.get(settings.magnet.ref, settings.magnet.ref)}
-    if isinstance(settings, PPOConfig) and settings.teacher is not None:
-        changes["teacher"] = settings.teacher.model_dump() | {
-            "ref": pins.get(settings.teacher.ref, settings.teacher.ref)
-        }
+    changes: JSON = {
+        "opponents": settings.opponents.model_dump() | {"fixed": [pinned(each) for each in settings.opponents.fixed]}
+    }
+    if isinstance(settings, PPOConfig):
+        parts = {"magnet": settings.magnet, "teacher": settings.teacher}
+        changes |= {name: pinned(part) for name, part in parts.items() if part is not None}
     return config.with_training(**changes)
 
 

@@ -9,7 +9,7 @@ from ray import tune
 from rich.console import Console
 
 from league.conditions import describe_selection
-from league.config.algorithms import AnyTraining, TrainingConfig
+from league.config.algorithms import ALGORITHMS, AnyTraining, TrainingConfig
 from league.config.league import LeagueConfig
 from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
@@ -109,15 +109,21 @@ def train(
         )
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
         with run.locked(), progress, RunReporter(registry, run) as reporter:
-            progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
-            progress.say(_parallel_environments(config, interface))
-            if run.record.exploits is not None:
-                progress.say(f"Role: {run.record.role}. Opponent in all episodes: {run.record.exploits}.")
-            progress.say(describe_selection(config, interface))
-            if dashboard:
-                progress.say(f"Ray's dashboard: {dashboard}")
+            _describe(config, interface, run, dashboard, progress)
             _train_and_publish(run, registry, interface, progress, reporter)
     return published_versions(registry, run)
+
+
+def _describe(
+    config: LeagueConfig, interface: Interface, run: RunDirectory, dashboard: str | None, progress: TrainingProgress
+) -> None:
+    progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
+    progress.say(_parallel_environments(config, interface))
+    if run.record.exploits is not None:
+        progress.say(f"Role: {run.record.role}. Opponent in all episodes: {run.record.exploits}.")
+    progress.say(describe_selection(config, interface))
+    if dashboard:
+        progress.say(f"Ray's dashboard: {dashboard}")
 
 
 def _parallel_environments(config: LeagueConfig, interface: Interface) -> str:
@@ -171,6 +177,8 @@ def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
 
 def check_network(version: VersionRow, config: LeagueConfig) -> None:
     """Raise ConfigError if `config` defines another network than the version. Missing settings have defaults."""
+    if version.manifest.algorithm not in ALGORITHMS:
+        raise ConfigError(f"{version.ref} was {version.manifest.algorithm}: it has no training state to start from")
     settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
     before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
     for key in NETWORK_SETTINGS:

@@ -113,7 +113,7 @@ def test_policies_can_be_assigned_by_a_function() -> None:
     [
         (f"{__name__}:missing", "returned no valid policy id for agent 'player_1'"),
         (f"{__name__}:invalid_id", "returned no valid policy id for agent 'player_0'.*Not A Slug"),
-        (f"{__name__}:absent", "has no function 'absent'"),
+        (f"{__name__}:absent", "policies: .* has no 'absent'"),
         ("no_such_module:role", "policies: cannot import 'no_such_module'"),
     ],
 )

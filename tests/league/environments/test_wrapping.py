@@ -109,7 +109,10 @@ def test_vector_environments_are_rejected(name: str) -> None:
         ([{"reshape_v0": {"shape": [3]}}], r"reshape_v0 \(number 1\).*as many elements"),
         (["frame_stack_v0"], "SuperSuit has no wrapper 'frame_stack_v0'.*use frame_stack_v1 instead"),
         (["utils"], "'utils' of SuperSuit is not a wrapper"),
-        ([{"observation_lambda_v0": {"change_observation_fn": "no.such:thing"}}], "'no.such:thing' is not a function"),
+        (
+            [{"observation_lambda_v0": {"change_observation_fn": "no.such:thing"}}],
+            "observation_lambda_v0.change_observation_fn: cannot import 'no.such'",
+        ),
     ],
 )
 def test_invalid_wrappers_are_rejected_with_name_position_and_reason(wrappers: list[Any], message: str) -> None:

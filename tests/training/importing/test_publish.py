@@ -16,6 +16,7 @@ from tests.support.policies.foreign_graphs import foreign
 from training.importing import checks
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
+from training.runs.train import check_network
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +49,13 @@ def test_an_imported_graph_is_a_version_like_others(registry: Registry, tmp_path
     report = evaluate(tictactoe.LEAGUE, [version.ref, "script:random"], registry=registry, blocks=4, workers=0)
     assert {standing.ref for standing in report.leaderboard} >= {version.ref, "script:random"}
     assert imported(registry, path).number == version.number
+
+
+def test_training_cannot_start_from_an_imported_version(registry: Registry, tmp_path: Path) -> None:
+    path = tmp_path / "foreign.onnx"
+    path.write_bytes(foreign(18, 9, shape=(3, 3, 2)))
+    with pytest.raises(ConfigError, match=r"tictactoe@1 was imported: it has no training state"):
+        check_network(imported(registry, path), tictactoe.config())
 
 
 def test_weights_in_another_file_are_included(registry: Registry, tmp_path: Path) -> None:
