@@ -46,6 +46,21 @@ class LineGame:
                     covered.append(line.ravel())
         return np.array(covered)
 
+    def bits(self) -> NDArray[np.uint64]:
+        """Return the bit of each square in a bitboard, (rows · columns,).
+
+        A column has one bit per square, from the bottom to the top, and one that is always 0, so that lines do not
+        continue in the next column.
+        """
+        positions = [
+            column * (self.rows + 1) + row for row in reversed(range(self.rows)) for column in range(self.columns)
+        ]
+        return np.uint64(1) << np.array(positions, np.uint64)
+
+    def steps(self) -> tuple[int, ...]:
+        """Return the distances between neighbouring bits of a line: up, and the three directions to the right."""
+        return 1, self.rows, self.rows + 1, self.rows + 2
+
     def actions_on(self, squares: NDArray, empty: NDArray) -> NDArray:
         """Return which actions take one of `squares`: two (k, rows · columns) bool → (k, actions) bool."""
         if not self.gravity:

@@ -1,8 +1,8 @@
 """Scripted baselines, which need no training.
 
 `random` samples uniformly from the legal actions; `first` takes the first one. `mirror` repeats its observation, which
-is the opponent's last move in rock, paper, scissors. `one_ply`, `mcts_100`, `mcts_1000` and `solver` play connect four
-and tic-tac-toe; see `league.policies.line_games`, `league.policies.search` and `league.policies.solver`.
+is the opponent's last move in rock, paper, scissors. `one_ply`, `minimax_2`, `minimax_4`, `mcts_100`, `mcts_1000` and
+`solver` play connect four and tic-tac-toe; see `line_games`, `minimax`, `search` and `solver` in `league.policies`.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from league.policies.actions import bounds, check_legal_action, to_environment
 from league.policies.bots import Bot
 from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
 from league.policies.line_games import OnePly
+from league.policies.minimax import Minimax
 from league.policies.policy import Actions, Arrays, Policy
 from league.policies.search import MCTS
 from league.policies.solver import Solver
@@ -140,6 +141,8 @@ SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {
     "one_ply": OnePly,
     "first": First,
     "mirror": Mirror,
+    "minimax_2": partial(Minimax, 2),
+    "minimax_4": partial(Minimax, 4),
     "mcts_100": partial(MCTS, 100),
     "mcts_1000": partial(MCTS, 1000),
     "solver": Solver,

@@ -1,8 +1,4 @@
-"""Exact play by search with bitboards: the script `solver` for tic-tac-toe and late positions of connect four.
-
-A column of a bitboard has one bit per square, from the bottom to the top, and one that is always 0, so that lines do
-not continue in the next column.
-"""
+"""Exact play by search with bitboards: the script `solver` for tic-tac-toe and late positions of connect four."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -26,10 +22,7 @@ class LineGameSolver:
 
     def __init__(self, game: LineGame) -> None:
         self._game, self._stride = game, game.rows + 1
-        self._bits = np.array(
-            [1 << column * self._stride + row for row in reversed(range(game.rows)) for column in range(game.columns)],
-            dtype=np.uint64,
-        )
+        self._bits = game.bits()
         self._full = int(self._bits.sum())
         actions = range(game.actions)
         self._order = (
@@ -75,7 +68,7 @@ class LineGameSolver:
 
     def _wins(self, pieces: int) -> bool:
         """Return whether `pieces` contain a line."""
-        for step in (1, self._stride - 1, self._stride, self._stride + 1):
+        for step in self._game.steps():
             line = pieces
             for distance in range(1, self._game.length):
                 line &= pieces >> distance * step

@@ -1,0 +1,127 @@
+"""Depth-limited minimax search on batches of positions: the scripts `minimax_2` and `minimax_4`.
+
+All positions of a batch are searched at once with bitboards, so a teacher of this kind costs a fraction of training.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.policies.actions import check_legal_action
+from league.policies.draws import Generators, choose, draw
+from league.policies.line_games import LineGame, line_game
+from league.policies.policy import Actions, Arrays
+from league.spaces import ACTION_MASK, OBSERVATION, Space
+
+Bitboards = NDArray[np.uint64]
+LOST = -128
+"""Below each value of a position."""
+
+
+class BatchedMinimax:
+    """Computes the values of moves. A position is a pair of bitboards: of the player to move and of its opponent."""
+
+    def __init__(self, game: LineGame) -> None:
+        self._game = game
+        self._bits = game.bits()
+        squares = self._bits.reshape(game.rows, game.columns)
+        self._columns = np.bitwise_or.reduce(squares, axis=0)
+        self._lowest = squares[-1]
+        self._reached = self._columns if game.gravity else self._bits
+
+    def positions(self, boards: NDArray) -> tuple[Bitboards, Bitboards]:
+        """Return the bitboards of boards (k, rows, columns, 2), two (k,) uint64."""
+        own, other = (
+            (boards[..., player].reshape(-1, len(self._bits)) != 0).astype(np.uint64) @ self._bits for player in (0, 1)
+        )
+        return own, other
+
+    def values(self, own: Bitboards, other: Bitboards, plies: int) -> NDArray[np.int8]:
+        """Return the value of each move, if the rest of the search is played best.
+
+        Args:
+            own: Pieces of the player to move, (k,). No line is complete.
+            other: Pieces of the opponent, (k,).
+            plies: Number of moves to look ahead, at least 1.
+
+        Returns:
+            (k, actions): `plies` − d if the player wins with its d-th ply from here (0, 2, …), −(`plies` − d) if the
+            opponent does (1, 3, …), 0 if neither, and LOST for an illegal move.
+        """
+        values = np.full((len(own), self._game.actions), LOST, np.int8)
+        winning, moves = self._completing(own), self._moves(own | other)
+        for action in range(self._game.actions):
+            move = moves & self._reached[action]
+            wins = (winning & move) != 0
+            values[wins, action] = plies
+            rows = np.flatnonzero((move != 0) & ~wins)
+            values[rows, action] = -self._value(other[rows], (own | move)[rows], plies - 1) if plies > 1 else 0
+        return values
+
+    def _value(self, own: Bitboards, other: Bitboards, plies: int) -> NDArray[np.int8]:
+        """Return the values of positions, (k,): `values` of the best moves, or 0 if the board is full."""
+        moves = self._moves(own | other)
+        wins = (self._completing(own) & moves) != 0
+        value = np.where(wins, plies, 0).astype(np.int8)
+        rows = np.flatnonzero(~wins & (moves != 0))
+        if plies > 1 and len(rows):
+            value[rows] = self._best_reply(own[rows], other[rows], moves[rows], plies)
+        return value
+
+    def _best_reply(self, own: Bitboards, other: Bitboards, moves: Bitboards, plies: int) -> NDArray[np.int8]:
+        """Return the value of the best move of positions without a winning one. Only a move that prevents the
+        opponent's immediate win can be better than losing at once."""
+        threats = self._completing(other) & moves
+        candidates = np.where(threats != 0, threats, moves)
+        best = np.full(len(own), LOST, np.int8)
+        for squares in self._reached:
+            move = candidates & squares
+            rows = np.flatnonzero(move)
+            value = -self._value(other[rows], (own | move)[rows], plies - 1)
+            best[rows] = np.maximum(best[rows], value)
+        return best
+
+    def _moves(self, taken: Bitboards) -> Bitboards:
+        """Return the squares that can be taken: the empty ones, with gravity the lowest empty one of each column."""
+        squares = np.bitwise_or.reduce(self._bits)
+        return (taken + np.bitwise_or.reduce(self._lowest)) & squares if self._game.gravity else squares & ~taken
+
+    def _completing(self, pieces: Bitboards) -> Bitboards:
+        """Return the squares that complete a line of `pieces`, occupied ones and ones outside the board included."""
+        squares = np.zeros_like(pieces)
+        for step in self._game.steps():
+            for gap in range(self._game.length):
+                line = ~np.zeros_like(pieces)
+                for distance in range(self._game.length):
+                    if distance != gap:
+                        line &= _shift(pieces, (gap - distance) * step)
+                squares |= line
+        return squares
+
+
+class Minimax:
+    """Plays a random one of the moves that are best within `plies` moves, in connect four and tic-tac-toe."""
+
+    def __init__(self, plies: int, observation: Space, action: Space) -> None:
+        self._search = BatchedMinimax(line_game(f"minimax_{plies}", observation, action))
+        self._plies = plies
+
+    def act(
+        self,
+        observations: Arrays,
+        *,
+        state: Arrays | None = None,  # noqa: ARG002
+        explore: bool = False,  # noqa: ARG002
+        rng: Generators | None = None,
+    ) -> Actions:
+        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
+        legal = observations[ACTION_MASK] != 0
+        check_legal_action(legal)
+        values = self._search.values(*self._search.positions(observations[OBSERVATION]), self._plies)
+        values = np.where(legal, values, np.int8(LOST))
+        best = legal & (values == values.max(axis=1, keepdims=True))
+        return Actions(choose(best, draw(rng, len(best))))
+
+
+def _shift(pieces: Bitboards, distance: int) -> Bitboards:
+    """Move pieces up by a number of bits, down by a negative one."""
+    return pieces << np.uint64(distance) if distance >= 0 else pieces >> np.uint64(-distance)
