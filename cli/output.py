@@ -145,8 +145,13 @@ def verdict(report: "VerdictReport") -> str:
     anchors = "".join(
         f"; {each.outcome} to {each.ref} by {each.margin:g} after {each.games} games" for each in report.anchors
     )
+    exploiters = "".join(
+        f"; against {each.ref} {each.outcome} than {report.opponent} by {each.margin:g} after {each.games} games"
+        for each in report.exploiters
+    )
     note = f": {report.note}" if report.note else ""
-    return f"{report.candidate} against {report.opponent}: {report.outcome} {games}, {place}{gap}{anchors}{note}"
+    who = f"{report.candidate} against {report.opponent}"
+    return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}"
 
 
 def difference(gap: "Difference") -> str:

@@ -211,6 +211,34 @@ class AnchorReport(Document):
 
 
 @dataclass(frozen=True, slots=True)
+class ExploiterReport(Document):
+    """One paired test of candidate and champion against an exploiter, with its evidence.
+
+    exploits: the champion that the exploiter was trained against.
+    margin: by how much the candidate may be worse than the champion, as a share of all points or in returns.
+    schedule: of the matches that count. outcome: `not worse`, `worse`, `inconclusive`, or `open` as for an anchor.
+    blocks: counted pairs of blocks. games: of both contestants. counts: pairs per cell, worst for the candidate first.
+    score, champion_score: mean scores of candidate and champion against the exploiter; None without games.
+    difference: between candidate and champion, in the unit of the margin; None without games.
+    """
+
+    ref: str
+    exploits: str
+    margin: float
+    schedule: str
+    outcome: str
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    unique_games: int
+    counts: tuple[int, ...]
+    score: float | None
+    champion_score: float | None
+    difference: Difference | None
+
+
+@dataclass(frozen=True, slots=True)
 class VerdictReport(Document):
     """The test of one candidate with its evidence.
 
@@ -221,7 +249,7 @@ class VerdictReport(Document):
     score: the candidate's mean score. elo, interval: logistic Elo above the opponent with its 95 % interval; infinite
     bounds are None.
     alpha: error probability spent by this verdict.
-    anchors: non-inferiority tests after the opponent was beaten.
+    anchors: non-inferiority tests after the opponent was beaten. exploiters: paired tests after these.
     difference: mean return minus that of the opponent if contestants are compared on the same side or the gate
     tests returns, else None.
     promoted: whether this verdict made the candidate champion.
@@ -244,6 +272,7 @@ class VerdictReport(Document):
     promoted: bool
     alpha: float
     anchors: tuple[AnchorReport, ...] = ()
+    exploiters: tuple[ExploiterReport, ...] = ()
     difference: Difference | None = None
     note: str | None = None
 

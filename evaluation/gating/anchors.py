@@ -21,7 +21,8 @@ def resolve_anchors(registry: Registry, league: LeagueRow, candidate: int, champ
     Raises UnknownVersion, UnknownPolicy, EnvironmentMismatch and InvalidReference for anchors that cannot play.
     """
     gate = league.config.gate
-    wanted = [*gate.anchors, *(AnchorConfig(ref=ref) for ref in earlier_champions(registry, league))]
+    former = earlier_champions(registry, league, gate.earlier_champions)
+    wanted = [*gate.anchors, *(AnchorConfig(ref=ref) for ref in former)]
     found: dict[str, AnchorConfig] = {}
     for anchor in wanted:
         try:
@@ -34,8 +35,8 @@ def resolve_anchors(registry: Registry, league: LeagueRow, candidate: int, champ
     return list(found.values())
 
 
-def earlier_champions(registry: Registry, league: LeagueRow) -> list[str]:
-    """The last `gate.earlier_champions` former champions, newest first.
+def earlier_champions(registry: Registry, league: LeagueRow, most: int) -> list[str]:
+    """The last `most` former champions, newest first.
 
     Versions that were rolled back or trained in another environment are left out.
     """
@@ -45,7 +46,7 @@ def earlier_champions(registry: Registry, league: LeagueRow) -> list[str]:
     now = events[0].version if events else None
     refs: list[str] = []
     for number in reigned:
-        if number == now or number in rolled_back or len(refs) == league.config.gate.earlier_champions:
+        if number == now or number in rolled_back or len(refs) == most:
             continue
         if registry.versions.get(league.slug, number).manifest.environment_digest == league.environment_digest:
             refs.append(f"{league.slug}@{number}")

@@ -11,15 +11,18 @@ Technometrics 24, 1982).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.game_records import forfeit_difference, unique_games
+from evaluation.gating.observations import Observations, matches_each, observe
+from evaluation.matches.game_records import unique_games
+from evaluation.results import Difference
+from evaluation.statistics.payoff import student_interval
 from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config.gate import GateConfig
 from league.errors import BoundExceeded
@@ -152,8 +155,8 @@ def decide_matches(settings: GateConfig, matches: Sequence[Match], candidate: st
         matches: Matches in schedule order.
         candidate: Reference of the candidate.
     """
-    differences = _differences(settings, matches, candidate) if settings.model == "returns" else ()
-    decision = decide(settings, *_block_scores(matches, candidate), differences)
+    seen = observe(settings, matches, candidate)
+    decision = decide(settings, seen.scores, seen.comparisons, seen.differences)
     return replace(decision, unique_games=unique_games(matches[: decision.blocks]))
 
 
@@ -200,8 +203,10 @@ class SequentialMonitor:
     It processes each block once. `decide_matches` makes the decision itself.
     """
 
-    def __init__(self, settings: GateConfig, candidate: str) -> None:
-        self._settings, self._candidate = settings, candidate
+    def __init__(self, settings: GateConfig, candidate: str, champion: str | None = None) -> None:
+        """champion: for a test against an exploiter, the contestant of every second match."""
+        self._settings, self._candidate, self._champion = settings, candidate, champion
+        self._each = matches_each(champion)
         self.bounds = decision_bounds(settings)
         self.llr = 0.0
         self._counts: NDArray[np.int64] | None = None
@@ -210,30 +215,29 @@ class SequentialMonitor:
 
     def is_over(self, matches: Sequence[Match]) -> bool:
         """Whether the test is decided or exhausted. matches: all matches of the schedule so far, in order."""
-        new = matches[self._seen : self._settings.max_blocks]
-        if new:
-            curve = self._wealth(new) if self._settings.model == "returns" else self._llr(new)
-            self.llr = float(curve[-1])
-            self._seen += len(new)
+        end = min(len(matches) // self._each, self._settings.max_blocks)
+        if end > self._seen:
+            new = matches[self._seen * self._each : end * self._each]
+            curve = self._curve(observe(self._settings, new, self._candidate, self._champion))
+            self.llr, self._seen = float(curve[-1]), end
             if _crossed(curve, self.bounds).size:
                 return True
         return self._seen >= self._settings.max_blocks
 
-    def _llr(self, new: Sequence[Match]) -> NDArray[np.float64]:
-        counts = _cumulated(*_block_scores(new, self._candidate))
+    def _curve(self, new: Observations) -> NDArray[np.float64]:
+        if self._settings.model == "returns":
+            self._differences += new.differences
+            return _wealth(self._settings, self._differences)
+        counts = _cumulated(new.scores, new.comparisons)
         counts = counts if self._counts is None else counts + self._counts
         self._counts = counts[-1]
-        assert self._settings.model != "returns"
         return gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
-
-    def _wealth(self, new: Sequence[Match]) -> NDArray[np.float64]:
-        self._differences += _differences(self._settings, new, self._candidate)
-        return _wealth(self._settings, self._differences)
 
 
 def cell_counts(matches: Sequence[Match], candidate: str) -> tuple[int, ...]:
     """Number of blocks per cell, worst for the candidate first. Requires at least one match."""
-    return tuple(int(n) for n in _cumulated(*_block_scores(matches, candidate))[-1])
+    scores = [match.score(match.contestants.index(candidate)) for match in matches]
+    return tuple(int(n) for n in _cumulated(scores, matches[0].result().games)[-1])
 
 
 def decision_bounds(settings: GateConfig) -> tuple[float, float]:
@@ -261,30 +265,6 @@ def _wealth(settings: GateConfig, differences: Sequence[float]) -> NDArray[np.fl
     return np.where(against_h0 >= against_h1, against_h0, -against_h1)
 
 
-def _block_scores(matches: Sequence[Match], candidate: str) -> tuple[list[float], int]:
-    """The candidate's score in each block, and the number of comparisons per block."""
-    scores = [match.score(match.contestants.index(candidate)) for match in matches]
-    return scores, matches[0].result().games if matches else GAMES_PER_BLOCK
-
-
-def _differences(settings: GateConfig, matches: Sequence[Match], candidate: str) -> list[float]:
-    """Mean return of the candidate minus that of its opponent in each block.
-
-    In blocks with a forfeit, ± `return_bound`, or 0 if both forfeited.
-    """
-    bound, gaps = settings.return_bound or 0.0, list[float]()
-    for match in matches:
-        if (ruled := forfeit_difference(match, candidate)) is not None:
-            gaps.append(ruled * bound)
-            continue
-        own = match.contestants.index(candidate)
-        mine, other = match.mean_return(own), match.mean_return(1 - own)
-        assert mine is not None
-        assert other is not None
-        gaps.append(mine - other)
-    return gaps
-
-
 def _cumulated(block_scores: Sequence[float], comparisons: int) -> NDArray[np.int64]:
     """Counts per cell after each block, shape (blocks, 2 comparisons + 1)."""
     halves = np.asarray(block_scores, dtype=np.float64) * 2 * comparisons
@@ -309,22 +289,100 @@ class AnchorResult:
     decision: Decision
 
     @property
-    def is_passed(self) -> bool:
-        return self.decision.outcome == "promote"
+    def failure(self) -> str:
+        """What a `reject` shows."""
+        return f"is weaker than {self.ref}"
+
+    @property
+    def claim(self) -> str:
+        """What a `promote` shows."""
+        return f"is at most {self.margin:g} weaker than {self.ref}"
+
+
+@dataclass(frozen=True, slots=True)
+class ExploiterResult:
+    """A paired test of candidate and champion against one exploiter.
+
+    Attributes:
+        ref: The exploiter.
+        exploits: The champion that it was trained against.
+        margin: By how much the candidate may be worse than the champion.
+        schedule: Id of the schedule.
+        decision: The test, whose blocks are pairs of blocks.
+        scores: Mean scores of candidate and champion over the counted pairs; None without pairs.
+        difference: Score of the candidate minus the champion's, or its difference of returns if the gate tests returns.
+    """
+
+    ref: str
+    exploits: str
+    margin: float
+    schedule: str
+    decision: Decision
+    scores: tuple[float, float] | None
+    difference: Difference | None
+
+    @property
+    def failure(self) -> str:
+        """What a `reject` shows."""
+        return f"does worse than the champion against {self.ref}, an exploiter of {self.exploits}"
+
+    @property
+    def claim(self) -> str:
+        """What a `promote` shows."""
+        return f"is at most {self.margin:g} worse than the champion against {self.ref}, an exploiter of {self.exploits}"
+
+
+def decide_pairs(settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str) -> Decision:
+    """Decide from matches of candidate and champion against an exploiter, one match of each in turn."""
+    seen = observe(settings, matches, candidate, champion)
+    decision = decide(settings, seen.scores, seen.comparisons, seen.differences)
+    counted = matches[: decision.blocks * matches_each(champion)]
+    games = len(counted) * GAMES_PER_BLOCK
+    return replace(decision, games=games, unique_games=unique_games(counted), estimate=None)
+
+
+def exploiter_result(
+    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, exploiter: Mapping[str, Any]
+) -> ExploiterResult:
+    """Test candidate and champion against an exploiter. exploiter: its record in the settings of the verdict."""
+    ref, exploits, margin, schedule = (exploiter[name] for name in ("ref", "exploits", "margin", "schedule"))
+    test = settings.against_exploiter(margin)
+    decision = decide_pairs(test, matches, candidate, champion)
+    counted = matches[: 2 * decision.blocks]
+    gaps, scores = observe(test, counted, candidate, champion).gaps, None
+    if counted:
+        own, other = (
+            sum(match.score(match.contestants.index(each)) for match in counted if each in match.contestants)
+            for each in (candidate, champion)
+        )
+        scores = own / decision.blocks, other / decision.blocks
+    gap = student_interval(gaps) if gaps else None
+    return ExploiterResult(ref, exploits, margin, schedule, decision, scores, gap)
+
+
+CompanionResult = AnchorResult | ExploiterResult
 
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
     """Results of all tests of a candidate.
 
-    anchors: started tests in order, of `planned_anchors` in total.
+    companions: started tests after that against the champion, in order, of `planned_companions` in total.
     forfeits: forfeited games, or None if the gate allows them.
     """
 
     champion: Decision
-    anchors: tuple[AnchorResult, ...] = ()
-    planned_anchors: int = 0
+    companions: tuple[CompanionResult, ...] = ()
+    planned_companions: int = 0
     forfeits: int | None = None
+
+    @property
+    def anchors(self) -> tuple[AnchorResult, ...]:
+        return tuple(each for each in self.companions if isinstance(each, AnchorResult))
+
+    @property
+    def exploiters(self) -> tuple[ExploiterResult, ...]:
+        return tuple(each for each in self.companions if isinstance(each, ExploiterResult))
 
     @property
     def outcome(self) -> Outcome | None:
@@ -341,25 +399,28 @@ class GateResult:
             return self.champion.outcome, None
         if self.forfeits:
             return "reject", f"it forfeited {self.forfeits} games, but the gate allows none"
-        for anchor in self.anchors:
-            if anchor.decision.outcome == "reject":
-                return "reject", f"it beat the champion, but is weaker than {anchor.ref}"
-            if anchor.decision.outcome == "inconclusive":
+        for test in self.companions:
+            if test.decision.outcome == "reject":
+                return "reject", f"it beat the champion, but {test.failure}"
+            if test.decision.outcome == "inconclusive":
                 return "inconclusive", (
-                    f"it beat the champion, but {anchor.decision.games} games do not show that it is at most"
-                    f" {anchor.margin:g} weaker than {anchor.ref}"
+                    f"it beat the champion, but {test.decision.games} games do not show that it {test.claim}"
                 )
-        is_complete = len(self.anchors) == self.planned_anchors and all(anchor.is_passed for anchor in self.anchors)
+        is_complete = len(self.companions) == self.planned_companions and all(map(_is_passed, self.companions))
         return ("promote" if is_complete else None), None
 
 
+def _is_passed(test: CompanionResult) -> bool:
+    return test.decision.outcome == "promote"
+
+
 def combine_results(
-    champion: Decision, anchors: Sequence[AnchorResult], planned_anchors: int, forfeits: int | None
+    champion: Decision, companions: Sequence[CompanionResult], planned_companions: int, forfeits: int | None
 ) -> GateResult:
-    """Combine the tests up to the first anchor that is not passed. Later anchors are ignored."""
-    looked_at: list[AnchorResult] = []
-    for anchor in anchors if champion.outcome == "promote" and not forfeits else ():
-        looked_at.append(anchor)
-        if not anchor.is_passed:
+    """Combine the tests up to the first one after the champion's that is not passed. Later ones are ignored."""
+    looked_at: list[CompanionResult] = []
+    for test in companions if champion.outcome == "promote" and not forfeits else ():
+        looked_at.append(test)
+        if not _is_passed(test):
             break
-    return GateResult(champion, tuple(looked_at), planned_anchors, forfeits)
+    return GateResult(champion, tuple(looked_at), planned_companions, forfeits)

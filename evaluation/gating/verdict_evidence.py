@@ -10,11 +10,12 @@ from evaluation.gating.verdicts import (
     anchor_report,
     confirmation,
     difference_of_returns,
+    exploiter_report,
     gate_of,
     gate_result,
     gate_statistics,
 )
-from evaluation.results import AnchorReport, Confirmation, Difference, Document, iso_timestamp
+from evaluation.results import AnchorReport, Confirmation, Difference, Document, ExploiterReport, iso_timestamp
 from league.registry.changes import OPEN
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent, VerdictRow
@@ -29,8 +30,8 @@ class VerdictEvidence(Document):
     curve: LLR after each block; the test decides at `bounds`.
     counts: blocks per cell, worst for the candidate first.
     elo, interval, difference: as in a VerdictReport.
-    alpha: error probability of the verdict. anchors: its non-inferiority tests. confirmation: the confirmation match of
-    its promotion.
+    alpha: error probability of the verdict. anchors: its non-inferiority tests. exploiters: its paired tests against
+    exploiters. confirmation: the confirmation match of its promotion.
     """
 
     verdict: str
@@ -56,6 +57,7 @@ class VerdictEvidence(Document):
     difference: Difference | None
     alpha: float
     anchors: tuple[AnchorReport, ...]
+    exploiters: tuple[ExploiterReport, ...]
     confirmation: Confirmation | None
 
 
@@ -82,6 +84,7 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
         difference=difference_of_returns(registry, verdict, decision.blocks),
         alpha=verdict.alpha,
         anchors=tuple(map(anchor_report, seen.anchors)),
+        exploiters=tuple(map(exploiter_report, seen.exploiters)),
         confirmation=confirmation(registry, verdict),
     )
 

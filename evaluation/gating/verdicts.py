@@ -2,10 +2,10 @@
 
 schedules in the ledger → verdict opened → matches → gate result → champion moved → verdict closed
 
-The order makes every step repeatable. An open verdict has its schedules: against the champion, against each anchor, and
-for the confirmation match of a promotion. The gate result follows from the matches in the ledger. The champion moves
-while the verdict is still open, and the audit row names the verdict. A verdict that was interrupted there is closed and
-never applied twice, even if the champion was rolled back meanwhile.
+The order makes every step repeatable. An open verdict has its schedules: against the champion, against each anchor and
+each exploiter, and for the confirmation match of a promotion. The gate result follows from the matches in the ledger.
+The champion moves while the verdict is still open, and the audit row names the verdict. A verdict that was interrupted
+there is closed and never applied twice, even if the champion was rolled back meanwhile.
 """
 
 from __future__ import annotations
@@ -16,20 +16,32 @@ from dataclasses import replace
 from typing import Any
 
 from evaluation.gating.anchors import resolve_anchors
+from evaluation.gating.exploiters import recent_exploiters
 from evaluation.gating.gate import (
     AnchorResult,
+    CompanionResult,
     Decision,
+    ExploiterResult,
     GateResult,
     SequentialMonitor,
     cell_counts,
     combine_results,
     decide_matches,
+    exploiter_result,
     shadow_shortfall,
 )
 from evaluation.matches import tournament
 from evaluation.matches.game_records import forfeits
-from evaluation.results import AnchorReport, Confirmation, Difference, Listener, Progress, VerdictReport
-from evaluation.schedules.builders import companion
+from evaluation.results import (
+    AnchorReport,
+    Confirmation,
+    Difference,
+    ExploiterReport,
+    Listener,
+    Progress,
+    VerdictReport,
+)
+from evaluation.schedules.builders import companion, exploiter_test
 from evaluation.schedules.builders import verdict as verdict_schedule
 from evaluation.statistics.payoff import paired_difference
 from evaluation.statistics.sequential import elo_estimate
@@ -112,12 +124,17 @@ def open_verdict(
     gate = config.gate.of_one_verdict(config.gate.alpha if alpha is None else alpha)
     schedule = verdict_schedule(config, league.interface, candidate_ref, opponent, gate, seed=len(spent))
     ledger.open(schedule)
-    settings: dict[str, Any] = {"gate": gate.model_dump(mode="json"), "night": nightly_run, "anchors": []}
+    settings: dict[str, Any] = {"gate": gate.model_dump(mode="json"), "night": nightly_run}
+    settings |= {"anchors": [], "exploiters": []}
     for anchor in resolve_anchors(registry, league, candidate, opponent):
         own = companion(config, league.interface, "anchor", schedule, anchor.ref, gate.max_blocks)
         settings["anchors"].append(
             {"ref": anchor.ref, "margin": anchor.margin or gate.margin, "schedule": ledger.open(own).id}
         )
+    for exploiter in recent_exploiters(registry, league, opponent):
+        own = exploiter_test(config, league.interface, schedule, exploiter.ref, gate.max_blocks)
+        record = {"ref": exploiter.ref, "exploits": exploiter.exploits, "margin": gate.margin_against_exploiters}
+        settings["exploiters"].append(record | {"schedule": ledger.open(own).id})
     if gate.confirmation_blocks:
         own = companion(config, league.interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
         settings["confirmation"] = ledger.open(own).id
@@ -133,8 +150,8 @@ def conclude(
     """
     if (obstacle := _obstacle(registry, verdict)) is not None:
         return _close(registry, verdict, VOID, gate_result(registry, verdict), note=obstacle)
-    for schedule, gate in _tests(registry, verdict):
-        _play(registry, verdict, schedule, gate, workers, listener)
+    for schedule, watch in _tests(registry, verdict):
+        _play(registry, verdict, schedule, watch, workers, listener)
         stopped = registry.verdicts.get(verdict.id)
         seen = gate_result(registry, verdict)
         if stopped.outcome is not None:
@@ -162,33 +179,37 @@ def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bo
 
 def schedules_of(verdict: VerdictRow) -> list[str]:
     """Ids of the schedules that belong to a verdict."""
-    anchors = [anchor["schedule"] for anchor in verdict.settings.get("anchors", ())]
     confirmation = verdict.settings.get("confirmation")
-    return [verdict.schedule, *anchors, *([confirmation] if confirmation else [])]
+    return [*tested_schedules(verdict), *([confirmation] if confirmation else [])]
 
 
-def _tests(registry: Registry, verdict: VerdictRow) -> list[tuple[Schedule, GateConfig]]:
-    """The schedules of a verdict in order, each with the settings of its test."""
-    ledger, gate = Ledger(registry), gate_of(verdict)
-    return [
-        (_schedule(registry, verdict), gate),
-        *(
-            (ledger.schedule(anchor["schedule"]), gate.against_anchor(anchor["margin"]))
-            for anchor in verdict.settings.get("anchors", ())
-        ),
-    ]
+def tested_schedules(verdict: VerdictRow) -> list[str]:
+    """Ids of the schedules whose results decide a verdict, in order."""
+    settings = verdict.settings
+    companions = [*settings.get("anchors", ()), *settings.get("exploiters", ())]
+    return [verdict.schedule, *(each["schedule"] for each in companions)]
+
+
+def _tests(registry: Registry, verdict: VerdictRow) -> list[tuple[Schedule, SequentialMonitor]]:
+    """The schedules of a verdict in order, each with a monitor of its test."""
+    gate, candidate, settings = gate_of(verdict), _candidate_ref(verdict), verdict.settings
+    anchors = [gate.against_anchor(each["margin"]) for each in settings.get("anchors", ())]
+    exploiters = [gate.against_exploiter(each["margin"]) for each in settings.get("exploiters", ())]
+    monitors = [SequentialMonitor(each, candidate) for each in (gate, *anchors)]
+    monitors += [SequentialMonitor(each, candidate, verdict.champion) for each in exploiters]
+    schedules = map(Ledger(registry).schedule, tested_schedules(verdict))
+    return list(zip(schedules, monitors, strict=True))
 
 
 def _play(
     registry: Registry,
     verdict: VerdictRow,
     schedule: Schedule,
-    gate: GateConfig,
+    watch: SequentialMonitor,
     workers: int,
     listener: Listener | None,
 ) -> None:
     """Play one of its tests until it is decided or the verdict is closed by another process."""
-    watch = SequentialMonitor(gate, _candidate_ref(verdict))
 
     def report(progress: Progress | VerdictReport) -> None:
         if listener and isinstance(progress, Progress):
@@ -269,15 +290,19 @@ def gate_result(registry: Registry, verdict: VerdictRow) -> GateResult:
     matches = _matches(registry, verdict)
     champion = decide_matches(gate, matches, candidate_ref)
     forfeited = forfeits(matches[: champion.blocks], candidate_ref)
-    anchors = []
+    companions: list[CompanionResult] = []
     for anchor in verdict.settings.get("anchors", ()):
         ref, margin, schedule = anchor["ref"], anchor["margin"], anchor["schedule"]
         matches = _matches(registry, verdict, schedule)
-        anchors.append(
-            AnchorResult(ref, margin, schedule, decide_matches(gate.against_anchor(margin), matches, candidate_ref))
-        )
-        forfeited += forfeits(matches[: anchors[-1].decision.blocks], candidate_ref)
-    return combine_results(champion, anchors, len(anchors), None if gate.forfeits else forfeited)
+        decision = decide_matches(gate.against_anchor(margin), matches, candidate_ref)
+        companions.append(AnchorResult(ref, margin, schedule, decision))
+        forfeited += forfeits(matches[: decision.blocks], candidate_ref)
+    for exploiter in verdict.settings.get("exploiters", ()):
+        matches = _matches(registry, verdict, exploiter["schedule"])
+        result = exploiter_result(gate, matches, candidate_ref, verdict.champion, exploiter)
+        companions.append(result)
+        forfeited += forfeits(matches[: 2 * result.decision.blocks], candidate_ref)
+    return combine_results(champion, companions, len(companions), None if gate.forfeits else forfeited)
 
 
 def difference_of_returns(
@@ -299,9 +324,11 @@ def difference_of_returns(
 def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     decision = seen.champion
     anchors = f", and is not inferior to {', '.join(each.ref for each in seen.anchors)}" if seen.anchors else ""
+    exploiters = ", ".join(each.ref for each in seen.exploiters)
+    unexploited = f", and does no worse than it against {exploiters}" if exploiters else ""
     return (
         f"beat {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
-        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}"
+        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{unexploited}"
     )
 
 
@@ -323,7 +350,8 @@ def report_of(
         **gate_statistics(seen.champion),
         promoted=is_applied(registry, verdict),
         alpha=verdict.alpha,
-        anchors=tuple(anchor_report(anchor) for anchor in seen.anchors),
+        anchors=tuple(map(anchor_report, seen.anchors)),
+        exploiters=tuple(map(exploiter_report, seen.exploiters)),
         difference=difference_of_returns(registry, verdict, seen.champion.blocks),
         note=note,
     )
@@ -340,6 +368,26 @@ def anchor_report(anchor: AnchorResult) -> AnchorReport:
         schedule=anchor.schedule,
         outcome=OUTCOMES[anchor.decision.outcome],
         **gate_statistics(anchor.decision),
+    )
+
+
+PAIRED_OUTCOMES = OUTCOMES | {"promote": "not worse", "reject": "worse"}
+
+
+def exploiter_report(exploiter: ExploiterResult) -> ExploiterReport:
+    """Report of one paired test against an exploiter."""
+    statistics = gate_statistics(exploiter.decision)
+    own, champion = exploiter.scores or (None, None)
+    return ExploiterReport(
+        ref=exploiter.ref,
+        exploits=exploiter.exploits,
+        margin=exploiter.margin,
+        schedule=exploiter.schedule,
+        outcome=PAIRED_OUTCOMES[exploiter.decision.outcome],
+        **{name: statistics[name] for name in ("llr", "bounds", "blocks", "games", "unique_games", "counts")},
+        score=own,
+        champion_score=champion,
+        difference=exploiter.difference,
     )
 
 

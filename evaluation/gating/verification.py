@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.gating.verdicts import gate_result, report_of
+from evaluation.gating.verdicts import gate_result, report_of, tested_schedules
 from evaluation.playback.replay import replay
 from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
@@ -57,9 +57,7 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     row = registry.verdicts.get(verdict)
     if row.outcome is None or row.evidence is None:
         raise InvalidInput(f"verdict {verdict} is still open: `league nightly` resumes it")
-    matches = _checked_matches(registry, row, row.schedule)
-    for anchor in row.settings.get("anchors", ()):
-        matches += _checked_matches(registry, row, anchor["schedule"])
+    matches = [match for name in tested_schedules(row) for match in _checked_matches(registry, row, name)]
     seen = gate_result(registry, row)
     # A verdict can be voided for reasons outside its games, at any point.
     outcome = VOID if row.outcome == VOID else str(seen.outcome)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from evaluation.matches.game_records import Upset, UpsetFinder, identity
 from evaluation.results import Payoff, RatedVersion, Standing, iso_timestamp
 from evaluation.schedules.builders import ANCHOR
-from evaluation.statistics.bradley_terry import rate
+from evaluation.statistics.bradley_terry import Rating, rate
 from evaluation.statistics.payoff import only_side, tabulate
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent, LeagueRow, VersionRow
@@ -21,7 +21,8 @@ from league.results.scoring import scoring
 def compute_leaderboard(registry: Registry, league: str) -> tuple[Standing, ...]:
     """All contestants under the league's current conditions, best first. Raises UnknownLeague."""
     conditions = registry.leagues.get(league).conditions
-    return rank_contestants(Ledger(registry).results(league, conditions))
+    unrated = registry.versions.exploiter_refs(league)
+    return rank_contestants(Ledger(registry).results(league, conditions), unrated=unrated)
 
 
 def rated_version(version: VersionRow, leaderboard: Sequence[Standing], events: Sequence[AliasEvent]) -> RatedVersion:
@@ -40,8 +41,13 @@ def rated_version(version: VersionRow, leaderboard: Sequence[Standing], events: 
     )
 
 
-def by_side(sides: Sequence[str], matches: Sequence[Match]) -> dict[str, tuple[Standing, ...]]:
-    """Leaderboard of each side, for leagues that compare contestants on the same side."""
+def by_side(
+    sides: Sequence[str], matches: Sequence[Match], unrated: Collection[str] = ()
+) -> dict[str, tuple[Standing, ...]]:
+    """Leaderboard of each side, for leagues that compare contestants on the same side.
+
+    unrated: as in `rank_contestants`.
+    """
     results: dict[str, list[BlockResult]] = {side: [] for side in sides}
     for match in matches:
         for number, side in enumerate(sides):
@@ -49,7 +55,7 @@ def by_side(sides: Sequence[str], matches: Sequence[Match]) -> dict[str, tuple[S
             part = replace(match, games=tuple(game for game in games if game is not None))
             if part.games:
                 results[side].append(part.result())
-    return {side: rank_contestants(own) for side, own in results.items()}
+    return {side: rank_contestants(own, unrated=unrated) for side, own in results.items()}
 
 
 def _on_side(game: Game, side: int) -> Game | None:
@@ -64,9 +70,14 @@ def _on_side(game: Game, side: int) -> Game | None:
 
 
 def rank_contestants(
-    results: Iterable[BlockResult], unique_games: Mapping[str, int] | None = None
+    results: Iterable[BlockResult],
+    unique_games: Mapping[str, int] | None = None,
+    unrated: Collection[str] = (),
 ) -> tuple[Standing, ...]:
-    """Sum up and rate `results`, best rating first. Contestants without a rating follow, by score."""
+    """Sum up and rate `results`, best rating first. Contestants without a rating follow, by score.
+
+    unrated: contestants whose games do not count in ratings: exploiters, which are strong against one version only.
+    """
     results = list(results)
     games: Counter[str] = Counter()
     whole: Counter[str] = Counter()
@@ -79,10 +90,10 @@ def rank_contestants(
         for ref, value in zip(block.contestants, block.returns or (), strict=block.returns is not None):
             whole[ref] += block.games
             returns[ref] += value
-    ratings = rate(results, ANCHOR)
+    ratings = rate([block for block in results if not any(ref in unrated for ref in block.contestants)], ANCHOR)
     table = []
     for ref, played in games.items():
-        rating = ratings[ref]
+        rating = ratings.get(ref, Rating(None, None, None))
         table.append(
             Standing(
                 ref=ref,
@@ -123,7 +134,9 @@ class CountedGames:
             for schedule in ledger.schedules(league.slug)
             if schedule.id not in purged and (schedule.conditions, schedule.sides) == (league.conditions, self._sides)
         }
-        leaderboard = rank_contestants(result for result in ledger.results(league.slug) if result.schedule in schedules)
+        self._unrated = registry.versions.exploiter_refs(league.slug)
+        results = (result for result in ledger.results(league.slug) if result.schedule in schedules)
+        leaderboard = rank_contestants(results, unrated=self._unrated)
         self._best = [standing.ref for standing in leaderboard[:MOST_CONTESTANTS]]
         ratings = {standing.ref: standing.rating for standing in leaderboard if standing.rating is not None}
         self._upsets = UpsetFinder(ratings, max_upsets) if max_upsets else None
@@ -146,7 +159,7 @@ class CountedGames:
 
     def by_side(self) -> dict[str, tuple[Standing, ...]]:
         """Leaderboard of each side. Empty if sides are alike or there is only one."""
-        return by_side(self._sides, self.matches) if self._is_rated_by_side and self.matches else {}
+        return by_side(self._sides, self.matches, self._unrated) if self._is_rated_by_side and self.matches else {}
 
     def greatest_upsets(self) -> list[Upset]:
         """The least expected games, greatest upset first."""

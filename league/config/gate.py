@@ -1,5 +1,6 @@
 """The `gate` section: the statistical test for promotions."""
 
+from math import log10
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -8,6 +9,9 @@ from league.config.base import ContestantRef, Part
 
 MAX_NORMALIZED_ELO = 190
 """Bound for hypotheses with a usable test; see evaluation/statistics/sequential.py."""
+
+EXPLOITER_MARGIN = 0.1
+"""Default of `exploiter_margin`: a tenth of all points."""
 
 
 class AnchorConfig(Part):
@@ -56,6 +60,11 @@ class GateConfig(Part):
     """Number of previous champions that are anchors."""
     margin: float = Field(default=50.0, gt=0)
     """Non-inferiority margin, in Elo of `model` or in returns."""
+    exploited_champions: int = Field(default=2, ge=0)
+    """Number of champions, the current one and previous ones, whose newest exploiters a candidate is tested against."""
+    exploiter_margin: float | None = Field(default=None, gt=0)
+    """How much less than the champion a candidate may score against an exploiter, as a share of all points (default
+    0.1), or in returns with the model `returns` (default: `margin`)."""
     confirmation_blocks: int = Field(default=200, ge=0)
     """Blocks against the previous champion after a promotion, for an unbiased estimate of the improvement."""
     forfeits: bool = False
@@ -94,11 +103,39 @@ class GateConfig(Part):
         if margin >= self.return_bound:
             raise ValueError(f"margin must be smaller than return_bound ({self.return_bound:g}), got {margin:g}")
 
+    @model_validator(mode="after")
+    def _margin_is_possible(self) -> Self:
+        margin = self.margin_against_exploiters
+        largest = 2 * (self.return_bound or 0) if self.model == "returns" else 1.0
+        if margin >= largest:
+            name = "twice return_bound" if self.model == "returns" else "all points"
+            raise ValueError(f"exploiter_margin must be smaller than {largest:g} ({name}), got {margin:g}")
+        return self
+
     def against_anchor(self, margin: float | None) -> Self:
         """Return the settings of a non-inferiority test. H0: weaker by the margin; H1: equally strong."""
         below = -(self.margin if margin is None else margin)
         zero = {"return0": below, "return1": 0.0} if self.model == "returns" else {"elo0": below, "elo1": 0.0}
         return self.model_copy(update=zero)
+
+    @property
+    def margin_against_exploiters(self) -> float:
+        """`exploiter_margin` or its default."""
+        if self.exploiter_margin is not None:
+            return self.exploiter_margin
+        return self.margin if self.model == "returns" else EXPLOITER_MARGIN
+
+    def against_exploiter(self, margin: float) -> Self:
+        """Return the settings of a paired test against an exploiter, which observes half of the difference between
+        candidate and champion. H0: the candidate is worse by the margin; H1: it is as good.
+
+        A score of ½ − margin/2 is expressed in Elo of the model `logistic`, whose hypotheses are mean scores. Those of
+        `normalized` would depend on how alike the games of candidate and champion are.
+        """
+        if self.model == "returns":
+            return self.model_copy(update={"return0": -margin / 2, "return1": 0.0})
+        elo0 = 400 * log10((1 - margin) / (1 + margin))
+        return self.model_copy(update={"model": "logistic", "elo0": elo0, "elo1": 0.0})
 
     def of_one_verdict(self, alpha: float) -> Self:
         """Return the settings of one verdict with error probability `alpha`."""

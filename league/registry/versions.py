@@ -66,6 +66,12 @@ class VersionRepository(Repository):
             leagues.require(session, league)
             return _rows(session, league, list(session.scalars(query.order_by(VersionTable.number))))
 
+    def exploiter_refs(self, league: str) -> set[str]:
+        """Return the references of all exploiters of a league, retired ones included. Does not read manifests."""
+        query = select(VersionTable.number).where(VersionTable.league == league, VersionTable.exploits.is_not(None))
+        with self._database.read() as session:
+            return {f"{league}@{number}" for number in session.scalars(query)}
+
     def numbers(self, league: str | None = None) -> dict[str, list[int]]:
         """Return league → version numbers, ascending, of one league or of all that have versions.
 

@@ -40,7 +40,8 @@ class Schedule:
     id: str
     league: str
     kind: str
-    """`verdict`, `anchor`, `confirmation`, `gauntlet`; `round_robin`, `challenge`, `adaptive` or `cross_play`"""
+    """`verdict`, `anchor`, `exploiter`, `confirmation`, `gauntlet`; `round_robin`, `challenge`, `adaptive` or
+    `cross_play`"""
     seed: int
     environment_digest: str
     game_digest: str
@@ -57,6 +58,8 @@ class Schedule:
     scoring: Scoring = "game"
     actions: ActionSelection = "greedy"
     """How versions select actions."""
+    common_seeds: bool = False
+    """Whether the matches of a round, one of each pairing, have the same seed."""
 
     @property
     def conditions(self) -> Conditions:
@@ -71,13 +74,17 @@ class Schedule:
         """Return the seed of match `position`."""
         from league.seeds import derive  # NumPy takes 0.1 s to import.
 
-        return derive(self.seed, position)
+        return derive(self.seed, position // self._matches_per_seed)
 
     def seeds_at(self, positions: Sequence[int]) -> list[int]:
         """Return the seeds of some matches."""
         from league.seeds import derive_each  # NumPy takes 0.1 s to import.
 
-        return derive_each(self.seed, positions).tolist()
+        return derive_each(self.seed, [position // self._matches_per_seed for position in positions]).tolist()
+
+    @property
+    def _matches_per_seed(self) -> int:
+        return len(self.pairings) if self.common_seeds else 1
 
     def seat_at(self, position: int) -> int:
         """Return the side that one contestant controls in each game of match `position`; the other has all other sides.

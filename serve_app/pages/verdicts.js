@@ -46,6 +46,7 @@ export function Verdict({ league, verdict }) {
       <${Evidence} verdict=${loaded} />
       <${Statistics} league=${league} verdict=${loaded} />
       ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
+      ${loaded.exploiters?.length > 0 && html`<${Exploiters} exploiters=${loaded.exploiters} />`}
       ${loaded.confirmation && html`<${Confirmation} match=${loaded.confirmation} />`}`}
     <//>
   </section>`;
@@ -97,6 +98,16 @@ function Anchors({ anchors }) {
     <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["95 % interval"]]}>
       ${anchors.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td>${each.outcome}</td><td class="number">${each.margin}</td>
         <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${signed(each.elo)}</td><td class="nowrap">${interval(each.interval)}</td></tr>`)}
+    <//>`;
+}
+
+function Exploiters({ exploiters }) {
+  const name = "Against exploiters, compared with the champion";
+  return html`<h3>${name}</h3>
+    <${Table} caption=${name} head=${[["Exploiter"], ["Of"], ["Outcome"], ["Margin", "number"], ["Games", "number"], ["LLR", "number"], ["Score", "number"], ["Champion’s score", "number"], ["Difference", "number"]]}>
+      ${exploiters.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td><span class="ref">${each.exploits}</span></td><td>${each.outcome}</td><td class="number">${each.margin}</td>
+        <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${percent(each.score)}</td><td class="number">${percent(each.champion_score)}</td>
+        <td class="number">${each.difference && html`${signed(each.difference.mean, 3)} <small>${number(each.difference.low, 3)} to ${number(each.difference.high, 3)}</small>`}</td></tr>`)}
     <//>`;
 }
 

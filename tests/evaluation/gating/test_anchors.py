@@ -61,15 +61,15 @@ def test_a_candidate_is_not_its_own_anchor_and_aliases_are_pinned(registry: Regi
 def test_a_rolled_back_champion_is_not_an_anchor(registry: Registry) -> None:
     promote(registry, 1, 2, 3)
     registry.aliases.rollback(tictactoe.LEAGUE, actor="me", reason="broken")
-    assert earlier_champions(registry, registry.leagues.get(tictactoe.LEAGUE)) == ["tictactoe@1"]
+    assert earlier_champions(registry, registry.leagues.get(tictactoe.LEAGUE), 2) == ["tictactoe@1"]
 
 
 def test_a_former_champion_of_another_environment_is_not_an_anchor(registry: Registry) -> None:
     promote(registry, 1, 2)
     changed = registry.leagues.get(tictactoe.LEAGUE)
     other = dataclasses.replace(changed, environment_digest="0" * 64)
-    assert earlier_champions(registry, changed) == ["tictactoe@1"]
-    assert earlier_champions(registry, other) == []
+    assert earlier_champions(registry, changed, 2) == ["tictactoe@1"]
+    assert earlier_champions(registry, other, 2) == []
 
 
 def test_an_unknown_anchor_is_reported_and_no_candidate_is_tested(registry: Registry) -> None:
