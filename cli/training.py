@@ -67,6 +67,7 @@ def check_env(
                 f" {min(found.lengths)} to {max(found.lengths)} steps, {found.steps_per_second:,.0f} steps per second"
             )
             say(found.implementation)
+            say(found.policies)
             say(found.actions)
         if (vectorised := found.vectorised) is not None:
             ratio = vectorised.steps_per_second / vectorised.stock_steps_per_second

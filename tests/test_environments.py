@@ -1,4 +1,5 @@
-"""Each environment of PettingZoo 1.27 and mpe2 except Atari: one update, a version, its matches, its actions."""
+"""Each environment of PettingZoo 1.27 and mpe2 except Atari, and games of OpenSpiel: one update, a version, its
+matches, its actions."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 
 from evaluation.matches import tournament
+from league.config.league import LeagueConfig
 from league.environments.building import interface
+from league.environments.conformance import examine
 from league.policies import load
 from league.registry.registry import Registry
 from league.settings import Storage
@@ -30,6 +33,23 @@ QUICK = ("tictactoe_v3", "pistonball_v6", "simple_speaker_listener_v4")
 """A turn-based environment, one with images, and one with different agents. Testing all others takes long."""
 
 
+GAMES = (
+    "backgammon",
+    "breakthrough",
+    "connect_four",
+    "goofspiel",
+    "hex",
+    "kuhn_poker",
+    "leduc_poker",
+    "liars_dice",
+    "matrix_rps",
+    "othello",
+    "pig",
+    "tic_tac_toe",
+)
+"""Games of OpenSpiel."""
+
+
 def _cases() -> list[Any]:
     names = {case.entry_point.rpartition(".")[2]: case for case in CASES}
     return [
@@ -40,7 +60,33 @@ def _cases() -> list[Any]:
 @pytest.mark.parametrize("case", _cases())
 @pytest.mark.usefixtures("ray_session")
 def test_trains_publishes_evaluates_and_loads(case: Case, registry: Registry, tmp_path: Path) -> None:
-    league = case.league()
+    _train_publish_evaluate_and_load(case.league(), registry, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("game", GAMES)
+@pytest.mark.usefixtures("ray_session")
+def test_games_of_openspiel_train_publish_and_evaluate(game: str, registry: Registry, tmp_path: Path) -> None:
+    pytest.importorskip("pyspiel")
+    league = Case("openspiel", {"game": game}).league()
+    _train_publish_evaluate_and_load(league, registry, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("entry_point", [case.entry_point for case in CASES])
+@pytest.mark.usefixtures("ray_session")
+def test_an_entry_point_alone_is_enough(entry_point: str) -> None:
+    alone = LeagueConfig.from_mapping({"league": "alone", "environment": {"entry_point": entry_point}})
+    assert examine(alone, episodes=1, steps=50).passed
+    short = alone.with_training(runners=0, num_envs=1, train_batch_size=32, minibatch_size=32, epochs=1, hidden=(8,))
+    algorithm = build_algorithm(short, interface(short))
+    try:
+        algorithm.train()
+    finally:
+        algorithm.stop()
+
+
+def _train_publish_evaluate_and_load(league: LeagueConfig, registry: Registry, tmp_path: Path) -> None:
     league_interface = interface(league)
     registry.leagues.register(league, league_interface)
     algorithm = build_algorithm(league, league_interface)

@@ -27,11 +27,16 @@ class WrapperConfig(Part):
         return value
 
 
+ADAPTERS = {"openspiel": "league.environments.openspiel"}
+"""Short entry points of adapters for other libraries → their modules."""
+
+
 class EnvironmentConfig(Part):
     """An environment and its wrappers."""
 
     entry_point: str
-    """A PettingZoo module (`pettingzoo.classic.connect_four_v3`) or a function (`package.module:function`)."""
+    """A PettingZoo module (`pettingzoo.classic.connect_four_v3`), a function (`package.module:function`), or
+    `openspiel` for a game of OpenSpiel."""
     api: Literal["aec", "parallel", "rllib"] | None = None
     """PettingZoo's AEC or Parallel API, or RLlib's MultiAgentEnv. By default the API is detected: from the return value
     of a function; for a module, Parallel if it has `parallel_env`, else AEC."""
@@ -46,6 +51,11 @@ class EnvironmentConfig(Part):
     """Identifies the rules of the game. It replaces the digest of the source files, so that editing them does not start
     a new game. Change it with the rules, and with data files that the environment reads."""
 
+    @property
+    def resolved_entry_point(self) -> str:
+        """The entry point, where the short name of an adapter is replaced by its module."""
+        return ADAPTERS.get(self.entry_point, self.entry_point)
+
     def digest(self) -> str:
         """Return the SHA-256 of the settings. Versions only play in the environment that they were trained in.
 
@@ -55,7 +65,7 @@ class EnvironmentConfig(Part):
 
     def code(self) -> JSON:
         """Return what identifies the environment's code: revision or source digest, and the versions of libraries."""
-        found = environment_code(self.entry_point)
+        found = environment_code(self.resolved_entry_point)
         identity: JSON = {"source": found.source} if self.revision is None else {"revision": self.revision}
         libraries = found.libraries | ({"supersuit": version("supersuit")} if self.wrappers else {})
         return {f"environment.{name}": value for name, value in identity.items()} | libraries

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
-from pydantic import Field, ValidationError, field_validator
+from pydantic import ValidationError, field_validator
 
 from league.config.algorithms import TrainingConfig
 from league.config.base import JSON, Part
@@ -19,8 +19,6 @@ from league.errors import ConfigError, InvalidReference, one_line
 from league.interface import digest
 from league.refs import check_slug
 
-ONE_POLICY: dict[str, tuple[str, ...]] = {"shared": ("*",)}
-
 
 class LeagueConfig(Part):
     """Configuration of a league. Only `league` and `environment` are required."""
@@ -28,9 +26,9 @@ class LeagueConfig(Part):
     league: str
     """Name of the league: a-z, 0-9, `_` and `-`."""
     environment: EnvironmentConfig
-    policies: dict[str, tuple[str, ...]] | str = Field(default=ONE_POLICY)
+    policies: dict[str, tuple[str, ...]] | str | None = None
     """Policy id → agents, by name or pattern (`player_*`); the first match determines an agent's policy. Alternatively
-    a function `package.module:function` from agent to policy id."""
+    a function `package.module:function` from agent to policy id. By default agents with equal spaces share a policy."""
     sides: dict[str, tuple[str, ...]] | None = None
     """Side → agents, by name or pattern. By default each agent is a separate side."""
     play: PlayConfig = PlayConfig()

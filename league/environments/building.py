@@ -2,6 +2,8 @@
 
 import fnmatch
 import os
+import re
+from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
@@ -21,7 +23,7 @@ from league.config.league import LeagueConfig
 from league.entry_points import import_entry_point, import_module
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
-from league.errors import ConfigError, EnvironmentMismatch
+from league.errors import ConfigError, EnvironmentMismatch, LeagueError
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
 from league.spaces.conversion import from_gymnasium
@@ -153,9 +155,12 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
         for agent in names
     }
     divided = config.policies
-    policies = (
-        _policies_from_function(divided, names) if isinstance(divided, str) else divide("policies", divided, names)
-    )
+    if divided is None:
+        policies = policies_by_spaces(agents)
+    elif isinstance(divided, str):
+        policies = _policies_from_function(divided, names)
+    else:
+        policies = divide("policies", divided, names)
     sides = config.sides or {agent: (agent,) for agent in names}
     side_of = divide("sides", sides, names)
     _check_equal_spaces(agents, policies)
@@ -168,7 +173,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
 
 
 def _constructor(config: EnvironmentConfig) -> Any:
-    module_name, colon, function = config.entry_point.partition(":")
+    module_name, colon, function = config.resolved_entry_point.partition(":")
     module = import_module("environment.entry_point", module_name)
     if colon:
         name = function
@@ -213,6 +218,50 @@ def _policies_from_function(entry_point: str, agents: list[str]) -> dict[str, st
                 f"policies: {entry_point} returned no valid policy id for agent {agent!r}: {error}"
             ) from error
     return mapped
+
+
+def policies_by_spaces(agents: Mapping[str, AgentInterface]) -> dict[str, str]:
+    """Return agent → policy id, with one policy for each kind of agents with equal spaces.
+
+    A single policy is `shared`. Several have the name of their first agents without its number (`adversary` for
+    `adversary_0`), or with it where kinds have equal names.
+    """
+    kinds: list[list[str]] = []
+    for agent, spaces in agents.items():
+        kind = next((kind for kind in kinds if agents[kind[0]] == spaces), None)
+        if kind is None:
+            kinds.append([agent])
+        else:
+            kind.append(agent)
+    if len(kinds) == 1:
+        return dict.fromkeys(agents, "shared")
+    firsts = [re.sub(r"[^a-z0-9_-]", "_", kind[0].lower()) for kind in kinds]
+    stems = [re.sub(r"_?\d+$", "", first) for first in firsts]
+    names = [
+        stem if _is_slug(stem) and stems.count(stem) == 1 else first for first, stem in zip(firsts, stems, strict=True)
+    ]
+    if len(set(names)) < len(names) or not all(map(_is_slug, names)):
+        names = [f"kind_{number}" for number in range(len(kinds))]
+    name_of = {agent: name for name, kind in zip(names, kinds, strict=True) for agent in kind}
+    return {agent: name_of[agent] for agent in agents}
+
+
+def describe_policies(interface: Interface) -> str:
+    """Return a sentence for people: the policies with their agents."""
+    parts = []
+    for policy in interface.policy_ids:
+        own = [agent for agent in interface.agents if interface.policies[agent] == policy]
+        agents = own[0] if len(own) == 1 else f"{own[0]} and {len(own) - 1} more"
+        parts.append(f"{policy} ({agents})")
+    return f"{'Policy' if len(parts) == 1 else 'Policies'}: {', '.join(parts)}."
+
+
+def _is_slug(name: str) -> bool:
+    try:
+        check_slug("policy", name)
+    except LeagueError:
+        return False
+    return True
 
 
 def divide(key: str, groups: dict[str, tuple[str, ...]], agents: list[str]) -> dict[str, str]:

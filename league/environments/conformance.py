@@ -23,7 +23,7 @@ from league.conditions import describe_selection
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
-from league.environments.building import action_space, build, describe, observation_space
+from league.environments.building import action_space, build, describe, describe_policies, observation_space
 from league.environments.implementation import implementation
 from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
@@ -118,6 +118,8 @@ class Examination:
     """Size of the global state; None without one."""
     implementation: str = ""
     """How copies of the environment are stepped, and why."""
+    policies: str = ""
+    """The policies with their agents."""
     actions: str = ""
     """How versions select actions, and why."""
     vectorised: Vectorised | None = None
@@ -153,6 +155,7 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int = 2000, seed: in
         return found
     found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
     found.agents = len(interface.agents)
+    found.policies = describe_policies(interface)
     found.actions = describe_selection(config, interface)
     for agent, spaces in interface.agents.items():
         if not _is_supported(spaces.action):

@@ -11,6 +11,7 @@ from rich.console import Console
 from league.conditions import describe_selection
 from league.config.algorithms import ALGORITHMS, AnyTraining, TrainingConfig
 from league.config.league import LeagueConfig
+from league.environments.building import describe_policies
 from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
 from league.errors import ConfigError, InterfaceChanged
@@ -121,6 +122,7 @@ def _describe(
     progress.say(_parallel_environments(config, interface))
     if run.record.exploits is not None:
         progress.say(f"Role: {run.record.role}. Opponent in all episodes: {run.record.exploits}.")
+    progress.say(describe_policies(interface))
     progress.say(describe_selection(config, interface))
     if dashboard:
         progress.say(f"Ray's dashboard: {dashboard}")

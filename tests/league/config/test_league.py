@@ -18,7 +18,7 @@ def test_each_shipped_config_is_valid_and_named_like_its_file(path: Path) -> Non
 
 def test_only_league_and_environment_are_required() -> None:
     config = LeagueConfig.from_mapping(MINIMAL)
-    assert config.policies == {"shared": ("*",)}
+    assert config.policies is None
     assert config.training.algorithm == "ppo"
 
 

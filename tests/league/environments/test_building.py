@@ -6,7 +6,14 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
-from league.environments.building import action_space, build, describe, interface, observation_space
+from league.environments.building import (
+    action_space,
+    build,
+    describe,
+    describe_policies,
+    interface,
+    observation_space,
+)
 from league.errors import ConfigError, EnvironmentMismatch
 
 COUNTING = "tests.support.environments.counting:counting"
@@ -186,3 +193,31 @@ def test_agents_without_string_names_are_rejected() -> None:
     env.possible_agents = (0, 1)  # type: ignore[assignment]
     with pytest.raises(EnvironmentMismatch, match="expected strings"):
         describe(env, league())
+
+
+ENTRY_POINTS_WITH_KINDS = {
+    "mpe2.simple_adversary_v3": {"adversary": "adversary_0", "agent": "agent_0 agent_1"},
+    "mpe2.simple_crypto_v3": {"eve": "eve_0", "bob": "bob_0 alice_0"},
+    "mpe2.simple_push_v3": {"adversary": "adversary_0", "agent": "agent_0"},
+    "mpe2.simple_speaker_listener_v4": {"speaker": "speaker_0", "listener": "listener_0"},
+    "mpe2.simple_tag_v3": {"adversary": "adversary_0 adversary_1 adversary_2", "agent": "agent_0"},
+    "mpe2.simple_world_comm_v3": {
+        "leadadversary": "leadadversary_0",
+        "adversary": "adversary_0 adversary_1 adversary_2",
+        "agent": "agent_0 agent_1",
+    },
+}
+
+
+@pytest.mark.parametrize("entry_point", ENTRY_POINTS_WITH_KINDS)
+def test_agents_with_different_spaces_get_a_policy_per_kind(entry_point: str) -> None:
+    found = interface(LeagueConfig.from_mapping({"league": "x", "environment": {"entry_point": entry_point}}))
+    kinds = ENTRY_POINTS_WITH_KINDS[entry_point]
+    assert found.policies == {agent: policy for policy, agents in kinds.items() for agent in agents.split()}
+
+
+def test_agents_with_equal_spaces_share_a_policy() -> None:
+    environment = {"entry_point": "pettingzoo.classic.rps_v2"}
+    found = interface(LeagueConfig.from_mapping({"league": "x", "environment": environment}))
+    assert found.policy_ids == ("shared",)
+    assert describe_policies(found) == "Policy: shared (player_0 and 1 more)."
