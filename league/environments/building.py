@@ -154,7 +154,9 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
     }
     divided = config.policies
     policies = (
-        _policies_from_function(divided, names) if isinstance(divided, str) else divide("policies", divided, names)
+        _policies_from_function(divided, names, config.folder)
+        if isinstance(divided, str)
+        else divide("policies", divided, names)
     )
     sides = config.sides or {agent: (agent,) for agent in names}
     side_of = divide("sides", sides, names)
@@ -169,7 +171,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
 
 def _constructor(config: EnvironmentConfig) -> Any:
     module_name, colon, function = config.entry_point.partition(":")
-    module = import_module("environment.entry_point", module_name)
+    module = import_module("environment.entry_point", module_name, config.folder)
     if colon:
         name = function
     elif config.api == "aec" or (config.api is None and not hasattr(module, "parallel_env")):
@@ -199,9 +201,9 @@ def _without_checks(env: Any) -> Any:
     return env
 
 
-def _policies_from_function(entry_point: str, agents: list[str]) -> dict[str, str]:
+def _policies_from_function(entry_point: str, agents: list[str], folder: str | None) -> dict[str, str]:
     """Return agent → policy id, as defined by the user's function."""
-    function = import_entry_point("policies", entry_point)
+    function = import_entry_point("policies", entry_point, folder)
     if not callable(function):
         raise ConfigError(f"policies: {entry_point} is not a function")
     mapped = {}
