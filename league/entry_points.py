@@ -1,46 +1,104 @@
-"""Imports functions and classes of users' code by their entry points, `my_package.module:name`."""
+"""Imports functions and classes of users' code by their entry points, `my_package.module:name`.
+
+The first part of the name is searched in the league's folder, which is by default that of its file, before it is
+searched as Python does. What the user's code imports is found in installed packages first, and then in that folder, so
+that a file in it cannot replace a library.
+"""
 
 import importlib
 import os
+import sys
+from collections.abc import Sequence
+from importlib.util import module_from_spec
 from types import ModuleType
 from typing import Any
 
-from league.errors import ConfigError
+from league.environment_code import module_in
+from league.errors import ConfigError, raised_at
+
+_folders: list[str] = []
 
 
-def import_module(key: str, name: str) -> ModuleType:
+def search_in(folder: str) -> None:
+    """Search entry points in a league's folder, for as long as this process lives."""
+    for folders in (_folders, sys.path):
+        if folder not in folders:
+            folders.append(folder)
+
+
+def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
     """Import a module.
 
     Args:
         key: What names the module, for error messages.
         name: The name of the module.
+        folder: The folder to search first. None: those of all leagues that this process has read.
 
     Raises:
-        ConfigError: It cannot be imported.
+        ConfigError: It cannot be imported, or another module of the same name has been.
     """
+    folders = _folders if folder is None else [folder]
     try:
+        _import_own(key, name.partition(".")[0], folders)
         return importlib.import_module(name)
+    except ConfigError:
+        raise
     except ImportError as error:
-        searched = f"{os.getcwd()} and the installed packages were searched"
-        raise ConfigError(f"{key}: cannot import {name!r}: {error}; {searched}") from error
+        raise ConfigError(f"{key}: cannot import {name!r}: {_reason(error)}; searched: {_searched(folders)}") from error
     except Exception as error:
         if not name or name.startswith("."):
             raise ConfigError(f"{key}: {name!r} is not a valid module name") from error
-        raise ConfigError(f"{key}: {name!r} fails on import: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{key}: {name!r} fails on import: {type(error).__name__}: {_reason(error)}") from error
 
 
-def import_entry_point(key: str, entry_point: str) -> Any:
+def import_entry_point(key: str, entry_point: str, folder: str | None = None) -> Any:
     """Import `module:name`.
 
     Args:
         key: What names the entry point, for error messages.
         entry_point: The module and the name in it.
+        folder: See `import_module`.
 
     Raises:
         ConfigError: The module cannot be imported, or does not have the name.
     """
     module_name, _, name = entry_point.partition(":")
-    module = import_module(key, module_name)
+    module = import_module(key, module_name, folder)
     if not hasattr(module, name):
         raise ConfigError(f"{key}: {module_name!r} ({module.__file__}) has no {name!r}")
     return getattr(module, name)
+
+
+def _import_own(key: str, package: str, folders: Sequence[str]) -> None:
+    """Import a top-level module or package if one of the folders contains it."""
+    found = {os.path.realpath(str(spec.origin)): spec for folder in folders if (spec := module_in(folder, package))}
+    present = sys.modules.get(package)
+    loaded = getattr(present, "__file__", None)
+    files = dict.fromkeys([*found, *([os.path.realpath(loaded)] if loaded and found else [])])
+    if len(files) > 1:
+        raise ConfigError(
+            f"{key}: {package!r} is the name of several modules, {' and '.join(files)}: rename all but one, or name"
+            " a single league in the command"
+        )
+    if not found or present is not None:
+        return
+    (spec,) = found.values()
+    module = module_from_spec(spec)
+    sys.modules[package] = module
+    try:
+        assert spec.loader is not None
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[package]
+        raise
+
+
+def _reason(error: Exception) -> str:
+    """The message of an exception, with the line of the user's code that raised it."""
+    place = raised_at(error)
+    return f"{error} ({place})" if place else str(error)
+
+
+def _searched(folders: Sequence[str]) -> str:
+    working = [os.getcwd()] if {os.getcwd(), ""} & set(sys.path) else []
+    return ", ".join(dict.fromkeys([*folders, *working, "installed packages"]))

@@ -31,9 +31,17 @@ class EnvironmentCode:
     libraries: dict[str, str]
 
 
+def module_in(folder: str, name: str) -> ModuleSpec | None:
+    """Find a module or package in a folder, without importing it; None if the folder does not contain it."""
+    found = FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name)
+    return found if found is not None and found.loader is not None else None
+
+
 @cache
-def environment_code(entry_point: str) -> EnvironmentCode:
+def environment_code(entry_point: str, folder: str | None = None) -> EnvironmentCode:
     """Return the code behind an entry point, `package.module` or `package.module:function`.
+
+    folder: where its package is searched first.
 
     It is read once per process, which also imports the environment once. Source files are the entry point's module and
     every module outside of the installed libraries that it imports, directly or through others. An entry point that
@@ -50,7 +58,7 @@ def environment_code(entry_point: str) -> EnvironmentCode:
         if name in seen or top in sys.stdlib_module_names or top in WITHOUT_INFLUENCE:
             continue
         seen.add(name)
-        spec = _spec(name)
+        spec = _spec(name, folder if top == package else None)
         if spec is None or not spec.origin or not Path(spec.origin).is_file():
             continue
         is_library = any(Path(spec.origin).is_relative_to(folder) for folder in _LIBRARIES)
@@ -68,15 +76,17 @@ def environment_code(entry_point: str) -> EnvironmentCode:
     return EnvironmentCode(source.hexdigest(), dict(sorted(_versions(libraries))))
 
 
-def _spec(name: str) -> ModuleSpec | None:
+def _spec(name: str, folder: str | None) -> ModuleSpec | None:
     """Find a module without importing its parents."""
     parent, _, _ = name.rpartition(".")
     if not parent:
+        if folder is not None and (own := module_in(folder, name)) is not None:
+            return own
         try:
             return find_spec(name)
         except ValueError:  # A module without a specification, such as __main__.
             return None
-    above = _spec(parent)
+    above = _spec(parent, folder)
     folders = above.submodule_search_locations if above else None
     found = (FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name) for folder in folders or ())
     return next(filter(None, found), None)

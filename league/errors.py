@@ -3,8 +3,14 @@
 Errors are raised where they occur and translated once: by the CLI to an exit code, by the server to an HTTP status.
 """
 
+import sysconfig
+import traceback
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar
+
+_INSTALLED = tuple(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib"))
+_OWN = str(Path(__file__).parent)
 
 
 class LeagueError(Exception):
@@ -227,6 +233,13 @@ def one_line(error: BaseException, with_type: bool = False, first_line: bool = F
     text, kind = str(error).strip(), type(error).__name__
     message = " ".join((text.partition("\n")[0] if first_line else text).split())
     return f"{kind}: {message}" if with_type and message else message or kind
+
+
+def raised_at(error: BaseException) -> str | None:
+    """Return where an error was raised, as `FILE, line N`: the last line outside of the Python installation."""
+    frames = traceback.extract_tb(error.__traceback__)
+    outside = [frame for frame in frames if not frame.filename.startswith((*_INSTALLED, "<", _OWN))]
+    return f"{outside[-1].filename}, line {outside[-1].lineno}" if outside else None
 
 
 def last_line(text: str) -> str:

@@ -3,7 +3,7 @@
 from importlib.metadata import version
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from league.config.base import JSON, Part
 from league.environment_code import environment_code
@@ -50,6 +50,11 @@ class EnvironmentConfig(Part):
     revision: str | None = None
     """Identifies the rules of the game. It replaces the digest of the source files, so that editing them does not start
     a new game. Change it with the rules, and with data files that the environment reads."""
+    _folder: str | None = PrivateAttr(default=None)
+
+    def search_in(self, folder: str | None) -> None:
+        """Set `folder`, which is no part of the section, so that manifests do not contain a path of this machine."""
+        self._folder = folder
 
     @property
     def resolved_entry_point(self) -> str:
@@ -63,9 +68,14 @@ class EnvironmentConfig(Part):
         """
         return digest(self.model_dump(mode="json", exclude={"vector", "revision"}))
 
+    @property
+    def folder(self) -> str | None:
+        """The folder in which entry points are searched first: that of the league."""
+        return self._folder
+
     def code(self) -> JSON:
         """Return what identifies the environment's code: revision or source digest, and the versions of libraries."""
-        found = environment_code(self.resolved_entry_point)
+        found = environment_code(self.resolved_entry_point, self.folder)
         identity: JSON = {"source": found.source} if self.revision is None else {"revision": self.revision}
         libraries = found.libraries | ({"supersuit": version("supersuit")} if self.wrappers else {})
         return {f"environment.{name}": value for name, value in identity.items()} | libraries

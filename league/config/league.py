@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
-from pydantic import ValidationError, field_validator
+from pydantic import ValidationError, field_validator, model_validator
 
 from league.config.algorithms import TrainingConfig
 from league.config.base import JSON, Part
@@ -15,6 +15,7 @@ from league.config.play import PlayConfig
 from league.config.ppo import PPOConfig
 from league.config.sweep import SweepConfig
 from league.config.validation_errors import describe_validation_error
+from league.entry_points import search_in
 from league.errors import ConfigError, InvalidReference, one_line
 from league.interface import digest
 from league.refs import check_slug
@@ -26,6 +27,8 @@ class LeagueConfig(Part):
     league: str
     """Name of the league: a-z, 0-9, `_` and `-`."""
     environment: EnvironmentConfig
+    folder: str | None = None
+    """Folder in which entry points are searched first, relative to the file; by default the folder of the file."""
     policies: dict[str, tuple[str, ...]] | str | None = None
     """Policy id → agents, by name or pattern (`player_*`); the first match determines an agent's policy. Alternatively
     a function `package.module:function` from agent to policy id. By default agents with equal spaces share a policy."""
@@ -52,6 +55,13 @@ class LeagueConfig(Part):
             _slug("name", key)
         return value
 
+    @model_validator(mode="after")
+    def _search_in_folder(self) -> Self:
+        if self.folder is not None:
+            search_in(self.folder)
+            self.environment.search_in(self.folder)
+        return self
+
     @classmethod
     def load(cls, path: Path | str) -> Self:
         """Read a YAML file. Raises ConfigError if it cannot be read, or the configuration is invalid."""
@@ -61,7 +71,7 @@ class LeagueConfig(Part):
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: not a YAML file: {one_line(error)}") from error
-        return cls.from_mapping(document, source=str(path))
+        return cls.from_mapping(_with_folder(document, Path(path)), source=str(path))
 
     @classmethod
     def from_mapping(cls, document: Any, source: str = "configuration") -> Self:
@@ -89,6 +99,17 @@ class LeagueConfig(Part):
         """Return the configuration with some training settings replaced. Raises ConfigError if it is invalid."""
         training = self.training.model_dump(by_alias=True) | settings
         return self.from_mapping(self.model_dump(by_alias=True) | {"training": training}, source=self.league)
+
+
+def _with_folder(document: Any, path: Path) -> Any:
+    """Make `folder` absolute. Invalid documents are returned as they are."""
+    given = document.get("folder") if isinstance(document, Mapping) else 0
+    if not isinstance(given, str | None):
+        return document
+    folder = (path.parent / (given or "")).resolve()
+    if not folder.is_dir():
+        raise ConfigError(f"{path}: folder: {folder} is not a directory")
+    return {**document, "folder": str(folder)}
 
 
 def _slug(kind: str, value: str) -> str:

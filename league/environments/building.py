@@ -158,7 +158,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
     if divided is None:
         policies = policies_by_spaces(agents)
     elif isinstance(divided, str):
-        policies = _policies_from_function(divided, names)
+        policies = _policies_from_function(divided, names, config.folder)
     else:
         policies = divide("policies", divided, names)
     sides = config.sides or {agent: (agent,) for agent in names}
@@ -174,7 +174,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
 
 def _constructor(config: EnvironmentConfig) -> Any:
     module_name, colon, function = config.resolved_entry_point.partition(":")
-    module = import_module("environment.entry_point", module_name)
+    module = import_module("environment.entry_point", module_name, config.folder)
     if colon:
         name = function
     elif config.api == "aec" or (config.api is None and not hasattr(module, "parallel_env")):
@@ -204,9 +204,9 @@ def _without_checks(env: Any) -> Any:
     return env
 
 
-def _policies_from_function(entry_point: str, agents: list[str]) -> dict[str, str]:
+def _policies_from_function(entry_point: str, agents: list[str], folder: str | None) -> dict[str, str]:
     """Return agent → policy id, as defined by the user's function."""
-    function = import_entry_point("policies", entry_point)
+    function = import_entry_point("policies", entry_point, folder)
     if not callable(function):
         raise ConfigError(f"policies: {entry_point} is not a function")
     mapped = {}

@@ -115,7 +115,7 @@ def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, stat
 
 
 def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation:
-    make = _imported(entry_point)
+    make = _imported(entry_point, config.folder)
     try:
         make(1, **config.kwargs)
     except UnsupportedArguments as error:
@@ -125,8 +125,8 @@ def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation
     return Implementation(make, f"It is vectorised by {entry_point}.")
 
 
-def _imported(entry_point: str) -> Callable[..., VectorEnv]:
-    found = import_entry_point("environment.vector", entry_point)
+def _imported(entry_point: str, folder: str | None) -> Callable[..., VectorEnv]:
+    found = import_entry_point("environment.vector", entry_point, folder)
     if not (isinstance(found, type) and issubclass(found, VectorEnv)):
         raise ConfigError(f"environment.vector: {entry_point} is not a subclass of VectorEnv")
     return found

@@ -202,7 +202,7 @@ class RunDirectory:
         if (changed := changed_setting(record.config, config)) is not None:
             raise ConfigError(
                 f"{changed} has changed since training run {newest.parent.name} began, so it cannot be resumed: "
-                f"start a new run, with --from to continue from a version"
+                f"set it back, or start a new run without --resume (with --from to continue from a version)"
             )
         if record.complete and not _has_larger_budget(record.config.training, config.training):
             raise NotFound(
@@ -251,9 +251,10 @@ def _runs(storage: Storage, league: str) -> Path:
 
 def changed_setting(old: LeagueConfig, new: LeagueConfig) -> str | None:
     """Return the first setting that differs and affects what is learned."""
-    for key in ("environment", "policies"):
-        if getattr(old, key) != getattr(new, key):
-            return key
+    if old.environment.model_dump() != new.environment.model_dump():  # the folder of its code may be another one
+        return "environment"
+    if old.policies != new.policies:
+        return "policies"
     before, after = (json.loads(config.training.model_dump_json(by_alias=True)) for config in (old, new))
     for key in before.keys() | after.keys():
         if key not in RESUMABLE_SETTINGS and before.get(key) != after.get(key):

@@ -1,0 +1,117 @@
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from league import entry_points
+from league.config.league import LeagueConfig
+from league.entry_points import import_entry_point, import_module
+from league.environment_code import environment_code
+from league.environments.building import build
+from league.errors import ConfigError
+
+GAME = "from pettingzoo.classic.tictactoe_v3 import env\n\ndef make_env():\n    return env()\n"
+
+
+@pytest.fixture(autouse=True)
+def own_search_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Forget the folders and modules of each test."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(entry_points, "_folders", [])
+    before = set(sys.modules)
+    yield
+    for name in [name for name in sys.modules if name not in before and name.startswith("own_")]:
+        del sys.modules[name]
+
+
+def write(folder: Path, module: str = "own_game", text: str = GAME) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / f"{module}.py").write_text(text)
+    path = folder / "league.yaml"
+    path.write_text(f"league: own\nenvironment:\n  entry_point: {module}:make_env\n")
+    return path
+
+
+def test_the_environment_next_to_the_file_is_found_from_any_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = LeagueConfig.load(write(tmp_path / "project"))
+    monkeypatch.chdir(tmp_path)
+    build(config.environment).close()
+    assert config.folder == str(tmp_path / "project")
+
+
+def test_a_stored_configuration_finds_the_code_in_a_new_process(tmp_path: Path) -> None:
+    stored = LeagueConfig.load(write(tmp_path)).model_dump(mode="json", by_alias=True)
+    entry_points._folders.clear()
+    sys.path.remove(str(tmp_path))
+    build(LeagueConfig.from_mapping(stored).environment).close()
+
+
+def test_the_folder_is_searched_before_the_installed_packages(tmp_path: Path) -> None:
+    write(tmp_path / "installed", text="WHERE = 'installed'")
+    write(tmp_path / "project", text="WHERE = 'project'")
+    sys.path.insert(0, str(tmp_path / "installed"))
+    assert import_entry_point("key", "own_game:WHERE", str(tmp_path / "project")) == "project"
+
+
+def test_a_file_of_the_folder_does_not_replace_a_library(tmp_path: Path) -> None:
+    (tmp_path / "colorsys.py").write_text("raise RuntimeError('shadowed')")
+    config = LeagueConfig.load(write(tmp_path, text="import colorsys\n" + GAME))
+    sys.modules.pop("colorsys", None)
+    build(config.environment).close()
+
+
+def test_modules_of_the_folder_import_each_other(tmp_path: Path) -> None:
+    (tmp_path / "own_rules.py").write_text(GAME)
+    build(LeagueConfig.load(write(tmp_path, text="from own_rules import make_env")).environment).close()
+
+
+def test_a_folder_is_relative_to_the_file(tmp_path: Path) -> None:
+    write(tmp_path / "source")
+    path = tmp_path / "league.yaml"
+    path.write_text("league: own\nfolder: source\nenvironment: {entry_point: 'own_game:make_env'}\n")
+    build(LeagueConfig.load(path).environment).close()
+    path.write_text("league: own\nfolder: nowhere\nenvironment: {entry_point: 'own_game:make_env'}\n")
+    with pytest.raises(ConfigError, match=r"league\.yaml: folder: .*nowhere is not a directory"):
+        LeagueConfig.load(path)
+
+
+def test_two_leagues_with_modules_of_one_name_are_an_error(tmp_path: Path) -> None:
+    first, second = (LeagueConfig.load(write(tmp_path / name)) for name in ("a", "b"))
+    build(first.environment).close()
+    with pytest.raises(ConfigError, match="'own_game' is the name of several modules") as raised:
+        build(second.environment)
+    assert f"{tmp_path}/b/own_game.py and {tmp_path}/a/own_game.py" in str(raised.value)
+
+
+def test_the_code_of_two_leagues_with_modules_of_one_name_differs(tmp_path: Path) -> None:
+    write(tmp_path / "a")
+    write(tmp_path / "b", text=GAME + "\n# another rule\n")
+    codes = {environment_code("own_game:make_env", str(tmp_path / name)).source for name in ("a", "b")}
+    assert len(codes) == 2
+
+
+def test_the_folder_is_no_part_of_the_game(tmp_path: Path) -> None:
+    first, second = (LeagueConfig.load(write(tmp_path / name)) for name in ("a", "b"))
+    assert first.game_digest() == second.game_digest()
+    assert str(tmp_path) not in first.environment.model_dump_json()
+
+
+def test_an_import_error_names_line_and_searched_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = LeagueConfig.load(write(tmp_path / "project", text="\nimport own_missing\n"))
+    with pytest.raises(ConfigError) as raised:
+        build(config.environment)
+    message = str(raised.value)
+    assert "environment.entry_point: cannot import 'own_game': No module named 'own_missing'" in message
+    assert f"{tmp_path}/project/own_game.py, line 2" in message
+    assert f"searched: {tmp_path}/project" in message
+
+
+def test_an_exception_on_import_names_its_line(tmp_path: Path) -> None:
+    path = write(tmp_path, text="\n\n1 / 0\n")
+    with pytest.raises(ConfigError, match=r"ZeroDivisionError: division by zero \(.*own_game\.py, line 3\)"):
+        import_module("key", "own_game", str(path.parent))
+    assert "own_game" not in sys.modules
