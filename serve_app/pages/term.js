@@ -18,13 +18,12 @@ export function Term({ name, children }) {
   const root = useRef();
   useEffect(() => {
     if (!isOpen) return undefined;
-    const close = (event) => { if (event.key === "Escape" || (event.type === "pointerdown" && !root.current.contains(event.target))) setIsOpen(false); };
-    addEventListener("keydown", close);
+    const close = (event) => { if (!root.current.contains(event.target)) setIsOpen(false); };
     addEventListener("pointerdown", close);
-    return () => { removeEventListener("keydown", close); removeEventListener("pointerdown", close); };
+    return () => removeEventListener("pointerdown", close);
   }, [isOpen]);
   const text = children ?? name;
   if (!EXPLANATIONS[name]) return text;
-  return html`<span class="term" ref=${root}><button type="button" class="quiet" title=${EXPLANATIONS[name]} aria-expanded=${isOpen} aria-controls=${id}
+  return html`<span class="term" ref=${root} onKeyDown=${(event) => event.key === "Escape" && setIsOpen(false)}><button type="button" class="quiet" title=${EXPLANATIONS[name]} aria-expanded=${isOpen} aria-controls=${id}
       onClick=${() => setIsOpen(!isOpen)}>${text}</button><span id=${id} class="explanation" role="note" hidden=${!isOpen}>${EXPLANATIONS[name]}</span></span>`;
 }
