@@ -40,7 +40,7 @@ def direction_keys(names: Mapping[str, str]) -> dict[str, int]:
         directions = {DIRECTIONS[word] for word in words if word in DIRECTIONS}
         if len(directions) == 1:
             found[directions.pop()].append((len(words), int(action)))
-    keys = {}
+    keys: dict[str, int] = {}
     for direction, candidates in found.items():
         fewest, action = min(candidates)
         if [words for words, _ in candidates].count(fewest) == 1:
