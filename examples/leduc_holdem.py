@@ -15,6 +15,8 @@ ROUNDS, MOST_ACTIONS = 2, 4
 """Betting rounds, and the most actions in one."""
 STOCK_SIZE = 36
 OBSERVATION_SIZE = STOCK_SIZE + ROUNDS * MOST_ACTIONS * NUM_ACTIONS
+CARD_BACK = "Card"
+"""Name of RLCard's picture of the back of a card."""
 FIRST_PUBLIC_CARD = 3
 """Index of the public card in PettingZoo's observation: three elements, zeros in the first round."""
 
@@ -45,6 +47,16 @@ class LeducWithHistory(raw_env):
         """Return the information state of an agent, and its action mask."""
         seen = super().observe(agent)
         return seen | {"observation": np.concatenate([seen["observation"], self._history.ravel()])}
+
+    def render_for(self, agent: str) -> NDArray:
+        """Render the table as a player sees it, with the opponent's card face down: (height, width, 3) uint8."""
+        game, own = self.env.game, self._name_to_int(agent)
+        state_of = game.get_state
+        game.get_state = lambda player: state_of(player) | ({} if player == own else {"hand": CARD_BACK})
+        try:
+            return np.array(self.render())
+        finally:
+            del game.get_state
 
     def step(self, action: int | None) -> None:
         if action is not None:

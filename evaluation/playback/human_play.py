@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from evaluation.matches.policy_calls import PolicyFault, action_fault
 from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.matches.worker import baselines
+from evaluation.playback.action_names import action_names, direction_keys
+from evaluation.playback.environment_hooks import Board, Declarations, EnvironmentHooks
 from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of
 from evaluation.playback.single_game import GameStep, Move, play_game, policy_output
 from evaluation.playback.video import data_uri
@@ -37,20 +39,28 @@ MOST_OPPONENTS = 50
 
 @dataclass(frozen=True, slots=True)
 class PlayableAgent(Document):
-    """An agent that a person can control: its actions are the `actions` integers from `start`."""
+    """An agent that a person can control: its actions are the `actions` integers from `start`.
+
+    names: action, as text → name; empty without names. keys: `KeyboardEvent.key` → action. color: in the pictures, a
+    colour name or #rrggbb, if the environment declares it.
+    """
 
     agent: str
     side: str
     actions: int
     start: int
+    names: dict[str, str]
+    keys: dict[str, int]
+    color: str | None
 
 
 @dataclass(frozen=True, slots=True)
 class Playability(Document):
     """What a person can play in a league.
 
-    why: reason if nothing can be played, else None. draws: whether the environment renders images.
-    opponents: the newest versions that can play, newest first, then scripts.
+    why: reason if nothing can be played, else None. opponents: the newest versions that can play, newest first, then
+    scripts. draws: whether the environment renders images. board: rows of actions over the picture, if the environment
+    declares them. reveals: whether the pictures show what the environment hides from the agent.
     """
 
     league: str
@@ -59,17 +69,14 @@ class Playability(Document):
     agents: tuple[PlayableAgent, ...]
     opponents: tuple[str, ...]
     draws: bool
+    board: Board | None
+    reveals: bool
 
 
-def playability(config: LeagueConfig, registry: Registry, interface: Interface, draws: bool) -> Playability:
-    """What can be played. draws: whether the environment renders images. Raises UnknownLeague."""
+def playability(config: LeagueConfig, registry: Registry, interface: Interface, hooks: EnvironmentHooks) -> Playability:
+    """What can be played. Raises UnknownLeague."""
     league = config.league
-    side_of = {agent: side for side, agents in interface.sides.items() for agent in agents}
-    playable_agents = tuple(
-        PlayableAgent(agent, side_of[agent], spaces.action.n, spaces.action.start)
-        for agent, spaces in interface.agents.items()
-        if isinstance(spaces.action, Discrete)
-    )
+    playable_agents = _playable_agents(config, interface, hooks.declared)
     kinds = sorted({type(spaces.action).__name__ for spaces in interface.agents.values()})
     why = None if playable_agents else f"human play needs Discrete actions, but its agents have {' and '.join(kinds)}"
     versions = [version.ref for version in reversed(eligible(registry, league))]
@@ -79,8 +86,25 @@ def playability(config: LeagueConfig, registry: Registry, interface: Interface, 
         why=why,
         agents=playable_agents,
         opponents=(*versions[:MOST_OPPONENTS], *baselines(config, interface)),
-        draws=draws,
+        draws=hooks.draws,
+        board=hooks.declared.board,
+        reveals=hooks.draws and not hooks.has_views and interface.hidden_information and len(interface.agents) > 1,
     )
+
+
+def _playable_agents(config: LeagueConfig, interface: Interface, declared: Declarations) -> tuple[PlayableAgent, ...]:
+    side_of = {agent: side for side, agents in interface.sides.items() for agent in agents}
+    names = action_names(config.play, interface)
+    agents = []
+    for agent, spaces in interface.agents.items():
+        if not isinstance(space := spaces.action, Discrete):
+            continue
+        own = names.get(agent, {})
+        keys = direction_keys(own) | declared.action_keys
+        fitting = {key: action for key, action in keys.items() if space.start <= action < space.start + space.n}
+        color = declared.agent_colors.get(agent)
+        agents.append(PlayableAgent(agent, side_of[agent], space.n, space.start, own, fitting, color))
+    return tuple(agents)
 
 
 PERSON = "person"
@@ -119,7 +143,7 @@ def human_play(
     interface: Interface,
     players: Mapping[str, Policy],
     environment: BatchedEnvironment,
-    draws: bool,
+    hooks: EnvironmentHooks,
 ) -> GameState:
     """Play the game in `environment`, which has `num_envs` 1.
 
@@ -129,7 +153,7 @@ def human_play(
         interface: Interface of the league.
         players: agent → the opponent's policy, for all agents including the person's, for action probabilities.
         environment: The environment. It must not be used again after GameCrashed.
-        draws: Whether the environment renders images.
+        hooks: What the environment renders. If it has views of agents, the picture shows what the person's agent sees.
 
     Raises:
         InvalidInput: Unknown agent, or actions after the end of the game.
@@ -140,7 +164,7 @@ def human_play(
     space = space_of(interface, request.agent)
     person = _Person(request.actions, space, players[request.agent] if request.chances else None)
     steps, last, stop, picture = _play(
-        environment, players, person, request, interface, draws, action_selection(config, interface)
+        environment, players, person, request, interface, hooks, action_selection(config, interface)
     )
     awaiting = stop if isinstance(stop, _AwaitingPerson) else None
     forfeit = stop if isinstance(stop, _Forfeited) else None
@@ -171,7 +195,7 @@ def _play(
     person: _Person,
     request: HumanPlayRequest,
     interface: Interface,
-    draws: bool,
+    hooks: EnvironmentHooks,
     actions: ActionSelection,
 ) -> tuple[list[RecordedStep], GameStep, _Stop | None, str | None]:
     """The steps of the game, the last one, what stopped it before its end, and the last picture."""
@@ -190,7 +214,8 @@ def _play(
                 steps.append(step_of(last, controllers, interface))
         except _Stop as stopping:
             stop = stopping
-        picture = data_uri(environment.render(0), LARGEST) if draws else None
+        view = request.agent if hooks.has_views else None
+        picture = data_uri(environment.render(0, view), LARGEST) if hooks.draws else None
     except IllegalAction:
         raise
     except Exception as error:

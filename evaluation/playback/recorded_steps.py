@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from evaluation.playback.action_names import ActionNamesByAgent, action_names
 from evaluation.playback.captions import chances
 from evaluation.playback.replay import GameSource
 from evaluation.playback.single_game import GameStep, Move
@@ -67,7 +68,8 @@ def likely(move: Move, space: Space) -> Chances:
 
 @dataclass(frozen=True, slots=True)
 class RecordedGame(Document):
-    """players: agent → who controlled it. length: steps of the whole game. steps: the requested ones.
+    """players: agent → who controlled it. action_names: agent → action, as text → its name. length: steps of the whole
+    game. steps: the requested ones.
 
     returns: agent → return. forfeits: agent, reference and reason. fault: why the game cannot be replayed; `steps` is
     empty then.
@@ -76,6 +78,7 @@ class RecordedGame(Document):
     match: str
     game: int
     players: dict[str, str]
+    action_names: ActionNamesByAgent
     length: int
     every: int
     steps: tuple[RecordedStep, ...]
@@ -107,6 +110,7 @@ def recorded_steps(
         match=match.id,
         game=request.game,
         players=dict(source.controllers),
+        action_names=action_names(source.config.play, source.interface),
         length=0 if last is None else last.step,
         every=request.every,
         steps=tuple(steps),

@@ -24,10 +24,11 @@ from typing import BinaryIO
 
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.matches.worker import MatchWorker
+from evaluation.playback.environment_hooks import EnvironmentHooks, environment_hooks
 from evaluation.playback.human_play import human_play, playability
 from evaluation.playback.recorded_steps import recorded_steps
 from evaluation.playback.replay import recorded_game
-from evaluation.playback.video import render_modes, write_video
+from evaluation.playback.video import write_video
 from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
@@ -54,14 +55,14 @@ class GameWorker:
         self._league, self._registry = league, registry
         self._matches: MatchWorker | None = None
         self._environment: BatchedEnvironment | None = None
-        self._renders = False
+        self._hooks: EnvironmentHooks | None = None
 
     def respond(self, operation: GameOperation) -> GameResponse:
         """Perform an operation. Raises LeagueError. An environment in an undefined state is discarded."""
         matches = self._ready()
         match operation:
             case PlayabilityRequest():
-                return _json(playability(matches.config, self._registry, matches.interface, self._renders))
+                return _json(playability(matches.config, self._registry, matches.interface, self._shown))
             case VideoRequest():
                 return GameResponse("image/gif", self._video(operation))
             case RecordingRequest():
@@ -80,8 +81,8 @@ class GameWorker:
             if self._matches is None or self._matches.config != config:
                 self._matches, self._environment = MatchWorker(config, self._registry), None
             if self._environment is None:
-                self._renders = "rgb_array" in render_modes(config.environment)
-                render_mode = "rgb_array" if self._renders else None
+                self._hooks = environment_hooks(config.environment)
+                render_mode = "rgb_array" if self._hooks.draws else None
                 self._environment = stock_stepping(config.environment, 1, render_mode=render_mode)
         except Exception as error:  # never a fault of the caller
             raise GameCrashed(f"the environment of {self._league} cannot be created: {one_line(error)}") from error
@@ -92,10 +93,15 @@ class GameWorker:
         assert self._environment is not None, "_ready creates one"
         return self._environment
 
+    @property
+    def _shown(self) -> EnvironmentHooks:
+        assert self._hooks is not None, "_ready reads them"
+        return self._hooks
+
     def _recording(self, request: RecordingRequest) -> Document:
         source = recorded_game(request.match, request.game, self._registry, chances=True)
         match = Ledger(self._registry).match(request.match)
-        recording = recorded_steps(source, match, request, self._open, self._renders)
+        recording = recorded_steps(source, match, request, self._open, self._shown.draws)
         if recording.fault is not None:
             self.discard_environment()
         return recording
@@ -115,7 +121,7 @@ class GameWorker:
     def _human_play(self, request: HumanPlayRequest, matches: MatchWorker) -> Document:
         policies = {agent: policy for agent, (_, policy) in matches.contestant(request.opponent).items()}
         try:
-            return human_play(request, matches.config, matches.interface, policies, self._open, self._renders)
+            return human_play(request, matches.config, matches.interface, policies, self._open, self._shown)
         except GameCrashed:
             self.discard_environment()
             raise

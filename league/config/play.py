@@ -2,9 +2,25 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from league.config.base import JSON, Part
+
+LONGEST_NAME = 40
+
+
+def _check_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    if not names:
+        raise ValueError("expected at least one name")
+    for name in names:
+        if not name.strip() or len(name) > LONGEST_NAME:
+            raise ValueError(f"{name[:LONGEST_NAME]!r}: expected 1 to {LONGEST_NAME} characters")
+    if doubled := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise ValueError(f"{doubled[0]!r} is the name of several actions")
+    return names
+
+
+ActionNames = Annotated[tuple[str, ...], AfterValidator(_check_names)]
 
 
 class PlayConfig(Part):
@@ -30,9 +46,18 @@ class PlayConfig(Part):
     game_seconds: float = Field(default=600.0, gt=0, allow_inf_nan=False)
     """Seconds of environment time (resets and steps of this game alone) after which a game counts as hung."""
 
+    action_names: ActionNames | dict[str, ActionNames] | None = None
+    """Names of Discrete actions for people, in the order of the actions: of all policies, or policy id → names. They
+    do not influence results."""
+
+    def names_for(self, policy: str) -> tuple[str, ...]:
+        """Return the names of a policy's actions; empty without names."""
+        names = self.action_names or ()
+        return names.get(policy, ()) if isinstance(names, dict) else names
+
     def rules(self) -> JSON:
-        """Return the settings that decide results: all but those of speed and of hung processes.
+        """Return the settings that decide results: all but those of speed, of hung processes and for people.
 
         `actions` is not part of the game, because its default depends on the interface; see `league.conditions`.
         """
-        return self.model_dump(mode="json", exclude={"num_envs", "game_seconds", "actions"})
+        return self.model_dump(mode="json", exclude={"num_envs", "game_seconds", "actions", "action_names"})

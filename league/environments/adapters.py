@@ -33,8 +33,8 @@ class EnvAdapter(Protocol):
     def state(self) -> Any:
         """Return the current global state; None if the environment has none."""
 
-    def render(self) -> Any:
-        """Return the result of the environment's `render`."""
+    def render(self, agent: str | None) -> Any:
+        """Return the result of the environment's `render`, or of its `render_for` for an agent."""
 
     def close(self) -> None:
         """Close the environment."""
@@ -66,8 +66,10 @@ class _Adapter:
         self._agents = tuple(env.possible_agents)
         self._index = {agent: index for index, agent in enumerate(self._agents)}
 
-    def render(self) -> Any:
-        return self._env.render()
+    def render(self, agent: str | None) -> Any:
+        if agent is None:
+            return self._env.render()
+        return getattr(self._env, "unwrapped", self._env).render_for(agent)
 
     def close(self) -> None:
         self._env.close()

@@ -20,12 +20,14 @@ from pettingzoo.utils.wrappers import (
 from league.conditions import hides_information
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
+from league.config.play import PlayConfig
 from league.entry_points import import_entry_point, import_module
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
+from league.spaces import Discrete
 from league.spaces.conversion import from_gymnasium
 
 
@@ -164,6 +166,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
     sides = config.sides or {agent: (agent,) for agent in names}
     side_of = divide("sides", sides, names)
     _check_equal_spaces(agents, policies)
+    _check_action_names(config.play, agents, policies)
     return Interface(
         agents=agents,
         policies=policies,
@@ -291,3 +294,20 @@ def _check_equal_spaces(agents: dict[str, AgentInterface], policies: dict[str, s
                 f"policies.{policy}: {other} and {agent} have different spaces: assign them separate policies,"
                 " or pad the spaces with SuperSuit"
             )
+
+
+def _check_action_names(play: PlayConfig, agents: dict[str, AgentInterface], policies: dict[str, str]) -> None:
+    """Names given per policy must fit its actions; names given for all policies must fit all Discrete ones."""
+    actions = {policy: agents[agent].action for agent, policy in policies.items()}
+    for policy in play.action_names if isinstance(play.action_names, dict) else ():
+        if not isinstance(actions.get(policy), Discrete):
+            known = ", ".join(name for name, space in actions.items() if isinstance(space, Discrete))
+            raise ConfigError(
+                f"play.action_names.{policy}: expected a policy with Discrete actions ({known or 'there is none'})"
+            )
+    if play.action_names and not any(isinstance(space, Discrete) for space in actions.values()):
+        raise ConfigError("play.action_names: no policy has Discrete actions: remove the names")
+    for policy, space in actions.items():
+        names = play.names_for(policy)
+        if isinstance(space, Discrete) and names and len(names) != space.n:
+            raise ConfigError(f"play.action_names: policy {policy} has {space.n} actions, but {len(names)} names")

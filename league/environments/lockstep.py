@@ -139,8 +139,8 @@ class Lockstep:
             seconds[busy] += perf_counter() - self._since
         return seconds
 
-    def render(self, env: int) -> NDArray:
-        picture = self._envs[env].render()
+    def render(self, env: int, agent: str | None = None) -> NDArray:
+        picture = self._envs[env].render(agent)
         if picture is None:
             raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
         return np.asarray(picture, dtype=np.uint8)

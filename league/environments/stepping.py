@@ -190,8 +190,12 @@ class BatchedEnvironment(Protocol):
         call in progress.
         """
 
-    def render(self, env: int) -> NDArray:
-        """Render an environment, (height, width, 3) uint8. Raises EnvironmentMismatch if it cannot be rendered."""
+    def render(self, env: int, agent: str | None = None) -> NDArray:
+        """Render an environment, (height, width, 3) uint8.
+
+        agent: render what this agent sees, by the environment's `render_for`; by default everything.
+        Raises EnvironmentMismatch if it cannot be rendered.
+        """
 
     def close(self) -> None:
         """Close the environments."""

@@ -106,9 +106,9 @@ class VectorStepping:
         seconds[busy] += perf_counter() - self._since
         return seconds
 
-    def render(self, env: int) -> NDArray:
+    def render(self, env: int, agent: str | None = None) -> NDArray:
         with closing(self._episodes.in_stock(self._config, env, render_mode="rgb_array")) as stock:
-            picture = stock.render()
+            picture = stock.render(agent)
         if picture is None:
             raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
         return np.asarray(picture, dtype=np.uint8)

@@ -65,7 +65,7 @@ export function Ref({ value, champion }) {
   return html`<span class="ref">${value}</span>${isChampion && html` <${Badge} tone="accent" sign="★">champion<//>`}`;
 }
 
-/** A table that scrolls horizontally if it is too wide. `head`: [text, class, is visually hidden]. */
+/** A table that scrolls horizontally if it is too wide. `head`: [text or component, class, is visually hidden]. */
 export function Table({ caption, head, children, showCaption = false, cls = "" }) {
   return html`<div class="wide" tabindex="0" role="region" aria-label=${caption}>
     <table class=${cls}>

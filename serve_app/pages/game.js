@@ -47,6 +47,7 @@ const byNumber = (steps) => Object.fromEntries(steps.map((step) => [step.step, s
 function Player({ recording, loadFrom }) {
   const { fragment } = useAddress();
   const last = recording.length;
+  const names = recording.action_names;
   const [at, setAt] = useState(() => Math.min(last, Math.max(0, Number(fragment) || 0)));
   const [isPlaying, setIsPlaying] = useState(false);
   const [speed, setSpeed] = useState(1);
@@ -68,7 +69,7 @@ function Player({ recording, loadFrom }) {
   });
   return html`<div class="player">
     <div class="screen">
-      <${Picture} src=${step?.picture} alt=${describe(step)} />
+      <${Picture} src=${step?.picture} alt=${describe(step, names)} />
       <div class="controls" role="group" aria-label="Playback">
         <button type="button" onClick=${() => move(0)} aria-label="First step"><${Icon} path="M2 2h2v10H2zM12 2v10L5 7z" /></button>
         <button type="button" onClick=${() => move(at - 1)} aria-label="Previous step"><${Icon} path="M11 2v10L3 7z" /></button>
@@ -78,12 +79,12 @@ function Player({ recording, loadFrom }) {
         <label class="inline">Speed <select value=${speed} onChange=${(event) => setSpeed(Number(event.target.value))}>${SPEEDS.map((each) => html`<option value=${each}>${each} ×</option>`)}</select></label>
       </div>
       <label class="seek"><span class="visually-hidden">Step</span>
-        <input type="range" min="0" max=${last} value=${at} aria-valuetext="step ${at}: ${describe(step)}" onInput=${(event) => move(Number(event.target.value))} />
+        <input type="range" min="0" max=${last} value=${at} aria-valuetext="step ${at}: ${describe(step, names)}" onInput=${(event) => move(Number(event.target.value))} />
         <output>${at} of ${last}</output></label>
     </div>
     <div class="game-info" aria-live=${isPlaying ? "off" : "polite"}>
       <h3>${step ? (at === 0 ? "Start" : `Step ${at}`) : "Loading …"}${at === last ? " · end" : ""}</h3>
-      <${Moves} step=${step} />
+      <${Moves} step=${step} names=${names} />
       <${Players} recording=${recording} isOver=${at === last} />
       <p class="muted small keys"><kbd>Space</kbd> play or pause, <kbd>←</kbd> <kbd>→</kbd> previous or next step, <kbd>Home</kbd> <kbd>End</kbd> first or last step, <kbd>+</kbd> <kbd>−</kbd> speed</p>
     </div>

@@ -4,6 +4,7 @@ import { html } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
 import { useChangeToken, useOffsetList } from "./data.js";
 import { Await, EmptyState, leaguePath, Ref, ShowMore, Table } from "./components.js";
+import { Term } from "./term.js";
 import { useAddress } from "./router.js";
 import { count, interval, number, percent, plural, signed } from "./format.js";
 
@@ -32,7 +33,7 @@ function Rows({ league, rows, champion, computedAt }) {
   }
   const hasReturn = rows.some((row) => row.mean_return != null);
   const range = ratingRange(rows);
-  const head = [["Rank", "number"], ["Contestant"], ["Rating", "number"], ["95 % interval"], ["Rating chart", "interval-cell", true],
+  const head = [["Rank", "number"], ["Contestant"], [html`<${Term} name="rating">Rating<//>`, "number"], ["95 % interval"], ["Rating chart", "interval-cell", true],
     ["Score", "number"], hasReturn && ["Mean return", "number"], ["Games", "number"]].filter(Boolean);
   return html`<${Table} caption="Leaderboard" head=${head} cls="full">
     ${rows.map((row, index) => html`<tr key=${row.ref} class=${row.ref === `${league}@${champion}` ? "champion-row" : ""}>

@@ -2,12 +2,11 @@
 
 import { html, useEffect, useState } from "./vendor/preact-htm.js";
 import { apiPath, request } from "./api.js";
-import { boardOf } from "./boards.js";
 import { useData } from "./data.js";
 import { useKeys } from "./keyboard.js";
 import { Await, Badge, EmptyState, ErrorNotice, sentence } from "./components.js";
 import { navigate, useAddress } from "./router.js";
-import { describe, Moves, Picture, Probabilities } from "./step.js";
+import { actionName, describe, Moves, Picture, Probabilities } from "./step.js";
 import { number } from "./format.js";
 
 const SEED_LIMIT = 2 ** 31;
@@ -18,7 +17,7 @@ export function Play({ league, about }) {
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Play</h2></div>
     <${Await} result=${playable} message="Starting the evaluation service …">${playable.data && (playable.data.playable
-      ? game ? html`<${Game} key=${`${game.agent} ${game.seed}`} league=${league} about=${about} seats=${playable.data.agents} game=${game} />`
+      ? game ? html`<${Game} key=${`${game.agent} ${game.seed}`} league=${league} playable=${playable.data} game=${game} />`
         : html`<${NewGame} league=${league} about=${about} playable=${playable.data} />`
       : html`<${EmptyState}>You cannot play in this league: ${sentence(playable.data.why)}<//>`)}<//>
   </section>`;
@@ -59,7 +58,7 @@ function NewGame({ league, about, playable }) {
   </form>`;
 }
 
-function Game({ league, about, seats, game }) {
+function Game({ league, playable, game }) {
   const [showProbabilities, setShowProbabilities] = useState(false);
   const [state, setState] = useState(null);
   const [error, setError] = useState(null);
@@ -84,19 +83,22 @@ function Game({ league, about, seats, game }) {
   };
   const restart = () => navigate(fragmentOf({ ...game, seed: randomSeed(), actions: [] }));
   const undo = () => navigate(fragmentOf({ ...game, actions: actions.slice(0, -1) }), { replace: true });
-  const seat = seats.find((each) => each.agent === agent);
+  const seat = playable.agents.find((each) => each.agent === agent);
+  const names = Object.fromEntries(playable.agents.map((each) => [each.agent, each.names]));
   return html`<div class="player">
     <div class="screen">
       <p class="turn" role="status">${statusOf(state, busy, error, agent)}</p>
-      ${state && html`<${Board} state=${state} about=${about} act=${act} isTurn=${isTurn} />`}
-      ${state && seat && !state.over && html`<${Actions} seat=${seat} legal=${state.legal} act=${act} isTurn=${isTurn} />`}
+      ${state && html`<${Board} state=${state} board=${playable.board} names=${names} act=${act} isTurn=${isTurn} />`}
+      ${state && seat && !state.over && html`<${Actions} seat=${seat} hasBoard=${!!(playable.board && state.picture)} legal=${state.legal} act=${act} isTurn=${isTurn} />`}
+      ${playable.reveals && html`<p class="notice">The picture shows everything, also what is hidden from ${agent}: this environment does not render the view of one agent.</p>`}
       ${error && html`<${ErrorNotice} error=${error} retry=${() => setAttempt(attempt + 1)} />`}
     </div>
     <div class="game-info">
-      <p>You are <strong>${agent}</strong> against <strong class="ref">${opponent}</strong> <${Badge}>seed ${seed}<//></p>
+      <p>You are <${AgentColor} color=${seat?.color} /><strong>${agent}</strong> against <strong class="ref">${opponent}</strong> <${Badge}>seed ${seed}<//></p>
+      <${OtherAgents} agents=${playable.agents} own=${agent} />
       <label class="option"><input type="checkbox" checked=${showProbabilities} onChange=${(event) => setShowProbabilities(event.target.checked)} /><span>Show the policy's probabilities</span></label>
-      ${showProbabilities && state?.chances?.length > 0 && !state.over && html`<h3>Policy's probabilities in your position</h3><${Probabilities} values=${state.chances} />`}
-      ${state && html`<${MoveLog} steps=${state.steps} showProbabilities=${showProbabilities} />`}
+      ${showProbabilities && state?.chances?.length > 0 && !state.over && html`<h3>Policy's probabilities in your position</h3><${Probabilities} values=${state.chances} names=${names[agent]} />`}
+      ${state && html`<${MoveLog} steps=${state.steps} names=${names} showProbabilities=${showProbabilities} />`}
       <div class="buttons">
         <button type="button" class=${state?.over ? "primary" : ""} onClick=${restart}>Play again</button>
         <button type="button" onClick=${undo} disabled=${!actions.length || busy}>Undo move</button>
@@ -120,27 +122,53 @@ function outcomeOf({ score }) {
   return score > 0.5 ? "You won." : score < 0.5 ? "You lost." : "Draw.";
 }
 
-function Board({ state, about, act, isTurn }) {
-  const board = boardOf(about.environment);
-  const last = state.steps.at(-1);
-  return html`<${Picture} src=${state.picture} alt="Game after: ${describe(last)}">
-    ${board && state.picture && !state.over && html`<div class="cells x${board.columns}" aria-hidden="true">${board.cells.map((action) => html`
-      <button type="button" tabindex="-1" key=${action} disabled=${!isTurn || !state.legal.includes(action)} onClick=${() => act(action)} data-action=${action}></button>`)}</div>`}
+/** The picture; if the environment declares a board, its cells can be clicked. */
+function Board({ state, board, names, act, isTurn }) {
+  return html`<${Picture} src=${state.picture} alt="Game after: ${describe(state.steps.at(-1), names)}">
+    ${board && state.picture && !state.over && html`<div class="cells" style=${{ "--columns": board[0].length }} aria-hidden="true">${board.flat().map((action) => action == null ? html`<span></span>` : html`
+      <button type="button" tabindex="-1" disabled=${!isTurn || !state.legal.includes(action)} onClick=${() => act(action)} data-action=${action}></button>`)}</div>`}
   <//>`;
 }
 
-/** One button per action; digit keys select the first ten. Illegal actions are disabled. */
-function Actions({ seat, legal, act, isTurn }) {
-  const all = Array.from({ length: seat.actions }, (_, index) => seat.start + index);
-  useKeys((key) => /^\d$/.test(key) && act(Number(key)));
-  return html`<div class="actions-grid x${all.length <= 10 ? all.length : "many"}" role="group" aria-label="Your actions">${all.map((action) => html`
-    <button type="button" key=${action} aria-disabled=${!isTurn || !legal.includes(action)} class=${legal.includes(action) ? "" : "illegal"} onClick=${() => act(action)}>
-      ${action}</button>`)}</div>
-    ${all.length <= 10 && html`<p class="muted small keys">Select an action, press its key (<kbd>${all[0]}</kbd> to <kbd>${all.at(-1)}</kbd>), or click the board.</p>`}`;
+/** A sample of an agent's color in the pictures. */
+function AgentColor({ color }) {
+  return color && html`<svg class="agent-color" viewBox="0 0 12 12" width="12" height="12" role="img" aria-label=${color}><circle cx="6" cy="6" r="5" fill=${color} /></svg> `;
 }
 
-function MoveLog({ steps, showProbabilities }) {
+function OtherAgents({ agents, own }) {
+  const colored = agents.filter((each) => each.color && each.agent !== own);
+  return colored.length > 0 && html`<p class="muted small">${colored.map((each) => html`<span key=${each.agent}><${AgentColor} color=${each.color} />${each.agent} </span>`)}</p>`;
+}
+
+/** One button per action; digit keys select the first ten, and other keys as the server lists them. Illegal actions are disabled. */
+function Actions({ seat, hasBoard, legal, act, isTurn }) {
+  const all = Array.from({ length: seat.actions }, (_, index) => seat.start + index);
+  const isNamed = Object.keys(seat.names).length > 0;
+  useKeys((key) => {
+    const action = seat.keys[key] ?? seat.keys[key.toLowerCase()] ?? (/^\d$/.test(key) ? Number(key) : null);
+    if (action != null) act(action);
+    return action != null; // the page must not scroll while it is not the person's turn
+  });
+  return html`<div class="actions-grid ${isNamed ? "named" : `x${all.length <= 10 ? all.length : "many"}`}" role="group" aria-label="Your actions">${all.map((action) => html`
+    <button type="button" key=${action} aria-disabled=${!isTurn || !legal.includes(action)} class=${legal.includes(action) ? "" : "illegal"} onClick=${() => act(action)}>
+      ${actionName(seat.names, action)}</button>`)}</div>
+    <p class="muted small keys">${ways(seat, all, hasBoard)}</p>`;
+}
+
+/** How actions can be selected, as a sentence. */
+function ways(seat, all, hasBoard) {
+  const keys = [...new Set([...Object.keys(seat.keys), ...(all.length <= 10 ? all.filter((action) => action < 10 && !isNamedKey(seat, action)) : [])])].map((key) => keyName(String(key)));
+  const pressed = keys.length > 0 && html`press a key (${keys.map((key) => html`<kbd key=${key}>${key}</kbd> `)})`;
+  return html`Select an action${pressed && html`, or ${pressed}`}${hasBoard && ", or click the board"}.`;
+}
+
+/** Whether an action has a key of its own, so that its digit need not be listed. */
+const isNamedKey = (seat, action) => Object.values(seat.keys).includes(action);
+
+const keyName = (key) => ({ ArrowUp: "↑", ArrowDown: "↓", ArrowLeft: "←", ArrowRight: "→", " ": "Space" })[key] ?? (key.length === 1 ? key.toUpperCase() : key);
+
+function MoveLog({ steps, names, showProbabilities }) {
   const moves = steps.filter((step) => step.moves.length);
   return html`<details open class="move-log"><summary>Moves</summary><ol reversed class="tall" tabindex="0">${[...moves].reverse().map((step) => html`<li key=${step.step} value=${step.step}>
-    ${showProbabilities && step.moves.some((move) => move.chances?.length) ? html`<${Moves} step=${step} />` : describe(step)}</li>`)}</ol></details>`;
+    ${showProbabilities && step.moves.some((move) => move.chances?.length) ? html`<${Moves} step=${step} names=${names} />` : describe(step, names)}</li>`)}</ol></details>`;
 }

@@ -12,24 +12,27 @@ export function Picture({ src, alt, children }) {
     : html`<p class="blank muted">This environment does not render pictures.</p>`}${children}</div>`;
 }
 
-/** The moves of a step as text. */
-export function describe(step) {
+/** The name of an action. `names`: action → name, of one agent; without names, the action itself. */
+export const actionName = (names, action) => names?.[action] ?? String(action);
+
+/** The moves of a step as text. `names`: agent → action → name. */
+export function describe(step, names) {
   if (!step) return "";
   if (!step.moves.length) return step.step === 0 ? "Start of the game." : "No moves.";
-  return step.moves.map((move) => `${move.agent} plays ${move.action}`).join("; ") + (step.opening ? " (random opening)" : "");
+  return step.moves.map((move) => `${move.agent} plays ${actionName(names?.[move.agent], move.action)}`).join("; ") + (step.opening ? " (random opening)" : "");
 }
 
 /** The moves of a step with their probabilities. */
-export function Moves({ step }) {
-  if (!step?.moves.length) return html`<p class="muted">${describe(step)}</p>`;
+export function Moves({ step, names }) {
+  if (!step?.moves.length) return html`<p class="muted">${describe(step, names)}</p>`;
   return html`<ul class="moves">${step.moves.map((move) => html`<li key=${move.agent}>
-    <p><strong>${move.agent}</strong> <span class="muted ref">${move.ref === PERSON ? "you" : shortRef(move.ref)}</span> plays <strong>${String(move.action)}</strong>${step.opening && html`<span class="muted"> · random opening</span>`}</p>
-    ${move.chances?.length > 0 && html`<${Probabilities} values=${move.chances} taken=${move.action} />`}</li>`)}</ul>`;
+    <p><strong>${move.agent}</strong> <span class="muted ref">${move.ref === PERSON ? "you" : shortRef(move.ref)}</span> plays <strong>${actionName(names?.[move.agent], move.action)}</strong>${step.opening && html`<span class="muted"> · random opening</span>`}</p>
+    ${move.chances?.length > 0 && html`<${Probabilities} values=${move.chances} taken=${move.action} names=${names?.[move.agent]} />`}</li>`)}</ul>`;
 }
 
 /** Probabilities of actions, as bars with numbers. `values`: [action, probability] pairs. */
-export function Probabilities({ values, taken }) {
-  return html`<ul class="probabilities" aria-label="Probabilities">${values.map(([action, probability]) => html`
-    <li class=${String(action) === String(taken) ? "taken" : ""}><span class="action">${String(action)}</span>
+export function Probabilities({ values, taken, names }) {
+  return html`<ul class="probabilities ${names && Object.keys(names).length ? "named" : ""}" aria-label="Probabilities">${values.map(([action, probability]) => html`
+    <li class=${String(action) === String(taken) ? "taken" : ""}><span class="action">${actionName(names, action)}</span>
       <progress max="1" value=${probability} aria-hidden="true"></progress><span class="value">${percent(probability, probability < 0.1 ? 1 : 0)}</span></li>`)}</ul>`;
 }

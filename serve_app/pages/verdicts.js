@@ -5,11 +5,12 @@ import { apiPath, query } from "./api.js";
 import { Chart, DataTable } from "./chart.js";
 import { useChangeToken, useData, useList } from "./data.js";
 import { Await, EmptyState, leaguePath, Outcome, Properties, ShowMore, Table, Time, useTitle } from "./components.js";
+import { Term } from "./term.js";
 import { count, interval, number, percent, shortRef, signed } from "./format.js";
 
 export function Verdicts({ league }) {
   const verdicts = useList(apiPath(league, "verdicts"), "verdicts", useChangeToken("verdicts", "computed_at"));
-  const head = [["Candidate"], ["Opponent"], ["Outcome"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["Decided"]];
+  const head = [["Candidate"], ["Opponent"], ["Outcome"], ["Games", "number"], [html`<${Term} name="LLR" />`, "number"], ["Elo", "number"], ["Decided"]];
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Verdicts</h2></div>
     <p class="muted">The gate promotes a new version if statistical tests show that it is stronger. Select a verdict to see its evidence.</p>
@@ -60,7 +61,7 @@ function Evidence({ verdict }) {
   const lines = [{ name, values: [0, ...pairs.map(([, llr]) => llr)] }];
   const [low, high] = verdict.bounds;
   const label = `${name} after each of ${count(verdict.blocks)} blocks. Final value: ${number(verdict.llr)}. The candidate is promoted at ${number(high)} and rejected at ${number(low)}.`;
-  return html`<h3>Evidence</h3>
+  return html`<h3>Evidence: <${Term} name=${name} /></h3>
     <${Chart} label=${label} x=${x} lines=${lines} xName="blocks" yName=${name} format=${(value) => number(value)}
       thresholds=${[{ name: `promote at ${signed(high, 2)}`, value: high, tone: "good" }, { name: `reject at ${signed(low, 2)}`, value: low, tone: "bad" }]} />
     <${DataTable} x=${x} lines=${lines} xName="blocks" caption="${name} after each block" format=${(value) => number(value)} />`;
@@ -72,7 +73,7 @@ function Statistics({ league, verdict }) {
   return html`<${Properties} items=${[
       ["Games", html`<a href=${query(leaguePath(league, "matches"), { first: verdict.candidate, second: verdict.opponent })}>${count(verdict.games)}</a>`],
       verdict.unique_games != null && ["Unique games", count(verdict.unique_games)],
-      ["Blocks", count(verdict.blocks)],
+      [html`<${Term} name="block">Blocks<//>`, count(verdict.blocks)],
       ["Score", percent(verdict.score)],
       verdict.elo != null && ["Elo difference", html`${signed(verdict.elo)} <small>${interval(verdict.interval)}</small>`],
       difference && ["Difference in mean return", html`${signed(difference.mean, 2)} <small>${number(difference.low)} to ${number(difference.high)}</small>`],
@@ -95,7 +96,7 @@ function Counts({ counts }) {
 
 function Anchors({ anchors }) {
   return html`<h3>Non-inferiority tests</h3>
-    <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], ["LLR", "number"], ["Elo", "number"], ["95 % interval"]]}>
+    <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], [html`<${Term} name="LLR" />`, "number"], ["Elo", "number"], ["95 % interval"]]}>
       ${anchors.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td>${each.outcome}</td><td class="number">${each.margin}</td>
         <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${signed(each.elo)}</td><td class="nowrap">${interval(each.interval)}</td></tr>`)}
     <//>`;

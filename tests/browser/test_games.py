@@ -8,7 +8,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect
 
 from tests.support.clients.browsers import Served, Tab
-from tests.support.leagues.browser_leagues import CONNECT_FOUR, answer, verdict_between_versions
+from tests.support.leagues.browser_leagues import CONNECT_FOUR, HIDDEN, NAMED, answer, verdict_between_versions
 from tests.support.leagues.tictactoe import LEAGUE
 
 pytestmark = pytest.mark.slow  # a browser and a server take all cores
@@ -137,3 +137,35 @@ def test_illegal_actions_are_rejected(tab: Tab) -> None:
     expect(page.get_by_role("alert")).to_contain_text("99")
     tab.ignore(422)
     tab.ignore(400)
+
+
+def test_named_actions_are_played_by_arrow_keys_and_wasd(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{NAMED}/play#opponent=script:first&agent=player_1&seed=1&actions=")
+    turn, actions = page.locator(".turn"), page.get_by_role("group", name="Your actions")
+    expect(turn).to_have_text(TURN)
+    expect(actions.get_by_role("button", name="centre", exact=True)).to_be_visible()
+    page.keyboard.press("ArrowDown")
+    expect(page.locator(".move-log")).to_contain_text("player_1 plays down")
+    expect(turn).to_have_text(TURN)
+    page.keyboard.press("D")
+    expect(page.locator(".move-log")).to_contain_text("player_1 plays right")
+    expect(page.locator(".move-log")).to_contain_text("player_2 plays up-left")
+
+
+def test_the_page_shows_colors_and_warns_of_pictures_that_show_everything(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{CONNECT_FOUR}/play#opponent=script:first&agent=player_0&seed=1&actions=")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    expect(page.get_by_role("img", name="#d63c4c")).to_be_visible()
+    expect(page.locator(".notice")).to_have_count(0)
+    page = tab.open(f"/leagues/{HIDDEN}/play#opponent=script:first&agent=player_1&seed=1&actions=")
+    expect(page.locator(".notice")).to_contain_text("what is hidden from player_1")
+
+
+def test_terms_are_explained(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{LEAGUE}")
+    term = page.get_by_role("button", name="Rating")
+    expect(page.get_by_role("note")).to_have_count(0)
+    term.click()
+    expect(page.get_by_role("note")).to_contain_text("Strength in Elo")
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("note")).to_have_count(0)

@@ -66,3 +66,17 @@ def test_pettingzoo_accepts_the_environment() -> None:
         warnings.simplefilter("ignore")  # it expects observations without a mask
         api_test(env(), num_cycles=50)
     seed_test(env)
+
+
+def test_a_player_sees_the_back_of_the_opponents_card() -> None:
+    game = env(render_mode="rgb_array")
+    game.reset(seed=3)
+    everything = game.render()
+    views = {agent: game.render_for(agent) for agent in game.possible_agents}
+    half = len(everything) // 2
+    upper, lower = everything[:half], everything[half:]
+    np.testing.assert_array_equal(views["player_0"][:half], upper)
+    np.testing.assert_array_equal(views["player_1"][half:], lower)
+    assert (views["player_0"][half:] != lower).any()
+    assert (views["player_1"][:half] != upper).any()
+    np.testing.assert_array_equal(game.render(), everything)

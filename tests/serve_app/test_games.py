@@ -137,6 +137,8 @@ def test_agents_and_opponents_are_listed(client: TestClient) -> None:
     assert playable_agents["opponents"] == ["tictactoe@2", "tictactoe@1", "script:random", "script:one_ply"]
     assert [seat["agent"] for seat in playable_agents["agents"]] == ["player_1", "player_2"]
     assert (playable_agents["playable"], playable_agents["draws"]) == (True, True)
+    assert playable_agents["board"] == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
+    assert playable_agents["agents"][0] | {"color": "#6183e7", "names": {}, "keys": {}} == playable_agents["agents"][0]
 
 
 def test_a_game_is_played_to_its_end(client: TestClient) -> None:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from base64 import b64decode
 from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from functools import cache
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
+from PIL import Image
 
-from evaluation.playback.human_play import PERSON, GameState, human_play
+from evaluation.playback.environment_hooks import Declarations, EnvironmentHooks, environment_hooks
+from evaluation.playback.human_play import PERSON, GameState, human_play, playability
 from evaluation.playback.single_game import GameStep, play_game
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -25,12 +32,14 @@ from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.service_requests import HumanPlayRequest
 from league.spaces import inputs
+from tests.support.environments.declaring import EVERYTHING, VIEWS
 from tests.support.leagues import tictactoe
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
 CONNECT_FOUR = "pettingzoo.classic.connect_four_v3"
 SPREAD = "mpe2.simple_spread_v3"
 BRIEF = {"max_cycles": 8}
+UNSEEN = EnvironmentHooks(draws=False, has_views=False, declared=Declarations())
 
 
 @cache
@@ -56,7 +65,7 @@ def play_request(
     kwargs = options.pop("kwargs", {})
     config, described, environment = league_and_environment(entry_point, **kwargs)
     request = HumanPlayRequest(opponent="script:random", agent=agent, actions=tuple(actions), **options)
-    return human_play(request, config, described, players, environment, draws=False)
+    return human_play(request, config, described, players, environment, UNSEEN)
 
 
 class Scripted:
@@ -218,3 +227,47 @@ def test_an_exception_of_the_environment_is_reported() -> None:
     players = scripted_players(league_and_environment("tests.support.environments.hanging:Raising")[1])
     with pytest.raises(GameCrashed, match="ValueError: the board is gone"):
         play_request("tests.support.environments.hanging:Raising", players, "player_1", [4])
+
+
+def test_the_picture_is_the_view_of_the_agent_if_the_environment_has_one() -> None:
+    entry_point = "tests.support.environments.declaring:Declaring"
+    config = LeagueConfig.from_mapping({"league": "home", "environment": {"entry_point": entry_point}})
+    described, hooks = interface(config), environment_hooks(config.environment)
+    environment = stock_stepping(config.environment, 1, render_mode="rgb_array")
+    players = scripted_players(described, "first")
+
+    def brightness(hooks: EnvironmentHooks, agent: str) -> int:
+        request = HumanPlayRequest(opponent="script:first", agent=agent)
+        picture = human_play(request, config, described, players, environment, hooks).picture
+        assert picture is not None
+        return int(np.asarray(Image.open(BytesIO(b64decode(picture.partition(",")[2]))).convert("L"))[0, 0])
+
+    whole = replace(hooks, has_views=False)
+    shown = [brightness(hooks, "player_1"), brightness(hooks, "player_2"), brightness(whole, "player_2")]
+    assert shown == [VIEWS["player_1"], VIEWS["player_2"], EVERYTHING]
+
+
+@pytest.mark.parametrize(("entry_point", "reveals"), [("Declaring", False), ("Revealing", True), ("Open", False)])
+def test_pictures_that_reveal_hidden_information_are_reported(tmp_path: Path, entry_point: str, reveals: bool) -> None:
+    config = tictactoe.config(environment={"entry_point": f"tests.support.environments.declaring:{entry_point}"})
+    described = interface(config)
+    with closing(tictactoe.registry(tmp_path)) as registry:
+        registry.leagues.register(config, described)
+        found = playability(config, registry, described, environment_hooks(config.environment))
+    assert (found.draws, found.reveals) == (True, reveals)
+
+
+def test_agents_have_the_declared_names_keys_and_colors(tmp_path: Path) -> None:
+    names = ["left", *"bcdefgh", "right"]
+    config = tictactoe.config(
+        environment={"entry_point": "tests.support.environments.declaring:Declaring"}, play={"action_names": names}
+    )
+    described = interface(config)
+    with closing(tictactoe.registry(tmp_path)) as registry:
+        registry.leagues.register(config, described)
+        found = playability(config, registry, described, environment_hooks(config.environment))
+    first, second = found.agents
+    assert first.names == {str(action): name for action, name in enumerate(names)}
+    assert first.keys == {"ArrowLeft": 0, "a": 0, "ArrowRight": 8, "d": 4}, "declared keys precede; 99 is no action"
+    assert (first.color, second.color) == ("red", None)
+    assert found.board == ((0, None), (1, 2))

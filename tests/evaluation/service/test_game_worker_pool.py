@@ -117,9 +117,22 @@ def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
         "league": LEAGUE,
         "playable": True,
         "why": None,
-        "agents": [{"agent": f"player_{i}", "side": f"player_{i}", "actions": 9, "start": 0} for i in (1, 2)],
+        "agents": [
+            {
+                "agent": f"player_{i}",
+                "side": f"player_{i}",
+                "actions": 9,
+                "start": 0,
+                "names": {},
+                "keys": {},
+                "color": color,
+            }
+            for i, color in ((1, "#6183e7"), (2, "#f53a3a"))
+        ],
         "opponents": ["tictactoe@1", "script:random", "script:one_ply"],
         "draws": True,
+        "board": [[0, 3, 6], [1, 4, 7], [2, 5, 8]],
+        "reveals": False,
     }
 
 

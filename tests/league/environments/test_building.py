@@ -221,3 +221,17 @@ def test_agents_with_equal_spaces_share_a_policy() -> None:
     found = interface(LeagueConfig.from_mapping({"league": "x", "environment": environment}))
     assert found.policy_ids == ("shared",)
     assert describe_policies(found) == "Policy: shared (player_0 and 1 more)."
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "names", "message"),
+    [
+        ("mpe2.simple_spread_v3", ["a", "b"], "policy shared has 5 actions, but 2 names"),
+        ("mpe2.simple_spread_v3", {"shared": ["a"]}, "policy shared has 5 actions, but 1 names"),
+        ("mpe2.simple_spread_v3", {"other": ["a"]}, r"play.action_names.other: expected .* \(shared\)"),
+        ("pettingzoo.sisl.multiwalker_v9", ["a"], "no policy has Discrete actions"),
+    ],
+)
+def test_action_names_must_fit_the_action_spaces(entry_point: str, names: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        interface(league(entry_point, play={"action_names": names}))

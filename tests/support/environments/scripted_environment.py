@@ -108,7 +108,7 @@ class Scripted:
     def assign(self, envs: NDArray, groups: NDArray) -> None:
         self._groups[envs] = groups
 
-    def render(self, env: int) -> NDArray:
+    def render(self, env: int, agent: str | None = None) -> NDArray:
         raise NotImplementedError
 
     def close(self) -> None:

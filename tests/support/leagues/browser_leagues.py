@@ -14,12 +14,16 @@ from league.environments.building import interface
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint, VerdictRow
+from tests.support.leagues import tictactoe
 from tests.support.leagues.reported_league import HOSTILE, league_after_nightly
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.waiting import until
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
+NAMED, HIDDEN = "named", "hidden"
+"""Tic-tac-toe with names of actions, and an environment whose pictures show hidden information."""
+DIRECTIONS = ["up-left", "left", "down-left", "up", "centre", "down", "up-right", "right", "down-right"]
 RUN = "ppo-17"
 KEYS = {"everything": ["act", "read", "evaluate", "promote"], "evaluator": ["evaluate", "read"], "reader": ["read"]}
 
@@ -30,6 +34,12 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
     with league_after_nightly(home) as registry:
         for name in (CONNECT_FOUR, EMPTY):
             config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
+            registry.leagues.register(config, interface(config))
+        hidden = {"entry_point": "tests.support.environments.declaring:Revealing"}
+        for config in (
+            tictactoe.config(league=NAMED, play={"action_names": DIRECTIONS}),
+            tictactoe.config(league=HIDDEN, environment=hidden),
+        ):
             registry.leagues.register(config, interface(config))
         registry.traffic.set(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
         registry.versions.set_note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
