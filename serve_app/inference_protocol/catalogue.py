@@ -74,14 +74,19 @@ class ModelCatalogue:
         }
 
     async def statistics(self, model: str = "", version: str = "") -> Document:
-        """Statistics of all models, all versions of a model, or one version. Raises the errors of
-        `ModelResolver.find`."""
+        """Statistics of all models, all versions of a model, or one version. The version that answers is always listed.
+
+        Raises the errors of `ModelResolver.find`.
+        """
         statistics = self._inference.statistics
         if not model:
             return {"model_stats": statistics.documents()}
         served = await self._inference.find(model, version)
-        found = statistics.documents(served.name, served.version.number if version else None)
-        return {"model_stats": found or [_empty_statistics(served)]}
+        number = served.version.number
+        found = statistics.documents(served.name, number if version else None)
+        if all(each["version"] != str(number) for each in found):
+            found.append(_empty_statistics(served))
+        return {"model_stats": found}
 
     async def index(self, only_ready: bool = False) -> list[Document]:
         """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises

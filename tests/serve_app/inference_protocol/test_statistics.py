@@ -13,7 +13,7 @@ def test_durations_are_of_the_parts_of_a_request() -> None:
     assert document["inference_stats"] == {
         "success": {"count": 2, "ns": 1003},
         "fail": {"count": 1, "ns": 50},
-        "queue": {"count": 0, "ns": 0},
+        "queue": {"count": 2, "ns": 0},
         "compute_input": {"count": 2, "ns": 10},
         "compute_infer": {"count": 2, "ns": 91},
         "compute_output": {"count": 2, "ns": 901},
