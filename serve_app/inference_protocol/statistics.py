@@ -7,11 +7,17 @@ do not wait in a queue: its count is that of the answered requests, and its dura
 
 import time
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+REPORT = "open_inference_statistics"
+"""The key of a replica's statistics in its report to the registry."""
 MAX_ENTRIES = 1024
 """Maximum policies and versions with statistics; the least recently used are dropped."""
+
+
+Document = dict[str, Any]
 
 
 @dataclass(slots=True)
@@ -80,6 +86,28 @@ class ModelStatistics:
                 "cache_miss": nothing,
             },
         }
+
+
+def sum_documents(documents: Iterable[Document]) -> list[Document]:
+    """Sum the statistics of replicas by model and version; the last inference is the latest one."""
+    found: dict[tuple[str, int], Document] = {}
+    for document in documents:
+        key = (document["name"], int(document["version"]))
+        found[key] = _sum(found[key], document) if key in found else document
+    return [found[key] for key in sorted(found)]
+
+
+def _sum(one: Document, other: Document) -> Document:
+    return {
+        key: value
+        if isinstance(value, str)
+        else max(value, other[key])
+        if key == "last_inference"
+        else _sum(value, other[key])
+        if isinstance(value, dict)
+        else value + other[key]
+        for key, value in one.items()
+    }
 
 
 class Statistics:
