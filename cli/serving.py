@@ -10,7 +10,7 @@ import typer
 from cli.options import DEFAULT_URL, open_registry
 from cli.output import emit, say
 from league.errors import ConfigError, InvalidReference
-from league.refs import CHAMPION, CheckpointRef, PolicyRef, ScriptRef, parse_ref
+from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_ref
 from league.settings import Storage
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ def act(
 ) -> None:
     """Request one action from a policy server, or compute it locally."""
     parsed = parse_ref(ref)
-    if isinstance(parsed, ScriptRef):
-        raise InvalidReference(f"{ref} is a script. Only versions can be served, such as connect_four@champion")
+    if not isinstance(parsed, CheckpointRef):
+        raise InvalidReference(f"{ref} is not a version. Only versions can be served, such as connect_four@champion")
     value = _first_observation(parsed, policy) if observation is None else _read(observation)
     response = (_act_here if local else _ask)(parsed, policy, value, explore, seed, url)
     if as_json:

@@ -1,4 +1,4 @@
-"""References to versions, policies and scripts.
+"""References to versions, policies, scripts and remote models.
 
 | text                        | record                                      |
 |-----------------------------|---------------------------------------------|
@@ -7,6 +7,8 @@
 | `script:random`             | `ScriptRef("random")`                       |
 | `script:my_game.bots:block` | `ScriptRef("my_game.bots:block")`           |
 | `connect_four.shared`       | `PolicyRef("connect_four", "shared")`       |
+
+The URL of a model in the Open Inference Protocol, `http://host:8000/v2/models/NAME`, is a `RemoteRef`.
 """
 
 import re
@@ -19,6 +21,13 @@ MAX_SLUG = 100
 """Characters. Ids of schedules and verdicts contain the league's name and must fit into 255 characters."""
 ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 MAX_ENTRY_POINT = 200
+MODEL_URL = re.compile(
+    r"(?P<server>https?://[A-Za-z0-9.\-\[\]:]+(/[A-Za-z0-9._\-]+)*?)/v2/models/(?P<model>[A-Za-z0-9._\-{}]+)"
+    r"(/versions/(?P<version>[A-Za-z0-9._\-]+))?(#(?P<digest>[0-9a-f]{12}))?"
+)
+MAX_MODEL_URL = 200
+POLICY = "{policy}"
+"""Stands for the policy's name in the URL of a model."""
 CHAMPION = "champion"
 MAX_VERSION = 2**31 - 1
 """Version numbers are a signed 32-bit column of the registry."""
@@ -99,6 +108,46 @@ class ScriptRef:
 
 
 @dataclass(frozen=True, slots=True)
+class RemoteRef:
+    """A model of a server of the Open Inference Protocol, by its URL.
+
+    Attributes:
+        server: URL of the server, without `/v2`.
+        model: Name of the model, in which `{policy}` stands for the policy.
+        version: Version of the model; None for the server's default.
+        digest: First digits of the SHA-256 of the model's metadata, which identifies a model without versions.
+    """
+
+    server: str
+    model: str
+    version: str | None = None
+    digest: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> "RemoteRef":
+        if len(text) > MAX_MODEL_URL:
+            raise InvalidReference(f"{text[:32]!r}… has {len(text)} characters, expected at most {MAX_MODEL_URL}")
+        found = MODEL_URL.fullmatch(text)
+        if found is None or re.search(r"[{}]", found["model"].replace(POLICY, "")):
+            raise InvalidReference(f"{text!r} is not the URL of a model: expected http://HOST:PORT/v2/models/NAME")
+        return cls(found["server"], found["model"], found["version"], found["digest"])
+
+    @property
+    def default(self) -> "RemoteRef":
+        """The reference without version and digest."""
+        return RemoteRef(self.server, self.model)
+
+    def path(self, policy: str) -> str:
+        """Path of the model of a policy, below the server's URL."""
+        model = f"/v2/models/{self.model.replace(POLICY, policy)}"
+        return model if self.version is None else f"{model}/versions/{self.version}"
+
+    def __str__(self) -> str:
+        digest = "" if self.digest is None else f"#{self.digest}"
+        return f"{self.server}{self.path(POLICY)}{digest}"
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyRef:
     """A policy of a league; `policy` is optional if the league has one."""
 
@@ -114,8 +163,12 @@ class PolicyRef:
         return self.league if self.policy is None else f"{self.league}.{self.policy}"
 
 
-def parse_ref(text: str) -> CheckpointRef | ScriptRef:
-    """Parse the reference of a contestant: `connect_four@7`, `connect_four@champion` or `script:random`."""
+def parse_ref(text: str) -> CheckpointRef | ScriptRef | RemoteRef:
+    """Parse the reference of a contestant: `connect_four@7`, `connect_four@champion`, `script:random`, or the URL of a
+    model.
+    """
+    if text.startswith(("http://", "https://")):
+        return RemoteRef.parse(text)
     return ScriptRef.parse(text) if text.startswith("script:") else CheckpointRef.parse(text)
 
 

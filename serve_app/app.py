@@ -35,13 +35,14 @@ from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import RestRoutes
+from serve_app.inference_protocol.statistics import REPORT
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.alias_watcher import AliasWatcher
 from serve_app.models.resolver import ModelResolver
 from serve_app.models.shadow import Shadow
 from serve_app.models.traffic_split import TrafficSplit
 from serve_app.models.version_cache import VersionCache, load
-from serve_app.observability.metrics import Metrics
+from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter
 from serve_app.routes.action import ActionDispatch, ActionRoute
 from serve_app.routes.aliases import AliasRoutes
@@ -166,11 +167,13 @@ class Replica:
         )
         self.stream = StreamRoute(dependencies, replica)
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
-        self.reporter = MetricsReporter(registry, self.metrics, self.shadow, self._in_flight, replica, settings)
+        self.reporter = MetricsReporter(
+            registry, self.metrics, self.shadow, self._in_flight, self._statistics, replica, settings
+        )
         self.evaluations = EvaluationRoutes(self.models, settings, evaluation_client)
         self.games = GameRoutes(self.models, evaluation_client)
         self.events = EventBroker(self.models, settings)
-        self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings)
+        self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings, replica)
         self.inference_service = InferenceService(
             self.inference, self.catalogue, self.watcher, self.access, settings, machine, self.metrics.count_error
         )
@@ -182,6 +185,9 @@ class Replica:
             "stream": self.stream.connections.open,
             "events": self.events.connections.open,
         }
+
+    def _statistics(self) -> Report:
+        return {REPORT: self.inference.statistics.documents()}
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""

@@ -15,7 +15,7 @@ from evaluation.gating import verdicts
 from evaluation.gating.gate import alpha_share, alpha_spent
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import compute_leaderboard
-from evaluation.matches.worker import baselines
+from evaluation.matches.tournament import fixed_baselines
 from evaluation.results import Confirmation, Listener, NightlyReport, VerdictReport
 from evaluation.schedules.builders import ANCHOR, gauntlet
 from league.config.league import LeagueConfig
@@ -28,6 +28,7 @@ from league.errors import (
     GameHung,
     NotFound,
     ObservationError,
+    RemoteError,
     WorkerLost,
 )
 from league.policies.loading import check_scripts, eligible
@@ -49,6 +50,7 @@ CONTESTANT_FAULTS = (
     GameHung,
     NotFound,
     ObservationError,
+    RemoteError,
     WorkerLost,
 )
 """Errors of a single version, which do not prevent verdicts on the others."""
@@ -222,7 +224,7 @@ class _NightlyRun:
         """Schedule against the baselines, the champion and the previous version."""
         versions = {each.ref for each in eligible(self._registry, self._league.slug)} - {version.ref}
         rivals = (self.champion(), previous.ref if previous else None)
-        opponents = baselines(self._league.config, self._league.interface)
+        opponents = fixed_baselines(self._registry, self._league)
         opponents += [ref for ref in rivals if ref and ref in versions]
         return gauntlet(
             self._league.config, self._league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS

@@ -47,7 +47,7 @@ from evaluation.statistics.payoff import paired_difference
 from evaluation.statistics.sequential import elo_estimate
 from league.config.gate import GateConfig
 from league.errors import AliasMoved
-from league.refs import CHAMPION, CheckpointRef, ScriptRef, parse_ref
+from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow, VerdictRow
 from league.registry.verdicts import VOID
@@ -63,11 +63,11 @@ def is_applied(registry: Registry, verdict: VerdictRow) -> bool:
 
 
 def tested_champion(verdict: VerdictRow) -> int | None:
-    """Number of the champion that the candidate played; None if the opponent was a script."""
+    """Number of the champion that the candidate played; None if the opponent was not a version."""
     match parse_ref(verdict.champion):
         case CheckpointRef(version=int(number)):
             return number
-        case ScriptRef():
+        case ScriptRef() | RemoteRef():
             return None
     raise AssertionError(f"verdict {verdict.id} names {verdict.champion}, which is not a fixed version")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from evaluation.matches.game_state import ActionNumbers, State
 from league.environments.stepping import Batch, allows_nothing, legal_rows
-from league.errors import IllegalMask, one_line
+from league.errors import IllegalMask, RemoteError, one_line
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, MalformedAction, Policy
 from league.results.records import Reason
@@ -48,13 +48,14 @@ class PolicyOutput:
 def call_policy(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
     """Call a policy that acts in `space` on a batch.
 
-    Raises IllegalMask if the environment allows no action, which is not the contestant's fault.
+    Raises IllegalMask if the environment allows no action, and RemoteError if the server of a remote model cannot be
+    reached or fails. Neither is the contestant's fault.
     """
     generators = () if randomness is None or isinstance(randomness, ActionNumbers) else randomness
     before = [each.bit_generator.state for each in generators]
     try:
         answer = _call_batch(policy, batch, space, state, randomness)
-    except MemoryError:
+    except (MemoryError, RemoteError):
         raise
     except Exception:
         for each, mark in zip(generators, before, strict=True):
@@ -104,7 +105,7 @@ def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, r
         draws = _of_row(randomness, row)
         try:
             answer = _call_batch(policy, batch.rows(np.array([row])), space, own, draws)
-        except MemoryError:
+        except (MemoryError, RemoteError):
             raise
         except Exception as error:
             faults[row] = _fault(error)

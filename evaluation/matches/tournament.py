@@ -182,7 +182,7 @@ def evaluate(
     if schedule == "gauntlet":
         opponents = [pinned(ref, league, registry) for ref in against] or _opponents(registry, row)
     elif schedule != "cross_play":
-        requested += baselines(row.config, row.interface)
+        requested += fixed_baselines(registry, row)
     for ref in [*requested, *opponents]:
         check_eligible(ref, registry, row.config)
         if ref.startswith("script:"):
@@ -208,7 +208,12 @@ def _check_options(schedule: Kind, against: Sequence[str], budget: Budget) -> No
 
 def _opponents(registry: Registry, row: LeagueRow) -> list[str]:
     champion = registry.aliases.current(row.slug).get(CHAMPION)
-    return [*([] if champion is None else [f"{row.slug}@{champion}"]), *baselines(row.config, row.interface)]
+    return [*([] if champion is None else [f"{row.slug}@{champion}"]), *fixed_baselines(registry, row)]
+
+
+def fixed_baselines(registry: Registry, row: LeagueRow) -> list[str]:
+    """Return the baselines of a league, in which remote models are replaced by the versions that answer now."""
+    return [pinned(ref, row.slug, registry) for ref in baselines(row.config, row.interface)]
 
 
 def _play_plan(

@@ -17,7 +17,7 @@ from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implemen
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
 from league.interface import Interface
-from league.policies.loading import check_eligible, check_plays, configured_bots, contestant
+from league.policies.loading import check_eligible, check_plays, configured_contestants, contestant
 from league.policies.policy import Policy
 from league.refs import ScriptRef
 from league.registry.registry import Registry
@@ -96,8 +96,8 @@ BASELINES = (ANCHOR, str(ScriptRef("one_ply")))
 
 
 def baselines(config: LeagueConfig, interface: Interface) -> list[str]:
-    """The scripted baselines that can play a league, and the bots that its configuration names."""
-    return [*(ref for ref in BASELINES if _plays(ref, interface)), *configured_bots(config)]
+    """The scripted baselines that can play a league, and the bots and remote models that its configuration names."""
+    return [*(ref for ref in BASELINES if _plays(ref, interface)), *configured_contestants(config)]
 
 
 def _plays(ref: str, interface: Interface) -> bool:

@@ -4,6 +4,7 @@ Only versions trained in the league's current environment take part in its match
 would be compared on a task that they were not trained for, even if the spaces are equal.
 """
 
+from collections.abc import Mapping
 from contextlib import closing
 
 from league.config.league import LeagueConfig
@@ -11,9 +12,10 @@ from league.config.ppo import PPOConfig
 from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, LeagueError, UnknownPolicy
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
+from league.policies.open_inference import fixed_version, remote_policies
 from league.policies.policy import Policy
 from league.policies.scripted import script
-from league.refs import CheckpointRef, ScriptRef, of_league, parse_ref
+from league.refs import CheckpointRef, RemoteRef, ScriptRef, of_league, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.manifest import MAIN
 from league.registry.storage.rows import VersionRow
@@ -46,19 +48,26 @@ def contestant(ref: str, registry: Registry | None, interface: Interface) -> dic
     """Load the policies of a contestant for all agents.
 
     Args:
-        ref: A version or a script.
-        registry: The registry; optional for scripts.
+        ref: A version, a script or a remote model.
+        registry: The registry; required for versions.
         interface: Interface of the league.
 
     Returns:
         Policy id and policy of each agent. Agents with the same policy id share one object.
 
     Raises:
-        EnvironmentMismatch: The version or script does not fit `interface`.
+        EnvironmentMismatch: The version, script or remote model does not fit `interface`.
+        RemoteError: The server of a remote model cannot be reached or failed.
         LeagueError: See `load`.
     """
-    parsed = parse_ref(ref)
-    policies = _script(parsed, interface) if isinstance(parsed, ScriptRef) else _version(parsed, registry, interface)
+    policies: Mapping[str, Policy]
+    match parse_ref(ref):
+        case ScriptRef() as parsed:
+            policies = _script(parsed, interface)
+        case RemoteRef() as parsed:
+            policies = remote_policies(parsed, interface)
+        case CheckpointRef() as parsed:
+            policies = _version(parsed, registry, interface)
     return {agent: (interface.policies[agent], policies[interface.policies[agent]]) for agent in interface.agents}
 
 
@@ -69,7 +78,7 @@ def _script(ref: ScriptRef, interface: Interface) -> dict[str, Policy]:
 
 def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface) -> dict[str, Policy]:
     if registry is None:
-        raise InvalidInput(f"{ref} is a version: without a registry, only scripts can be loaded")
+        raise InvalidInput(f"{ref} is a version: without a registry, only scripts and remote models can be loaded")
     version = registry.versions.resolve(ref)
     if version.manifest.interface.digest() != interface.digest():
         raise EnvironmentMismatch(f"the spaces or policies of {version.ref} differ from those of the environment")
@@ -91,30 +100,64 @@ def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Poli
 
 
 def pinned(ref: str, league: str, registry: Registry) -> str:
-    """Return an immutable reference: an alias is replaced by its current version. Bots are not imported.
+    """Return an immutable reference: an alias is replaced by its current version, and the URL of a remote model by that
+    of the version that answers now. Bots are not imported.
 
     Raises:
         InvalidReference: The reference is malformed.
         UnknownVersion: The version does not exist.
         UnknownAlias: The alias does not exist.
         UnknownPolicy: The script does not exist.
-        EnvironmentMismatch: The version belongs to another league, or the script does not support the spaces.
+        EnvironmentMismatch: The version belongs to another league, or the script or remote model does not support the
+            spaces.
+        RemoteError: The server of a remote model cannot be reached or failed.
     """
     parsed = parse_ref(ref)
     if isinstance(parsed, CheckpointRef):
         _check_league(parsed, league)
         return registry.versions.resolve(parsed).ref
     row = registry.leagues.get(league)
+    if isinstance(parsed, RemoteRef):
+        return str(fixed_version(parsed, row.interface))
     if not parsed.is_bot:
         check_plays(parsed, row.interface)
     return ref
 
 
-def check_scripts(config: LeagueConfig, interface: Interface) -> None:
-    """Check the scripts and bots that a configuration names.
+def requested(ref: str, league: str, registry: Registry) -> str:
+    """Return the reference of a contestant that a request over the network names, with aliases replaced by versions.
+
+    A request must not choose which code is imported or which servers are called: bots and remote models must be named
+    by the league's configuration. They are neither imported nor called here.
 
     Raises:
-        ConfigError: One does not exist, cannot be imported, or does not support the spaces. Names its key.
+        UnknownPolicy: The script does not exist, or the configuration does not name the bot or the remote model.
+        LeagueError: See `pinned` and `check_eligible`.
+    """
+    config = registry.leagues.get(league).config
+    if _is_remote(ref):
+        if RemoteRef.parse(ref).default not in (known := _configured_remotes(config)):
+            raise _not_configured(ref, config, "remote models", [str(each) for each in known])
+        return ref
+    fixed = pinned(ref, league, registry)
+    if _is_bot(fixed) and fixed not in (bots := [each for each in configured_contestants(config) if _is_bot(each)]):
+        raise _not_configured(fixed, config, "bots", bots)
+    check_eligible(fixed, registry, config)
+    return fixed
+
+
+def _not_configured(ref: str, config: LeagueConfig, kind: str, known: list[str]) -> UnknownPolicy:
+    return UnknownPolicy(
+        f"{ref} is neither in gate.anchors nor in training.opponents of {config.league};"
+        f" its {kind}: {', '.join(known) or 'none'}"
+    )
+
+
+def check_scripts(config: LeagueConfig, interface: Interface) -> None:
+    """Check the scripts, bots and remote models that a configuration names.
+
+    Raises:
+        ConfigError: One does not exist, cannot be imported or reached, or does not support the spaces. Names its key.
     """
     named = [("gate.anchors", anchor.ref) for anchor in config.gate.anchors]
     named += [("training.opponents", opponent.ref) for opponent in config.training.opponents.fixed]
@@ -122,40 +165,39 @@ def check_scripts(config: LeagueConfig, interface: Interface) -> None:
         named.append(("training.teacher", config.training.teacher.ref))
     for key, ref in named:
         parsed = parse_ref(of_league(ref, config.league))
-        if isinstance(parsed, ScriptRef):
+        if not isinstance(parsed, CheckpointRef):
             try:
                 check_plays(parsed, interface)
             except LeagueError as error:
                 raise ConfigError(f"{key}: {error}") from error
 
 
-def configured_bots(config: LeagueConfig) -> list[str]:
-    """Return the bots among the anchors and opponents of a configuration."""
+def configured_contestants(config: LeagueConfig) -> list[str]:
+    """Return the bots and remote models among the anchors and opponents of a configuration."""
     named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents.fixed]
-    return [ref for ref in dict.fromkeys(named) if _is_bot(ref)]
+    return [ref for ref in dict.fromkeys(named) if _is_bot(ref) or _is_remote(ref)]
 
 
-def check_requested(ref: str, config: LeagueConfig) -> None:
-    """Raise UnknownPolicy if `ref` is a bot that the league's configuration does not name.
+def _configured_remotes(config: LeagueConfig) -> list[RemoteRef]:
+    return [RemoteRef.parse(ref).default for ref in configured_contestants(config) if _is_remote(ref)]
 
-    A request from the network must not choose which code is imported.
-    """
-    if _is_bot(ref) and ref not in (known := configured_bots(config)):
-        raise UnknownPolicy(
-            f"{ref} is neither in gate.anchors nor in training.opponents of {config.league};"
-            f" its bots: {', '.join(known) or 'none'}"
-        )
+
+def _is_remote(ref: str) -> bool:
+    return ref.startswith(("http://", "https://"))
 
 
 def _is_bot(ref: str) -> bool:
     return ref.startswith("script:") and ScriptRef.parse(ref).is_bot
 
 
-def check_plays(ref: ScriptRef, interface: Interface) -> None:
+def check_plays(ref: ScriptRef | RemoteRef, interface: Interface) -> None:
     """Raise UnknownPolicy if the script does not exist, EnvironmentMismatch if it does not support the spaces.
 
-    Imports bots, and raises ConfigError if that fails.
+    Imports bots, and raises ConfigError if that fails. Calls remote models, and raises RemoteError if that fails.
     """
+    if isinstance(ref, RemoteRef):
+        fixed_version(ref, interface)
+        return
     for policy in interface.policy_ids:
         spaces = interface.of_policy(policy)
         script(ref.name, spaces.observation, spaces.action)

@@ -6,12 +6,11 @@ Descriptions are JSON documents, from which the gRPC messages are built, too.
 
 from collections.abc import Iterable
 from importlib.metadata import version as installed
-from typing import Any
 
 from league.errors import StorageError
 from league.registry.registry import Registry
-from serve_app.inference_protocol.inference import Inference, ProtocolModel
-from serve_app.inference_protocol.statistics import ModelStatistics
+from serve_app.inference_protocol.inference import Inference
+from serve_app.inference_protocol.statistics import REPORT, Document, ModelStatistics, sum_documents
 from serve_app.inference_protocol.tensors import TensorSpec
 from serve_app.models.resolver import ModelResolver
 from serve_app.models.version_cache import VersionCache
@@ -23,19 +22,23 @@ BACKEND = "onnxruntime"
 EXTENSIONS = ["binary_tensor_data", "model_configuration", "model_repository", "statistics"]
 NOT_LOADED = "loaded on demand"
 
-Document = dict[str, Any]
-
 
 class ModelCatalogue:
-    """Describes the models of a replica."""
+    """Describes the models of a server. `replica`: the name of this replica."""
 
     def __init__(
-        self, models: ModelResolver, versions: VersionCache, inference: Inference, settings: ServeSettings
+        self,
+        models: ModelResolver,
+        versions: VersionCache,
+        inference: Inference,
+        settings: ServeSettings,
+        replica: str,
     ) -> None:
         self._models = models
         self._versions = versions
         self._inference = inference
         self._settings = settings
+        self._replica = replica
 
     def server(self) -> Document:
         """Name, version and supported extensions of the server."""
@@ -74,14 +77,33 @@ class ModelCatalogue:
         }
 
     async def statistics(self, model: str = "", version: str = "") -> Document:
-        """Statistics of all models, all versions of a model, or one version. Raises the errors of
-        `ModelResolver.find`."""
-        statistics = self._inference.statistics
+        """Statistics of all models, all versions of a model, or one version. The version that answers is always listed.
+
+        Sums over all replicas. Those of other replicas are from their last reports, which they write every few seconds;
+        without a database, they are missing.
+
+        Raises the errors of `ModelResolver.find`.
+        """
+        found = sum_documents([*self._inference.statistics.documents(), *await self._of_other_replicas()])
         if not model:
-            return {"model_stats": statistics.documents()}
+            return {"model_stats": found}
         served = await self._inference.find(model, version)
-        found = statistics.documents(served.name, served.version.number if version else None)
-        return {"model_stats": found or [_empty_statistics(served)]}
+        number = served.version.number
+        own = [each for each in found if each["name"] == served.name]
+        if version:
+            own = [each for each in own if each["version"] == str(number)]
+        if all(each["version"] != str(number) for each in own):
+            own.append(ModelStatistics().document(served.name, number))
+        return {"model_stats": own}
+
+    async def _of_other_replicas(self) -> list[Document]:
+        try:
+            reports = await self._models.query(lambda registry: registry.replicas.reports())
+        except StorageError:
+            return []
+        return [
+            each for replica, report in reports.items() if replica != self._replica for each in report.get(REPORT, ())
+        ]
 
     async def index(self, only_ready: bool = False) -> list[Document]:
         """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises
@@ -117,7 +139,3 @@ def _tensors(ports: Iterable[TensorSpec]) -> list[Document]:
 
 def _configured(port: TensorSpec) -> Document:
     return {"name": port.name, "data_type": f"TYPE_{port.datatype}", "dims": list(port.leaf.shape)}
-
-
-def _empty_statistics(served: ProtocolModel) -> Document:
-    return ModelStatistics().document(served.name, served.version.number)

@@ -14,9 +14,10 @@ from league.errors import ArtifactCorrupt, BodyTooLarge, InvalidInput, LeagueErr
 from serve_app.access.access_control import AccessControl, headers_of
 from serve_app.access.request_body import MAX_CHANGE_BODY
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from serve_app.inference_protocol.catalogue import Document, ModelCatalogue
+from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferRequest, InferResponse
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
+from serve_app.inference_protocol.statistics import Document
 from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
 from serve_app.models.alias_watcher import AliasWatcher
 from serve_app.models.traffic_split import Headers

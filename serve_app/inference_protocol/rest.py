@@ -3,8 +3,8 @@
     GET   v2, v2/health/live, v2/health/ready, v2/models/M[/versions/V], …/ready, …/config, …/stats, v2/models/stats
     POST  v2/models/M[/versions/V]/infer, v2/repository/index
 
-M is `{league}` or `{league}.{policy}`; V is a number or an alias, by default the champion. Statistics are those of the
-replica that answers. Errors are `{"error": "…"}`.
+M is `{league}` or `{league}.{policy}`; V is a number or an alias, by default the champion. Statistics are sums
+over all replicas. Errors are `{"error": "…"}`.
 """
 
 import asyncio

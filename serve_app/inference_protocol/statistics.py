@@ -1,17 +1,23 @@
 """Inference statistics of a replica by policy and version, in the protocol's format: counts and durations in
 nanoseconds.
 
-Each row counts as an inference, and each run of a graph as an execution. There is neither a queue nor a cache; their
-fields are 0.
+Each row counts as an inference, and each run of a graph as an execution. There is no cache; its fields are 0. Requests
+do not wait in a queue: its count is that of the answered requests, and its duration 0.
 """
 
 import time
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+REPORT = "open_inference_statistics"
+"""The key of a replica's statistics in its report to the registry."""
 MAX_ENTRIES = 1024
 """Maximum policies and versions with statistics; the least recently used are dropped."""
+
+
+Document = dict[str, Any]
 
 
 @dataclass(slots=True)
@@ -61,6 +67,8 @@ class ModelStatistics:
     def document(self, name: str, version: int) -> dict[str, Any]:
         """In the format of the statistics extension."""
         nothing = Duration().document()
+        # Nothing waits, but clients such as perf_analyzer read from this count which version has answered.
+        queue = {"count": self.success.count, "ns": 0}
         return {
             "name": name,
             "version": str(version),
@@ -70,7 +78,7 @@ class ModelStatistics:
             "inference_stats": {
                 "success": self.success.document(),
                 "fail": self.failure.document(),
-                "queue": nothing,
+                "queue": queue,
                 "compute_input": self.input.document(),
                 "compute_infer": self.infer.document(),
                 "compute_output": self.output.document(),
@@ -78,6 +86,28 @@ class ModelStatistics:
                 "cache_miss": nothing,
             },
         }
+
+
+def sum_documents(documents: Iterable[Document]) -> list[Document]:
+    """Sum the statistics of replicas by model and version; the last inference is the latest one."""
+    found: dict[tuple[str, int], Document] = {}
+    for document in documents:
+        key = (document["name"], int(document["version"]))
+        found[key] = _sum(found[key], document) if key in found else document
+    return [found[key] for key in sorted(found)]
+
+
+def _sum(one: Document, other: Document) -> Document:
+    return {
+        key: value
+        if isinstance(value, str)
+        else max(value, other[key])
+        if key == "last_inference"
+        else _sum(value, other[key])
+        if isinstance(value, dict)
+        else value + other[key]
+        for key, value in one.items()
+    }
 
 
 class Statistics:

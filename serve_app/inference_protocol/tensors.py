@@ -15,25 +15,10 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, ObservationError
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_OUT
+from league.policies.open_inference_signature import DATATYPES
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import ACTION_MASK, Box, Leaf, inputs
 from league.spaces.arrays import check, check_mask
-
-DATATYPES = {
-    "bool": "BOOL",
-    "int8": "INT8",
-    "int16": "INT16",
-    "int32": "INT32",
-    "int64": "INT64",
-    "uint8": "UINT8",
-    "uint16": "UINT16",
-    "uint32": "UINT32",
-    "uint64": "UINT64",
-    "float16": "FP16",
-    "float32": "FP32",
-    "float64": "FP64",
-}
-"""NumPy dtype → the protocol's datatype."""
 
 _BY_DTYPE = {
     np.dtype(name): datatype for name, datatype in DATATYPES.items()

@@ -29,8 +29,8 @@ Label = tuple[str, str, str, str]
 """league, policy, version, api"""
 Samples = list[list[Any]]
 """[[label values, value]]; the value of a histogram is {counts, sum}."""
-Report = dict[str, Samples]
-"""Metric name → samples."""
+Report = dict[str, Any]
+"""Metric name → samples, and further parts by name."""
 
 
 @dataclass(slots=True)

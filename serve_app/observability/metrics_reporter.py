@@ -72,7 +72,7 @@ def _counts(report: Report) -> Counter[str]:
 
 class MetricsReporter:
     """Reports in its own task, so that no report delays a promotion. Counting continues while the database is
-    unavailable.
+    unavailable. `further`: what other parts of the replica add to each report.
     """
 
     def __init__(
@@ -81,6 +81,7 @@ class MetricsReporter:
         metrics: Metrics,
         shadow: Shadow,
         in_flight: Callable[[], dict[str, int]],
+        further: Callable[[], Report],
         replica: str,
         settings: ServeSettings,
     ) -> None:
@@ -88,6 +89,7 @@ class MetricsReporter:
         self._metrics = metrics
         self._shadow = shadow
         self._in_flight = in_flight
+        self._further = further
         self._replica = replica
         slowest = max(settings.heartbeat, settings.poll_slowest)
         pace = settings.model_copy(update={"poll": settings.heartbeat, "poll_slowest": slowest})
@@ -118,7 +120,7 @@ class MetricsReporter:
             if self._written.get((one.league, one.candidate, one.champion)) != one
         ]
         report = self._metrics.report()
-        report |= {RATE: self._rates.since_last(report)} | self._disks.report()
+        report |= {RATE: self._rates.since_last(report)} | self._disks.report() | self._further()
         write = partial(self._registry.replicas.write_report, self._replica, report, shadowings)
         await asyncio.get_running_loop().run_in_executor(self._thread, write)
         self._written |= {(one.league, one.candidate, one.champion): one for one in shadowings}

@@ -61,7 +61,7 @@ export function State({ value }) {
 
 /** A contestant, with a badge if it is the champion. */
 export function Ref({ value, champion }) {
-  const isChampion = champion != null && value.endsWith(`@${champion}`) && !value.startsWith("script:");
+  const isChampion = champion != null && value.endsWith(`@${champion}`) && !value.startsWith("script:") && !value.includes("://");
   return html`<span class="ref">${value}</span>${isChampion && html` <${Badge} tone="accent" sign="★">champion<//>`}`;
 }
 

@@ -42,10 +42,10 @@ export function interval(bounds) {
 export const rate = (perSecond) =>
   perSecond == null ? NONE : perSecond === 0 ? "0" : perSecond < 10 ? perSecond.toFixed(1) : count(Math.round(perSecond));
 
-/** A reference without its league: `board@3` or 3 → `@3`. Scripts keep their full name. */
+/** A reference without its league: `board@3` or 3 → `@3`. Scripts and remote models keep their full name. */
 export function shortRef(ref) {
   const text = String(ref);
-  return text.startsWith("script:") ? text : `@${text.slice(text.indexOf("@") + 1)}`;
+  return text.startsWith("script:") || text.includes("://") ? text : `@${text.slice(text.indexOf("@") + 1)}`;
 }
 
 const medium = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", year: "numeric", hour: "2-digit", minute: "2-digit" });

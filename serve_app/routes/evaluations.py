@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from league.errors import Forbidden
-from league.policies.loading import check_eligible, check_requested, eligible, pinned
+from league.policies.loading import eligible, requested
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
@@ -106,13 +106,9 @@ class EvaluationRoutes:
 
 def _pinned(evaluation_request: EvaluationRequest, league: str, registry: Registry) -> dict[str, Any]:
     """The stored request, in which aliases are replaced by versions so that a resumed evaluation plays the same."""
-    row = registry.leagues.get(league)
     document = evaluation_request.root.model_dump(mode="json", exclude={"reason"})
     if isinstance(evaluation_request.root, TournamentRequest):
         for name in ("contestants", "against"):
-            document[name] = [pinned(ref, league, registry) for ref in getattr(evaluation_request.root, name)]
-            for ref in document[name]:
-                check_requested(ref, row.config)
-                check_eligible(ref, registry, row.config)
+            document[name] = [requested(ref, league, registry) for ref in getattr(evaluation_request.root, name)]
         document["contestants"] = document["contestants"] or [version.ref for version in eligible(registry, league)]
     return document

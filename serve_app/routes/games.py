@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from league.errors import UnknownMatch
-from league.policies.loading import check_eligible, check_requested, pinned
+from league.policies.loading import requested
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -74,10 +74,7 @@ class GameRoutes:
         body = parsing.parse_body(PlayBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
 
         def build_operation(registry: Registry, league: str) -> HumanPlayRequest:
-            opponent, config = pinned(body.opponent, league, registry), registry.leagues.get(league).config
-            check_requested(opponent, config)
-            check_eligible(opponent, registry, config)
-            return HumanPlayRequest(**body.model_dump() | {"opponent": opponent})
+            return HumanPlayRequest(**body.model_dump() | {"opponent": requested(body.opponent, league, registry)})
 
         return _response(await self._request_game(request, build_operation))
 

@@ -17,7 +17,7 @@ from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.policy import Policy
-from league.refs import ScriptRef, parse_ref
+from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Discrete, MultiDiscrete, Space
@@ -62,7 +62,7 @@ def check_teacher(interface: Interface) -> None:
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:
-    if isinstance(parse_ref(ref), ScriptRef):
+    if not isinstance(parse_ref(ref), CheckpointRef):
         return contestant(ref, None, interface)
     if storage is None:
         raise ConfigError(f"training.teacher.ref: {ref} is a version, but no storage is given to load it from")

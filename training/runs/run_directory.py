@@ -30,7 +30,8 @@ from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.files import disk_errors, replacing
 from league.interface import Interface
 from league.policies.loading import contestant
-from league.refs import CheckpointRef, of_league, parse_ref
+from league.policies.open_inference import fixed_version
+from league.refs import CheckpointRef, RemoteRef, of_league, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, Role
 from league.settings import Storage
@@ -58,13 +59,15 @@ def locked(directory: Path, what: str) -> Iterator[None]:
 
 def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface) -> dict[str, str]:
     """Resolve each opponent of `training.opponents`, the version of the magnet and the teacher: reference as written
-    → `script:name` or `league@number`.
+    → `script:name`, `league@number`, or the URL of a version of a remote model.
 
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
     for written in _references(config.training):
         ref = parse_ref(of_league(written, config.league))
+        if isinstance(ref, RemoteRef):
+            ref = fixed_version(ref, interface)
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
         contestant(pinned, registry, interface)
         pins[written] = pinned

@@ -15,7 +15,7 @@ from league.policies.bots import Bot
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
-from league.refs import ScriptRef, parse_ref
+from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
 from training.sampling.recurrent_state import RecurrentStates
@@ -216,7 +216,7 @@ class Opponents:
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:
-    if isinstance(parse_ref(ref), ScriptRef):
+    if not isinstance(parse_ref(ref), CheckpointRef):
         return contestant(ref, None, interface)
     if storage is None:
         raise ConfigError(f"training.opponents: {ref} is a version, but no storage is given to load it from")

@@ -10,6 +10,7 @@ import tritonclient.grpc
 from tritonclient.utils import InferenceServerException
 
 from league.registry.registry import Registry
+from serve_app.inference_protocol.statistics import REPORT
 from tests.support.clients.protocol_observations import observations, policy_of
 from tests.support.clients.triton import FORMS, Triton, assert_same
 from tests.support.leagues.served_leagues import promote
@@ -42,25 +43,41 @@ def test_each_form_of_the_client_is_answered(address: Address, served: Registry,
         assert_same(triton.infer(model, arrays).as_numpy("action"), policy.act(arrays).actions)
 
 
-def test_calls_on_one_channel_reach_all_replicas(address: Address) -> None:
+def test_calls_on_one_channel_reach_all_replicas(address: Address, served: Registry) -> None:
     """HAProxy balances calls, not connections."""
     with Triton("grpc", address) as triton:
-        wait_for_both_replicas(triton)
+        wait_for_both_replicas(triton, served)
 
 
-def wait_for_both_replicas(triton: Triton) -> None:
-    """The statistics of the two replicas differ once both have answered."""
-
-    def nanoseconds() -> str | None:
-        (entry,) = triton.document("get_inference_statistics", "vector")["model_stats"]
-        return entry["inference_stats"]["success"].get("ns")  # absent on a replica without calls
+def wait_for_both_replicas(triton: Triton, served: Registry) -> None:
+    """Both report to the registry that they have answered."""
 
     def have_answered() -> bool:
         for _ in range(4):
             triton.infer("vector", {"observation": np.zeros((1, 2), np.float32)})
-        return len({nanoseconds() for _ in range(4)} - {None}) == 2
+        reports = served.replicas.reports().values()
+        return sum(any(each["name"] == "vector" for each in report[REPORT]) for report in reports) == 2
 
     until(have_answered)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["http", "grpc"])
+def test_all_replicas_report_the_sum_of_their_statistics(address: Address, form: str) -> None:
+    """Soon after the last request, each answers with the number of requests that clients sent."""
+    calls = 20
+    with Triton(form, address) as triton:
+
+        def counts() -> set[int]:
+            """From as many calls as reach both replicas."""
+            entries = [triton.document("get_inference_statistics", "choice", "1")["model_stats"][0] for _ in range(8)]
+            return {int(entry["inference_stats"]["success"].get("count", 0)) for entry in entries}
+
+        until(lambda: len(counts()) == 1)
+        (before,) = counts()
+        for _ in range(calls):
+            triton.infer("choice", {"observation": np.zeros(1, np.int64)})
+        until(lambda: counts() == {before + calls})
 
 
 def test_a_promotion_applies_to_both_protocols(address: Address, served: Registry) -> None:
@@ -79,7 +96,7 @@ def test_a_promotion_applies_to_both_protocols(address: Address, served: Registr
 def test_retried_calls_survive_the_death_of_a_replica(address: Address, served: Registry) -> None:
     arrays = {"observation": np.zeros((1, 2), np.float32)}
     with Triton("grpc", address) as triton:
-        wait_for_both_replicas(triton)
+        wait_for_both_replicas(triton, served)
     victim = processes(served.storage, "PolicyServer")[0]
 
     def caller() -> Callable[[], int]:

@@ -1,6 +1,6 @@
 """What statistics count, and for how long they are kept."""
 
-from serve_app.inference_protocol.statistics import MAX_ENTRIES, Statistics
+from serve_app.inference_protocol.statistics import MAX_ENTRIES, Statistics, sum_documents
 
 
 def test_durations_are_of_the_parts_of_a_request() -> None:
@@ -13,7 +13,7 @@ def test_durations_are_of_the_parts_of_a_request() -> None:
     assert document["inference_stats"] == {
         "success": {"count": 2, "ns": 1003},
         "fail": {"count": 1, "ns": 50},
-        "queue": {"count": 0, "ns": 0},
+        "queue": {"count": 2, "ns": 0},
         "compute_input": {"count": 2, "ns": 10},
         "compute_infer": {"count": 2, "ns": 91},
         "compute_output": {"count": 2, "ns": 901},
@@ -33,3 +33,15 @@ def test_the_least_recently_used_entry_is_evicted() -> None:
     assert [document["version"] for document in kept[:2]] == ["1", "3"]
     assert statistics.documents("duo") == []
     assert [document["version"] for document in statistics.documents("board", 7)] == ["7"]
+
+
+def test_statistics_of_replicas_are_summed_by_model_and_version() -> None:
+    replicas = [Statistics(), Statistics()]
+    for number, statistics in enumerate(replicas, 1):
+        statistics.entry("board", 1).succeed(number, begun=0, found=0, read=1, ran=3, done=6)
+    replicas[1].entry("board", 2).fail(5)
+    first, second = sum_documents([each for statistics in replicas for each in statistics.documents()])
+    assert (first["version"], first["inference_count"], first["execution_count"]) == ("1", 3, 2)
+    assert first["inference_stats"]["success"] == {"count": 2, "ns": 12}
+    assert first["last_inference"] == max(each.documents("board", 1)[0]["last_inference"] for each in replicas)
+    assert (second["version"], second["inference_stats"]["fail"]["count"]) == ("2", 1)

@@ -273,3 +273,18 @@ def test_unsupported_features_are_rejected(triton: Triton, leagues: Storage) -> 
     tensor.set_data_from_numpy(observations(signature, 1)["observation"])
     with pytest.raises(InferenceServerException, match="classification, which this server does not support"):
         triton.call("infer", "vector", [tensor], outputs=[classes])
+
+
+@pytest.mark.parametrize("version", ["", "2"])
+def test_perf_analyzer_finds_the_version_that_answered(triton: Triton, leagues: Storage, version: str) -> None:
+    """It looks for the version whose count in the queue rose between two statistics that both list it."""
+
+    def queued() -> dict[str, int]:
+        entries = triton.document("get_inference_statistics", "board", version)["model_stats"]
+        return {entry["version"]: int(entry["inference_stats"]["queue"].get("count", 0)) for entry in entries}
+
+    before = queued()
+    for _ in range(3):
+        triton.infer("board", observations(policy_of(leagues, "board")[1], 1), version=version)
+    risen = {number: count - before[number] for number, count in queued().items() if count > before[number]}
+    assert risen == {version or "1": 3}

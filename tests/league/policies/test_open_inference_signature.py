@@ -1,0 +1,70 @@
+"""Matching of a remote model's tensors with the spaces of a policy."""
+
+from typing import Any
+
+import pytest
+
+from league.errors import EnvironmentMismatch, RemoteError
+from league.interface import AgentInterface
+from league.policies.open_inference_signature import read_signature
+from league.spaces import Box, DictSpace, Discrete
+
+SPACES = AgentInterface(
+    observation=DictSpace(
+        spaces={
+            "observation": Box(dtype="float32", shape=(3,), low=None, high=None),
+            "action_mask": Box(dtype="int8", shape=(4,), low=0, high=1),
+        }
+    ),
+    action=Discrete(n=4),
+)
+
+
+def tensor(name: str, datatype: str, *shape: int) -> dict[str, Any]:
+    return {"name": name, "datatype": datatype, "shape": [-1, *shape]}
+
+
+def model(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"name": "m", "inputs": inputs, "outputs": outputs}
+
+
+def test_tensors_are_matched_by_datatype_and_shape() -> None:
+    found = read_signature(
+        "m", model([tensor("x", "FP32", 3), tensor("legal", "INT8", 4)], [tensor("policy_head", "FP32", 4)]), SPACES
+    )
+    assert found.inputs == {"x": "observation", "legal": "action_mask"}
+    assert (found.output, found.is_logits) == ("policy_head", True)
+
+
+def test_a_finished_action_is_preferred_and_the_mask_is_optional() -> None:
+    found = read_signature(
+        "m", model([tensor("x", "FP32", 3)], [tensor("logits", "FP32", 4), tensor("best", "INT32")]), SPACES
+    )
+    assert (found.output, found.is_logits, found.requested) == ("best", False, ["best"])
+
+
+def test_state_is_matched_by_name() -> None:
+    inputs = [tensor("x", "FP32", 3), tensor("state_in_0", "FP32", 8)]
+    found = read_signature("m", model(inputs, [tensor("action", "INT64"), tensor("state_out_0", "FP32", 8)]), SPACES)
+    assert found.state["state_in_0"].shape == (8,)
+    assert found.requested == ["action", "state_out_0"]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "message"),
+    [
+        ([tensor("x", "FP32", 2)], [tensor("action", "INT64")], "has the input x FP32"),
+        ([tensor("legal", "INT8", 4)], [tensor("action", "INT64")], "has no input for observation"),
+        ([tensor("x", "FP32", 3), tensor("y", "FP32", 3)], [tensor("action", "INT64")], "two inputs for the same"),
+        ([tensor("x", "FP32", 3)], [tensor("value", "FP32", 1)], "or logits FP32"),
+        ([], [tensor("action", "INT64")], "lists no inputs"),
+    ],
+)
+def test_models_that_do_not_fit_are_refused(inputs: Any, outputs: Any, message: str) -> None:
+    with pytest.raises(EnvironmentMismatch, match=message):
+        read_signature("m", model(inputs, outputs), SPACES)
+
+
+def test_a_server_of_another_kind_is_reported() -> None:
+    with pytest.raises(RemoteError, match="does not describe its inputs"):
+        read_signature("m", {"error": "no"}, SPACES)
