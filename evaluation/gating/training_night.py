@@ -25,7 +25,7 @@ from league.seeds import derive
 class Trainer(Protocol):
     """Trains and publishes versions. A call with the name of an earlier run continues that run."""
 
-    def __call__(self, config: LeagueConfig, *, name: str, parent: int | None, target: str | None) -> object:
+    def __call__(self, config: LeagueConfig, /, *, name: str, parent: int | None, target: str | None) -> object:
         """Train until the budget is spent. target: the version that an exploiter is trained against.
 
         Raises LeagueError.
