@@ -2,12 +2,13 @@
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cli.options import CORES, AsJson, EvaluationCluster, Workers, open_registry
-from cli.output import GameProgress, complain, difference, emit, say, show_leaderboard
+from cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
+from cli.training import exit_on_interrupt
 from configs import find, names
 from league.errors import AlreadyRunning, LeagueError, UnknownLeague, one_line
 from league.files import disk_errors
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from evaluation.results import Confirmation, NightlyReport
     from league.config.league import LeagueConfig
     from league.registry.registry import Registry
+    from league.registry.storage.rows import TrainingNightRow
 
 FAULTS = 1
 BUSY = 75
@@ -32,6 +34,12 @@ def nightly(
             help="Registered leagues, YAML files or bundled configurations. Default: all registered leagues.",
         ),
     ] = None,
+    train: Annotated[
+        bool,
+        typer.Option(
+            "--train", help="First train from the champion; afterwards train and measure an exploiter of the new one."
+        ),
+    ] = False,
     workers: Workers = CORES,
     webhook: Annotated[
         str | None,
@@ -46,6 +54,8 @@ def nightly(
     continues when the command is run again, without replaying recorded games. The report of each league is written
     to LEAGUE_HOME/reports.
 
+    With --train, the section `nightly` of the configuration sets the budget, the opponents and the exploiter's share.
+
     Exit codes: 0 success, with or without a promotion; 1 a version could not be tested, a league failed, or the
     webhook could not be delivered; 2 invalid arguments; 75 another nightly run holds the lock of a league.
     """
@@ -53,11 +63,15 @@ def nightly(
     from league.ray_cluster import ray_session
 
     configs = _configs(leagues or ())
-    reports, faults, busy = [], [], False
+    reports, nights, faults, busy = [], [], [], False
     for config in configs:
         try:
             with ray_session(address):
-                report = run_nightly(config, workers, quiet=as_json)
+                if train:
+                    night, report = run_training_night(config, workers, quiet=as_json)
+                    nights.append(night)
+                else:
+                    report = run_nightly(config, workers, quiet=as_json)
         except LeagueError as error:
             # The remaining leagues are still processed.
             sentence = f"{config.league}: {one_line(error)}"
@@ -65,11 +79,16 @@ def nightly(
             faults += [] if isinstance(error, AlreadyRunning) else [sentence]
             complain(f"league: {sentence}")
             continue
-        reports.append(report)
-        faults += [f"{config.league}: {fault}" for fault in report.faults]
+        if train:
+            faults += [f"{config.league}: {fault}" for fault in faults_of(nights[-1])]
+        if report is not None:
+            reports.append(report)
+            faults += [f"{config.league}: {fault}" for fault in report.faults]
     if as_json:
-        emit({"leagues": [report.to_json() for report in reports], "faults": faults})
+        documents = {"nights": [night_document(night) for night in nights]} if train else {}
+        emit({"leagues": [report.to_json() for report in reports], "faults": faults} | documents)
     summary = [sentence for report in reports for sentence in summary_of(report)]
+    summary += [sentence for night in nights for sentence in summary_of_night(night)]
     if webhook:
         deliver(webhook, [*summary, *faults], reports)
     if faults or busy:
@@ -79,13 +98,20 @@ def nightly(
 def run_nightly(config: "LeagueConfig", workers: int = CORES, quiet: bool = False) -> "NightlyReport":
     """Run one league's nightly run, print the results, and write the league's report to LEAGUE_HOME/reports."""
     from evaluation.gating.nightly import nightly as run
-    from evaluation.reporting.html_page import write
-    from evaluation.reporting.league_report import league_report
 
     Storage.from_environment().export()
     registry = open_registry()
     with GameProgress(quiet) as listener:
         report = run(config, registry=registry, workers=workers, listener=listener)
+    _show(report, registry, config, quiet)
+    return report
+
+
+def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig", quiet: bool) -> None:
+    """Print the results of a nightly run, and write the league's report."""
+    from evaluation.reporting.html_page import write
+    from evaluation.reporting.league_report import league_report
+
     page = registry.storage.home / "reports" / f"{config.league}.html"
     with disk_errors(page):
         page.parent.mkdir(exist_ok=True)
@@ -101,7 +127,87 @@ def run_nightly(config: "LeagueConfig", workers: int = CORES, quiet: bool = Fals
         say()
         show_leaderboard(report.leaderboard)
         say(f"\nReport: {page}")
-    return report
+
+
+def run_training_night(
+    config: "LeagueConfig", workers: int = CORES, quiet: bool = False
+) -> "tuple[TrainingNightRow, NightlyReport | None]":
+    """Run one league's night of training, print the results, and write the league's report.
+
+    Returns:
+        The night, and the report of the gate unless an earlier process completed it.
+    """
+    from rich.console import Console
+
+    from evaluation.gating.training_night import training_night
+    from league.ray_cluster import connected
+    from league.refs import CheckpointRef
+    from training.runs.train import train as run
+
+    storage = Storage.from_environment()
+    storage.export()
+    registry, games = open_registry(), GameProgress(quiet)
+
+    def train(settings: "LeagueConfig", *, name: str, parent: int | None, target: str | None) -> None:
+        with games.paused():
+            run(
+                settings,
+                registry=registry,
+                parent=None if parent is None else CheckpointRef(settings.league, parent),
+                role="main" if target is None else "exploiter",
+                target=None if target is None else CheckpointRef.parse(target),
+                name=name,
+                console=Console(quiet=True) if quiet else console,
+            )
+
+    with exit_on_interrupt(), connected(None, storage), games as listener:
+        night, report = training_night(
+            config,
+            registry=registry,
+            train=train,
+            workers=workers,
+            listener=listener,
+            announce=(lambda _: None) if quiet else say,
+        )
+    for fault in faults_of(night):
+        complain(f"{config.league}: {fault}")
+    if report is not None:
+        _show(report, registry, config, quiet)
+    if not quiet:
+        for sentence in summary_of_night(night):
+            say(sentence)
+    return night, report
+
+
+def faults_of(night: "TrainingNightRow") -> list[str]:
+    """The errors of a night's steps."""
+    return [f"night {night.id}, {step}: {result['error']}" for step, result in night.steps.items() if "error" in result]
+
+
+def summary_of_night(night: "TrainingNightRow") -> list[str]:
+    """Summarise a night of training: what was trained, and how exploitable the champion is."""
+    versions = night.steps["train"]["versions"]
+    start = "from scratch" if night.parent is None else f"from {night.league}@{night.parent}"
+    sentences = [f"{night.league}: night {night.id} trained {', '.join(versions) or 'no version'} {start}."]
+    if (found := night.steps["measure"]["exploitability"]) is not None:
+        best = found["exploiters"][0]
+        sentences.append(
+            f"{found['ref']}: {best['ref']} scores {best['score']:.3f} [{best['low']:.3f}, {best['high']:.3f}] against"
+            " it, a lower bound on what a best response scores."
+        )
+    return sentences
+
+
+def night_document(night: "TrainingNightRow") -> dict[str, Any]:
+    """A night of training as JSON."""
+    return {
+        "league": night.league,
+        "night": night.id,
+        "parent": night.parent,
+        "steps": night.steps,
+        "began_at": night.began_at,
+        "ended_at": night.ended_at,
+    }
 
 
 def summary_of(report: "NightlyReport") -> list[str]:

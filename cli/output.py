@@ -2,7 +2,8 @@
 
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -103,6 +104,15 @@ class GameProgress:
         # Stopping a bar that was not started prints an empty line.
         if self._has_bar:
             self._bar.stop()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Hide the bar while another one is shown."""
+        if self._has_bar:
+            self._bar.stop()
+        yield
+        if self._has_bar:
+            self._bar.start()
 
     def _show(self, event: "Games | VerdictReport") -> None:
         if self._quiet:

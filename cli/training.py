@@ -145,7 +145,7 @@ def train(
     from league.ray_cluster import LocalRay
     from training.runs.train import train as run
 
-    with _exit_on_interrupt():
+    with exit_on_interrupt():
         published = run(
             league,
             registry=open_registry(),
@@ -194,7 +194,7 @@ def sweep(
     league = _load(config, _without_none(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus))
     if samples is not None and league.sweep is not None:
         league = league.model_copy(update={"sweep": league.sweep.model_copy(update={"samples": samples})})
-    with _exit_on_interrupt():
+    with exit_on_interrupt():
         report = run(
             league,
             registry=open_registry(),
@@ -270,12 +270,12 @@ def _submit(
         raise ConfigError("--job requires --address http://HOST:8265, the URL of the cluster's dashboard")
     check_unlimited(LocalRay(*local))
     arguments = [f"--{name}={value}" for name, value in options.items()] + ["--resume"] * resume
-    with _exit_on_interrupt():
+    with exit_on_interrupt():
         submit(address, config, arguments, Storage.from_environment(), say)
 
 
 @contextmanager
-def _exit_on_interrupt() -> Iterator[None]:
+def exit_on_interrupt() -> Iterator[None]:
     """Turn Ctrl-C into a message and exit code 130. Without a message the process exits at once."""
     try:
         yield

@@ -14,6 +14,7 @@ from league.config.gate import GateConfig
 from league.config.play import PlayConfig
 from league.config.ppo import PPOConfig
 from league.config.sweep import SweepConfig
+from league.config.training import NightlyConfig
 from league.config.validation_errors import describe_validation_error
 from league.entry_points import search_in
 from league.errors import ConfigError, InvalidReference, one_line
@@ -37,6 +38,7 @@ class LeagueConfig(Part):
     play: PlayConfig = PlayConfig()
     training: TrainingConfig = PPOConfig()
     gate: GateConfig = GateConfig()
+    nightly: NightlyConfig = NightlyConfig()
     sweep: SweepConfig | None = None
 
     @field_validator("league")
@@ -99,6 +101,27 @@ class LeagueConfig(Part):
         """Return the configuration with some training settings replaced. Raises ConfigError if it is invalid."""
         training = self.training.model_dump(by_alias=True) | settings
         return self.from_mapping(self.model_dump(by_alias=True) | {"training": training}, source=self.league)
+
+    def of_night(self, seed: int, share: float | None = None) -> Self:
+        """Return the configuration of a run of `league nightly --train`.
+
+        Args:
+            seed: Seed of the run.
+            share: Fraction of the budget for an exploiter, whose last checkpoint alone is published. None: a main run.
+        """
+        night, training = self.nightly, self.training
+        part = 1.0 if share is None else share
+        minutes, steps = night.minutes or training.minutes, night.steps or training.steps
+        settings: dict[str, Any] = {
+            "seed": seed,
+            "minutes": None if minutes is None else minutes * part,
+            "steps": max(1, round(steps * part)),
+        }
+        if share is not None:
+            settings |= {"checkpoint_every": None, "checkpoint_minutes": None}
+        if night.opponents is not None:
+            settings["opponents"] = night.opponents.model_dump(by_alias=True)
+        return self.with_training(**settings)
 
 
 def _with_folder(document: Any, path: Path) -> Any:

@@ -1,4 +1,4 @@
-"""The `training` section: settings common to all algorithms."""
+"""The `training` section: settings common to all algorithms; and the `nightly` section."""
 
 from typing import Annotated, Literal
 
@@ -69,3 +69,16 @@ class TrainingSettings(Part):
         """
         of_time = seconds / (60 * self.minutes) if self.minutes is not None else 0.0
         return min(max(steps / self.steps, of_time), 1.0)
+
+
+class NightlyConfig(Part):
+    """The `nightly` section: the training of `league nightly --train`. Null: the value of the `training` section."""
+
+    minutes: float | None = Field(default=None, gt=0)
+    """Maximum training time of a night."""
+    steps: int | None = Field(default=None, ge=1)
+    """Maximum number of actions of a night."""
+    opponents: OpponentsConfig | None = None
+    """Opponents."""
+    exploiter: float = Field(default=0.15, ge=0, le=1)
+    """Budget of the champion's exploiter, as a fraction of the night's; 0 trains none."""

@@ -18,6 +18,7 @@ from league.registry.storage import exclusive_lock
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database
 from league.registry.traffic import TrafficRepository
+from league.registry.training_nights import TrainingNightRepository
 from league.registry.verdicts import NightlyRunRepository, VerdictRepository
 from league.registry.versions import VersionRepository
 from league.settings import Storage
@@ -45,6 +46,7 @@ class Registry:
         self.keys = KeyRepository(database)
         self.verdicts = VerdictRepository(database)
         self.nightly_runs = NightlyRunRepository(database)
+        self.training_nights = TrainingNightRepository(database)
         self.evaluations = EvaluationRepository(database)
         self.runs = RunRepository(database)
         self.snapshots = SnapshotRepository(database)

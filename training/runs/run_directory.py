@@ -167,23 +167,31 @@ class RunDirectory:
         git_commit: str | None,
         pins: dict[str, str] | None = None,
         exploits: str | None = None,
+        name: str | None = None,
     ) -> Self:
         """Create the directory of a new run.
 
         pins: what the opponents' references resolve to. exploits: the version that an exploiter is trained against.
+        name: the id of the run, by default its start time and a random part.
         """
         pins = pins or {}
         config = with_pins(config, pins)
         now = datetime.now(UTC)
-        path = _runs(storage, config.league) / f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+        path = _runs(storage, config.league) / (name or f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}")
         record = RunRecord(
             config=config, pins=pins, parent=parent, exploits=exploits, git_commit=git_commit, started_at=now
         )
         run = cls(path, record)
         with disk_errors(path):
-            path.mkdir(parents=True)
+            path.mkdir(parents=True, exist_ok=name is not None)
             run._write()
         return run
+
+    @classmethod
+    def find(cls, storage: Storage, league: str, name: str) -> Self | None:
+        """Return the run with this id, if it has begun on this machine."""
+        file = _runs(storage, league) / name / RUN_FILE
+        return cls(file.parent, RunRecord.model_validate_json(file.read_text())) if file.exists() else None
 
     @classmethod
     def resume(cls, storage: Storage, config: LeagueConfig, role: Role = MAIN) -> Self:

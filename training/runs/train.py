@@ -50,6 +50,7 @@ def train(
     role: Role = MAIN,
     target: CheckpointRef | None = None,
     resume: bool = False,
+    name: str | None = None,
     address: str | None = None,
     local: LocalRay = UNLIMITED,
     config_path: Path | None = None,
@@ -73,6 +74,8 @@ def train(
         resume: Continue the league's newest run of this role, which was interrupted or has a larger budget now. Its
             versions stay, and checkpoints that were saved but not published are published first. With a checkpoint
             interval in steps and one runner, the versions equal those of an uninterrupted run.
+        name: The id of the run, by default a new one. A run with this id continues with the settings that it began
+            with; if it is complete, nothing is trained.
         address: A running Ray cluster. None uses the Ray that this process is connected to, or starts one.
         local: Limits of a Ray that is started; it ends with the run.
         config_path: The file of `config`; its git commit is recorded in the manifests.
@@ -102,11 +105,16 @@ def train(
     if exploits is not None:
         config = against(config, exploits)
     number = None if parent is None else _parent(registry, parent, config, interface).number
-    interrupted = RunDirectory.resume(registry.storage, config, role) if resume else None
+    if resume:
+        interrupted: RunDirectory | None = RunDirectory.resume(registry.storage, config, role)
+    else:
+        interrupted = None if name is None else RunDirectory.find(registry.storage, config.league, name)
+    if interrupted is not None and interrupted.record.complete:
+        return published_versions(registry, interrupted)
     pins = {} if interrupted else pin_opponents(config, registry, interface)
     with connected(address, registry.storage, local) as dashboard:
         run = interrupted or RunDirectory.begin(
-            registry.storage, config, number, git_commit(config_path), pins, exploits
+            registry.storage, config, number, git_commit(config_path), pins, exploits, name
         )
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
         with run.locked(), progress, RunReporter(registry, run) as reporter:

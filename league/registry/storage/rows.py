@@ -272,6 +272,30 @@ class NightlyRunRow:
     ended_at: datetime | None
 
 
+@dataclass(frozen=True, slots=True)
+class TrainingNightRow:
+    """A night of training of a league; `ended_at` is None while it runs."""
+
+    id: int
+    league: str
+    parent: int | None
+    """The version that training continues from."""
+    steps: dict[str, Any]
+    """step → result of each complete step"""
+    began_at: datetime
+    ended_at: datetime | None
+
+    @property
+    def run(self) -> str:
+        """Id of its training run."""
+        return f"{self.began_at:%Y%m%d-%H%M%S}-night-{self.id}"
+
+    @property
+    def exploiter_run(self) -> str:
+        """Id of the training run of its exploiter."""
+        return f"{self.run}-exploiter"
+
+
 EvaluationState = Literal["queued", "running", "done", "failed", "stopped"]
 
 

@@ -359,6 +359,22 @@ class NightlyRunTable(Base):
     ended_at: Mapped[datetime | None] = mapped_column(Utc)
 
 
+class TrainingNightTable(Base):
+    """A night of training: the results of its steps. Open until `ended_at`."""
+
+    __tablename__ = "training_nights"
+    __table_args__ = (Index("ix_training_nights_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    parent: Mapped[int | None]
+    """The version that training continues from."""
+    steps: Mapped[dict[str, Any]] = mapped_column(JSON)
+    """step → result of each complete step"""
+    began_at: Mapped[datetime] = mapped_column(Utc)
+    ended_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
 class EvaluationTable(Base):
     """An evaluation with its request, runner, progress and result."""
 

@@ -1,0 +1,177 @@
+"""A night of training: train, gate, train an exploiter of the champion, measure its exploitability.
+
+The result of each step is recorded in the registry before the next step begins. The next process repeats a step that
+was interrupted: its training run and its schedules have fixed names, so that it continues and nothing is done twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from evaluation.gating.exploitability import exploitability
+from evaluation.gating.nightly import nightly
+from evaluation.results import Listener, NightlyReport
+from league.config.league import LeagueConfig
+from league.environments.building import interface
+from league.errors import AlreadyRunning, LeagueError, StorageError, one_line
+from league.refs import CHAMPION, CheckpointRef
+from league.registry.registry import Registry
+from league.registry.storage.rows import TrainingNightRow
+from league.seeds import derive
+
+
+class Trainer(Protocol):
+    """Trains and publishes versions. A call with the name of an earlier run continues that run."""
+
+    def __call__(self, config: LeagueConfig, /, *, name: str, parent: int | None, target: str | None) -> object:
+        """Train until the budget is spent. target: the version that an exploiter is trained against.
+
+        Raises LeagueError.
+        """
+
+
+@dataclass
+class _Night:
+    config: LeagueConfig
+    registry: Registry
+    row: TrainingNightRow
+    train: Trainer
+    workers: int
+    listener: Listener | None
+    gate_report: NightlyReport | None = field(default=None)
+
+    def versions(self, run: str) -> list[str]:
+        """References of the versions that a training run has published."""
+        rows = self.registry.versions.all(self.config.league)
+        return [row.ref for row in rows if row.source.partition("/")[0] == run]
+
+    def earlier(self, step: str, target: str) -> dict[str, Any] | None:
+        """The newest successful result of a step for the same champion in an earlier night."""
+        nights = self.registry.training_nights.all(self.config.league)
+        results = [night.steps.get(step, {}) for night in nights if night.id < self.row.id]
+        same = (each for each in reversed(results) if each.get("target") == target and "error" not in each)
+        return next(same, None)
+
+
+def training_night(
+    config: LeagueConfig,
+    *,
+    registry: Registry,
+    train: Trainer,
+    workers: int = 0,
+    listener: Listener | None = None,
+    announce: Callable[[str], None] = lambda _: None,
+) -> tuple[TrainingNightRow, NightlyReport | None]:
+    """Begin a league's night of training, or continue the one that was interrupted.
+
+    A failed training run or measurement does not stop the night: its step records the error.
+
+    Args:
+        config: Configuration of the league.
+        registry: Registry of the league.
+        train: Trains a run.
+        workers: Parallel Ray tasks; 0 plays in this process.
+        listener: Receives progress and verdicts.
+        announce: Receives a sentence at the beginning of each step.
+
+    Returns:
+        The night with the results of its steps, and the report of the gate if this process ran it.
+
+    Raises:
+        AlreadyRunning: Another process works on a night or a nightly run of this league.
+        LeagueError: The errors of `nightly`.
+    """
+    with registry.exclusive_lock(f"training-night-{config.league}"):
+        registry.leagues.register(config, interface(config))
+        row = registry.training_nights.open(config.league)
+        night = _Night(config, registry, row, train, workers, listener)
+        for number, (name, step) in enumerate(STEPS.items(), 1):
+            if name not in night.row.steps:
+                announce(f"{config.league}: night {row.id}, step {number} of {len(STEPS)}: {name}")
+                night.row = registry.training_nights.record(row.id, name, step(night))
+        return registry.training_nights.close(row.id), night.gate_report
+
+
+def _train(night: _Night) -> dict[str, Any]:
+    seed = derive(night.config.training.seed, "night", night.row.id)
+    error = _attempt(night, night.config.of_night(seed), night.row.run, night.row.parent, None)
+    return {"run": night.row.run, "versions": night.versions(night.row.run)} | error
+
+
+def _attempt(night: _Night, config: LeagueConfig, run: str, parent: int | None, target: str | None) -> dict[str, str]:
+    """Train. Returns the error, if any."""
+    try:
+        night.train(config, name=run, parent=parent, target=target)
+    except (AlreadyRunning, StorageError):
+        raise
+    except LeagueError as error:
+        return {"error": one_line(error)}
+    return {}
+
+
+def _gate(night: _Night) -> dict[str, Any]:
+    registry, league = night.registry, night.config.league
+    night.gate_report = nightly(night.config, registry=registry, workers=night.workers, listener=night.listener)
+    began = night.row.began_at
+    verdicts = [
+        {"candidate": f"{league}@{row.candidate}", "opponent": row.champion, "outcome": row.outcome}
+        for row in registry.verdicts.all(league)
+        if row.closed_at is not None and row.closed_at >= began
+    ]
+    champion = registry.aliases.current(league).get(CHAMPION)
+    before = registry.aliases.history(league, at=began)
+    return {
+        "champion_before": f"{league}@{before[0].version}" if before else None,
+        "champion": None if champion is None else f"{league}@{champion}",
+        "verdicts": verdicts,
+    }
+
+
+def _exploiter(night: _Night) -> dict[str, Any]:
+    """Train an exploiter of the champion, unless there is one from an earlier night."""
+    target, share = night.row.steps["gate"]["champion"], night.config.nightly.exploiter
+    league = night.registry.leagues.get(night.config.league)
+    if target is None or share == 0 or len(league.interface.sides) < 2:
+        return {"target": target, "versions": []}
+    if (earlier := night.earlier("exploiter", target)) is not None and earlier["versions"]:
+        return earlier
+    run = night.row.exploiter_run
+    seed = derive(night.config.training.seed, "night", night.row.id, "exploiter")
+    parent = CheckpointRef.parse(target).version
+    assert isinstance(parent, int)
+    error = _attempt(night, night.config.of_night(seed, share), run, parent, target)
+    return {"target": target, "run": run, "versions": night.versions(run)} | error
+
+
+def _measure(night: _Night) -> dict[str, Any]:
+    """Play the champion against the newest version of its exploiter."""
+    exploiter = night.row.steps["exploiter"]
+    target, versions = exploiter["target"], exploiter["versions"]
+    if not versions:
+        return {"target": target, "exploitability": None}
+    if (earlier := night.earlier("measure", target)) is not None and earlier["exploitability"]:
+        return earlier
+    try:
+        found = exploitability(
+            CheckpointRef.parse(target),
+            versions[-1:],
+            registry=night.registry,
+            workers=night.workers,
+            listener=night.listener,
+        )
+    except (AlreadyRunning, StorageError):
+        raise
+    except LeagueError as error:
+        return {"target": target, "exploitability": None, "error": one_line(error)}
+    return {"target": target, "exploitability": found.to_json()}
+
+
+STEPS: dict[str, Callable[[_Night], dict[str, Any]]] = {
+    "train": _train,
+    "gate": _gate,
+    "exploiter": _exploiter,
+    "measure": _measure,
+}
+"""The steps of a night, in order."""

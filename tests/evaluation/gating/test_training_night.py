@@ -1,0 +1,200 @@
+"""Nights of training with a trainer that publishes handwritten versions."""
+
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy.orm import Session
+
+from evaluation.gating.training_night import training_night
+from league.config.league import LeagueConfig
+from league.errors import AlreadyRunning, ConfigError
+from league.registry.registry import Registry
+from league.registry.storage.database import Database
+from league.results.ledger import Ledger
+from league.settings import Storage
+from tests.support.leagues import tictactoe
+from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
+
+GATE = {"elo1": 150, "max_blocks": 100, "confirmation_blocks": 4}
+CONFIG = tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 4})
+LEAGUE = tictactoe.LEAGUE
+
+
+@pytest.fixture(autouse=True)
+def few_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evaluation.gating.nightly.RATING_BLOCKS", 4)
+    monkeypatch.setattr("evaluation.gating.training_night.exploitability", _short_exploitability())
+
+
+def _short_exploitability() -> Any:
+    from evaluation.gating.exploitability import exploitability
+
+    return partial(exploitability, blocks=4)
+
+
+class Trainer:
+    """Publishes the next graph for each new run, as training that resumes does: once for each name."""
+
+    def __init__(self, registry: Registry, *graphs: bytes) -> None:
+        self.registry, self.graphs = registry, graphs
+        self.calls: list[tuple[str, int | None, str | None]] = []
+
+    def __call__(self, config: LeagueConfig, *, name: str, parent: int | None, target: str | None) -> None:
+        self.calls.append((name, parent, target))
+        source, rows = f"{name}/100", self.registry.versions.all(LEAGUE)
+        if source not in {row.source for row in rows}:
+            graph = self.graphs[len(rows)]
+            build = tictactoe._builder(self.registry.leagues.get(LEAGUE), graph, target)
+            self.registry.publisher.publish(LEAGUE, build, source=source, parent=None)
+
+
+def state(registry: Registry) -> dict[str, Any]:
+    """All data that a night leaves, without times."""
+    return {
+        "versions": [(row.number, row.role, row.exploits) for row in registry.versions.all(LEAGUE)],
+        "matches": Ledger(registry).matches(league=LEAGUE),
+        "verdicts": [(row.id, row.outcome) for row in registry.verdicts.all(LEAGUE)],
+        "champions": [(event.version, event.previous) for event in registry.aliases.history(LEAGUE)],
+        "nights": [
+            (night.parent, _without_runs(night.steps), night.ended_at is None)
+            for night in registry.training_nights.all(LEAGUE)
+        ],
+    }
+
+
+def _without_runs(steps: dict[str, Any]) -> dict[str, Any]:
+    """Ids of runs contain the time."""
+    return {step: {key: value for key, value in result.items() if key != "run"} for step, result in steps.items()}
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    opened = league_of(tmp_path / "home", config=CONFIG)
+    yield opened
+    opened.close()
+
+
+def test_a_night_trains_gates_and_measures_the_champion(registry: Registry) -> None:
+    trainer = Trainer(registry, STRONG, STRONGEST)
+    announced: list[str] = []
+    night, report = training_night(CONFIG, registry=registry, train=trainer, announce=announced.append)
+    assert trainer.calls == [(night.run, None, None), (night.exploiter_run, 1, "tictactoe@1")]
+    assert report is not None
+    assert report.champion == "tictactoe@1"
+    assert night.ended_at is not None
+    assert night.steps["train"]["versions"] == ["tictactoe@1"]
+    gate = night.steps["gate"]
+    assert (gate["champion_before"], gate["champion"]) == (None, "tictactoe@1")
+    assert gate["verdicts"] == [{"candidate": "tictactoe@1", "opponent": "script:random", "outcome": "promote"}]
+    assert night.steps["exploiter"]["versions"] == ["tictactoe@2"]
+    measured = night.steps["measure"]["exploitability"]
+    assert (measured["ref"], measured["exploiters"][0]["ref"]) == ("tictactoe@1", "tictactoe@2")
+    assert [line.partition("step ")[2] for line in announced] == [
+        "1 of 4: train",
+        "2 of 4: gate",
+        "3 of 4: exploiter",
+        "4 of 4: measure",
+    ]
+
+
+def test_a_champion_that_stays_keeps_its_exploiter_and_its_measurement(registry: Registry) -> None:
+    trainer = Trainer(registry, STRONG, STRONGEST, WEAK)
+    first, _ = training_night(CONFIG, registry=registry, train=trainer)
+    second, _ = training_night(CONFIG, registry=registry, train=trainer)
+    assert trainer.calls[2:] == [(second.run, 1, None)]
+    assert second.steps["gate"]["champion"] == "tictactoe@1"
+    assert second.steps["measure"] == first.steps["measure"]
+
+
+def test_failed_training_is_recorded_and_the_night_goes_on(registry: Registry) -> None:
+    tictactoe.publish(registry, STRONG)
+
+    def fail(*_: object, **__: object) -> None:
+        raise ConfigError("no such opponent")
+
+    night, report = training_night(CONFIG, registry=registry, train=fail)
+    assert night.parent == 1, "the newest version, without a champion"
+    assert night.steps["train"]["error"] == "no such opponent"
+    assert report is not None
+    assert report.champion == "tictactoe@1"
+    assert night.steps["exploiter"]["error"] == "no such opponent"
+    assert night.steps["measure"]["exploitability"] is None
+
+
+def test_a_run_in_another_process_leaves_the_night_open(registry: Registry) -> None:
+    def busy(*_: object, **__: object) -> None:
+        raise AlreadyRunning("training run x is running in another process")
+
+    with pytest.raises(AlreadyRunning):
+        training_night(CONFIG, registry=registry, train=busy)
+    (night,) = registry.training_nights.all(LEAGUE)
+    assert (night.steps, night.ended_at) == ({}, None)
+
+
+def test_the_budget_of_an_exploiter_is_a_fraction_of_the_nights() -> None:
+    config = tictactoe.config(
+        training={"steps": 1000, "minutes": 9},
+        nightly={"minutes": 4, "exploiter": 0.25, "opponents": [{"ref": "script:random", "share": 0.5}]},
+    )
+    main, exploiter = config.of_night(7).training, config.of_night(8, config.nightly.exploiter).training
+    assert (main.seed, main.minutes, main.steps, main.checkpoint_every) == (7, 4, 1000, 200_000)
+    assert (exploiter.seed, exploiter.minutes, exploiter.steps, exploiter.checkpoint_every) == (8, 1, 250, None)
+    assert [each.ref for each in main.opponents.fixed] == ["script:random"]
+
+
+class ProcessDeath(BaseException):
+    """Simulates the death of the process."""
+
+
+@contextmanager
+def crash_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Crash after the `writes`-th transaction; yields a counter of the transactions."""
+    original, count, caller = Database.write, [0], threading.get_ident()
+
+    @contextmanager
+    def write(database: Database) -> Iterator[Session]:
+        with original(database) as session:
+            yield session
+        if threading.get_ident() != caller:
+            return
+        count[0] += 1
+        if count[0] == writes:
+            raise ProcessDeath
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "write", write)
+        yield count
+
+
+@pytest.mark.slow
+def test_a_night_that_died_after_any_transaction_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    league_of(tmp_path / "fresh", MIDDLING, config=CONFIG).close()
+
+    def run(registry: Registry) -> None:
+        training_night(CONFIG, registry=registry, train=Trainer(registry, MIDDLING, STRONG, STRONGEST))
+
+    quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
+    with crash_after(0, monkeypatch) as count:
+        run(quiet)
+    expected, writes = state(quiet), count[0]
+    assert writes > 15
+    assert len(expected["versions"]) == 3
+    for crash_at in range(writes, 0, -1):
+        registry = _copy(tmp_path / "fresh", tmp_path / str(crash_at))
+        with crash_after(crash_at, monkeypatch), pytest.raises(ProcessDeath):
+            run(registry)
+        if registry.training_nights.all(LEAGUE) == [] or registry.training_nights.all(LEAGUE)[0].ended_at is None:
+            run(registry)
+        assert state(registry) == expected, f"after transaction {crash_at}"
+        registry.close()
+
+
+def _copy(home: Path, to: Path) -> Registry:
+    shutil.copytree(home, to)
+    return Registry.open(Storage.at(to))
