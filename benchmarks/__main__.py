@@ -20,6 +20,7 @@ ORDER = (
     "promotions",
     "shadowing",
     "footprint",
+    "object_store",
     "faults",
     "fuzz",
     "hostile",

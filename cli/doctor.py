@@ -111,9 +111,25 @@ def _home() -> Iterator[Check]:
         "" if writable else "set LEAGUE_HOME to a writable directory",
     )
     yield _disk("disk", existing, "LEAGUE_HOME")
+    if not isinstance(storage.artifacts, Path):
+        return
     store = next(path for path in (storage.artifacts, *storage.artifacts.parents) if path.exists())
     if store.stat().st_dev != existing.stat().st_dev:
         yield _disk("disk of artefacts", store, "LEAGUE_ARTIFACTS")
+
+
+def _object_store() -> Iterator[Check]:
+    from league.registry.storage.object_artifacts import ObjectArtifactStore
+
+    storage = Storage.from_environment()
+    if isinstance(storage.artifacts, Path):
+        return
+    try:
+        ObjectArtifactStore(storage.artifacts, storage.home).check_writable()
+    except LeagueError as error:
+        yield Check("object store", "fail", str(error), "check LEAGUE_ARTIFACTS and the store's credentials")
+        return
+    yield Check("object store", "ok", f"{storage.artifacts} is reachable and writable")
 
 
 def _disk(what: str, path: Path, variable: str) -> Check:
@@ -188,6 +204,7 @@ CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _processor,
     _accelerator,
     _home,
+    _object_store,
     _registry,
     _ray,
     _haproxy,

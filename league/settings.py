@@ -7,6 +7,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from league.errors import ConfigError
 
+OBJECT_STORES = ("s3", "gs", "az")
+"""URL schemes of object stores."""
+
 
 @dataclass(frozen=True, slots=True)
 class Storage:
@@ -14,7 +17,8 @@ class Storage:
 
     home: Path
     database_url: str
-    artifacts: Path
+    artifacts: Path | str
+    """A directory, or the URL of an object store."""
 
     @classmethod
     def at(cls, home: Path | str) -> "Storage":
@@ -30,7 +34,7 @@ class Storage:
         return cls(
             home=default.home,
             database_url=os.environ.get("LEAGUE_DATABASE_URL") or default.database_url,
-            artifacts=Path(artifacts).expanduser().absolute() if artifacts else default.artifacts,
+            artifacts=_artifacts(artifacts) if artifacts else default.artifacts,
         )
 
     @property
@@ -58,13 +62,24 @@ class Storage:
 
     def check_reach(self, machines: set[str]) -> None:
         """Raise ConfigError if several machines cannot share the storage: SQLite, or artefacts in `home`."""
-        is_shared = not self.database_url.startswith("sqlite") and not self.artifacts.is_relative_to(self.home)
+        is_local = isinstance(self.artifacts, Path) and self.artifacts.is_relative_to(self.home)
+        is_shared = not self.database_url.startswith("sqlite") and not is_local
         if len(machines) > 1 and not is_shared:
             raise ConfigError(
                 f"the cluster has {len(machines)} machines: set LEAGUE_DATABASE_URL to a PostgreSQL server and"
-                " LEAGUE_ARTIFACTS to a directory that all of them mount"
+                " LEAGUE_ARTIFACTS to an object store (s3://bucket/prefix) or a directory that all of them mount"
             )
 
     def export(self) -> None:
         """Set the three variables in this process, so that Ray's workers inherit them."""
         os.environ |= self.environment
+
+
+def _artifacts(value: str) -> Path | str:
+    scheme, separator, location = value.partition("://")
+    if not separator:
+        return Path(value).expanduser().absolute()
+    if scheme not in OBJECT_STORES or not location.strip("/"):
+        known = ", ".join(f"{each}://BUCKET/PREFIX" for each in OBJECT_STORES)
+        raise ConfigError(f"LEAGUE_ARTIFACTS={value}: expected a directory or one of {known}")
+    return value.rstrip("/")

@@ -209,7 +209,7 @@ def test_the_server_image_has_all_dependencies_except_those_of_training() -> Non
     expected = [each.replace("ray[rllib,serve,tune]", "ray[serve]") for each in expected]
     listed = (ROOT / "deploy/server-requirements.txt").read_text().splitlines()
     assert [line for line in listed if line[0] != "#"] == sorted(
-        expected + PROJECT["optional-dependencies"]["postgres"]
+        expected + PROJECT["optional-dependencies"]["postgres"] + PROJECT["optional-dependencies"]["object-store"]
     )
 
 

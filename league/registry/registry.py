@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Self
 
 from league.registry.aliases import AliasRepository
@@ -17,11 +18,15 @@ from league.registry.snapshots import SnapshotRepository
 from league.registry.storage import exclusive_lock
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database
+from league.registry.storage.object_artifacts import ObjectArtifactStore
 from league.registry.traffic import TrafficRepository
 from league.registry.training_nights import TrainingNightRepository
 from league.registry.verdicts import NightlyRunRepository, VerdictRepository
 from league.registry.versions import VersionRepository
 from league.settings import Storage
+
+OBJECT_STORE_FILES = "object-store"
+"""Directory in the home: cached files of an object store, and uploads in progress."""
 
 
 class Registry:
@@ -34,7 +39,7 @@ class Registry:
     def __init__(self, storage: Storage, database: Database) -> None:
         self.storage = storage
         self.database = database
-        self.artifacts = ArtifactStore(storage.artifacts)
+        self.artifacts = artifact_store(storage)
         self.leagues = LeagueRepository(database)
         self.versions = VersionRepository(database, self.artifacts)
         self.retention = RetentionRepository(database, self.artifacts)
@@ -73,3 +78,10 @@ class Registry:
         """
         with exclusive_lock.hold(self.database, self.storage.home, name):
             yield
+
+
+def artifact_store(storage: Storage) -> ArtifactStore:
+    """Return the artefact store of a storage: a directory or an object store."""
+    if isinstance(storage.artifacts, Path):
+        return ArtifactStore(storage.artifacts)
+    return ObjectArtifactStore(storage.artifacts, storage.home / OBJECT_STORE_FILES)

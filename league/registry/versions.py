@@ -99,7 +99,7 @@ class VersionRepository(Repository):
         Raises ArtifactCorrupt, or VersionRetired if the version or this folder was removed.
         """
         manifest = self._artifacts.verify_names(league, number, self._with_files(league, number).sha256)
-        if not (self._artifacts.path(league, number) / folder).is_dir():
+        if not self._artifacts.has_folder(league, number, folder):
             raise VersionRetired(f"{league}@{number} has no {folder} state any more: `league retire` removed it")
         self._artifacts.copy(manifest, folder, target)
         return target

@@ -11,14 +11,15 @@ from serve_app.observability.metrics import Report
 
 
 class DiskSpace:
-    """Free and total bytes of the disks of the home and of the artefact store.
+    """Free and total bytes of the disks of the home and of the artefact store, unless that is an object store.
 
     A network disk that does not respond blocks whoever asks for its size. Therefore a thread measures, and a disk
     without an answer has no samples.
     """
 
     def __init__(self, storage: Storage) -> None:
-        self._paths: Mapping[str, Path] = {"home": storage.home, "artifacts": storage.artifacts}
+        disks = {"home": storage.home, "artifacts": storage.artifacts}
+        self._paths: Mapping[str, Path] = {disk: path for disk, path in disks.items() if isinstance(path, Path)}
         self._sizes: dict[str, tuple[int, int]] = {}
         self._threads: dict[str, Thread] = {}
 

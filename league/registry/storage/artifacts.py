@@ -100,6 +100,10 @@ class ArtifactStore:
         with disk_errors(directory):
             return directory.parent.is_dir() and not directory.is_dir()
 
+    def has_folder(self, league: str, number: int, folder: str) -> bool:
+        """Return whether a version has files in a folder."""
+        return (self.path(league, number) / folder).is_dir()
+
     def verify(self, league: str, number: int, sha256: str) -> Path:
         """Return the directory of a version after verifying all its files. Raises ArtifactCorrupt."""
         directory, manifest = self.path(league, number), self.verify_names(league, number, sha256)
@@ -107,7 +111,7 @@ class ArtifactStore:
             for name in self._expected(manifest):
                 path, digest = directory / name, manifest.files[name]
                 # Reading a pipe or a device, which a link may point to, would not end.
-                check_digest(_label(league, number, name), digest, file_sha256(path) if path.is_file() else None)
+                check_digest(label(league, number, name), digest, file_sha256(path) if path.is_file() else None)
         return directory
 
     def verify_names(self, league: str, number: int, sha256: str) -> Manifest:
@@ -120,15 +124,15 @@ class ArtifactStore:
         with disk_errors(directory):
             present = set(files_in(directory)) - {MANIFEST}
         for name in sorted(present - set(manifest.files)):
-            raise ArtifactCorrupt(f"{_label(league, number, name)} does not belong to {league}@{number}")
+            raise ArtifactCorrupt(f"{label(league, number, name)} does not belong to {league}@{number}")
         for name in sorted(self._expected(manifest) - present):
-            check_digest(_label(league, number, name), manifest.files[name], None)
+            check_digest(label(league, number, name), manifest.files[name], None)
         return manifest
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
         """Read the manifest of a version. Raises ArtifactCorrupt if its digest is not `sha256`."""
         content = self._verified(league, number, MANIFEST, sha256)
-        return Manifest.from_json(content, source=_label(league, number, MANIFEST))
+        return Manifest.from_json(content, source=label(league, number, MANIFEST))
 
     def read(self, manifest: Manifest, name: str) -> bytes:
         """Read and verify one file of a version. Raises ArtifactCorrupt."""
@@ -149,7 +153,7 @@ class ArtifactStore:
             if name.startswith(f"{folder}/")
         }
         source = self.path(manifest.league, manifest.version) / folder
-        copy_verified(source, names, target, _label(manifest.league, manifest.version, folder))
+        copy_verified(source, names, target, label(manifest.league, manifest.version, folder))
 
     def _expected(self, manifest: Manifest) -> set[str]:
         """Return the names of all files that must exist."""
@@ -157,14 +161,18 @@ class ArtifactStore:
         return {name for name in manifest.files if has_training or not name.startswith(f"{TRAINING}/")}
 
     def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
-        path = self.path(league, number) / name
-        with disk_errors(path):
-            content = path.read_bytes() if path.is_file() else None
+        content = self._content(league, number, name, digest)
         check_digest(
-            _label(league, number, name), digest, None if content is None else hashlib.sha256(content).hexdigest()
+            label(league, number, name), digest, None if content is None else hashlib.sha256(content).hexdigest()
         )
         assert content is not None
         return content
+
+    def _content(self, league: str, number: int, name: str, digest: str) -> bytes | None:  # noqa: ARG002
+        """Return a file, which is not verified. digest: for stores that cache by it."""
+        path = self.path(league, number) / name
+        with disk_errors(path):
+            return path.read_bytes() if path.is_file() else None
 
     def _staging(self, league: str, number: int) -> Path:
         return self.root / league / f"{STAGING}{number}"
@@ -176,6 +184,6 @@ def _size(directory: Path) -> int:
         return sum(path.lstat().st_size for path in directory.rglob("*") if not path.is_dir())
 
 
-def _label(league: str, number: int, name: str) -> str:
-    """A file as messages name it: callers on other machines need not know where the store is."""
+def label(league: str, number: int, name: str) -> str:
+    """Return a file as messages name it: callers on other machines need not know where the store is."""
     return f"{league}/{number}/{name}"
