@@ -193,7 +193,7 @@ def summary_of_night(night: "TrainingNightRow") -> list[str]:
         best = found["exploiters"][0]
         sentences.append(
             f"{found['ref']}: {best['ref']} scores {best['score']:.3f} [{best['low']:.3f}, {best['high']:.3f}] against"
-            " it, a lower bound on what a best response scores."
+            f" it. A best response scores at least {found['bound']:.3f}."
         )
     return sentences
 

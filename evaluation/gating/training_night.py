@@ -95,9 +95,14 @@ def training_night(
 
 
 def _train(night: _Night) -> dict[str, Any]:
-    seed = derive(night.config.training.seed, "night", night.row.id)
+    seed = _seed(night)
     error = _attempt(night, night.config.of_night(seed), night.row.run, night.row.parent, None)
     return {"run": night.row.run, "versions": night.versions(night.row.run)} | error
+
+
+def _seed(night: _Night, *path: str) -> int:
+    """Seed of a training run. NumPy's legacy generator, which RLlib seeds, takes 32 bits."""
+    return derive(night.config.training.seed, "night", night.row.id, *path) % 2**31
 
 
 def _attempt(night: _Night, config: LeagueConfig, run: str, parent: int | None, target: str | None) -> dict[str, str]:
@@ -138,7 +143,7 @@ def _exploiter(night: _Night) -> dict[str, Any]:
     if (earlier := night.earlier("exploiter", target)) is not None and earlier["versions"]:
         return earlier
     run = night.row.exploiter_run
-    seed = derive(night.config.training.seed, "night", night.row.id, "exploiter")
+    seed = _seed(night, "exploiter")
     parent = CheckpointRef.parse(target).version
     assert isinstance(parent, int)
     error = _attempt(night, night.config.of_night(seed, share), run, parent, target)

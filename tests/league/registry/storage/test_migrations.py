@@ -112,7 +112,7 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
         for table, columns in added.items():
             for column in columns:
                 operations.drop_column(table, column)
-        for table in ("snapshots", "run_points", "runs", "version_notes", "replicas"):
+        for table in ("snapshots", "run_points", "runs", "version_notes", "replicas", "training_nights"):
             operations.drop_table(table)
         connection.execute(text("UPDATE alembic_version SET version_num = '0005'"))
     registry.close()
