@@ -30,7 +30,7 @@ from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 3
+FORMAT = 4
 """Version of the document format. A new format invalidates all snapshots."""
 _COUNTS: dict[str, Executable] = {
     "matches": select(MatchTable.league, func.count()).group_by(MatchTable.league),
