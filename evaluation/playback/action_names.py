@@ -42,7 +42,7 @@ def direction_keys(names: Mapping[str, str]) -> dict[str, int]:
             found[directions.pop()].append((len(words), int(action)))
     keys: dict[str, int] = {}
     for direction, candidates in found.items():
-        fewest, number = min(candidates)
+        fewest, chosen = min(candidates)
         if [words for words, _ in candidates].count(fewest) == 1:
-            keys |= dict.fromkeys(KEYS[direction], number)
+            keys |= dict.fromkeys(KEYS[direction], chosen)
     return keys
