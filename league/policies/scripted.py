@@ -2,7 +2,7 @@
 
 `random` samples uniformly from the legal actions; `first` takes the first one. `mirror` repeats its observation, which
 is the opponent's last move in rock, paper, scissors. `one_ply`, `minimax_2`, `minimax_4`, `mcts_100`, `mcts_1000` and
-`solver` play connect four and tic-tac-toe; see `line_games`, `minimax`, `search` and `solver` in `league.policies`.
+`solver` play connect four and tic-tac-toe; see `league.policies.line_games`.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from league.errors import EnvironmentMismatch, UnknownPolicy
 from league.policies.actions import bounds, check_legal_action, to_environment
 from league.policies.bots import Bot
 from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
-from league.policies.line_games import OnePly
-from league.policies.minimax import Minimax
+from league.policies.line_games.game import OnePly
+from league.policies.line_games.mcts import MCTS
+from league.policies.line_games.minimax import Minimax
+from league.policies.line_games.solver import Solver
 from league.policies.policy import Actions, Arrays, Policy
-from league.policies.search import MCTS
-from league.policies.solver import Solver
 from league.spaces import (
     ACTION_MASK,
     OBSERVATION,

@@ -8,7 +8,7 @@ from datetime import timedelta
 from sqlalchemy import func, select
 
 from league.errors import AliasMoved, Conflict, NotReady
-from league.registry import aliases, evaluations, replicas, runs
+from league.registry import aliases, evaluations, replicas
 from league.registry.aliases import AliasRepository
 from league.registry.replicas import LIVENESS_TIMEOUT, ReplicaRepository
 from league.registry.storage.database import Database, Repository
@@ -25,6 +25,7 @@ from league.registry.storage.tables import (
     VersionTable,
 )
 from league.registry.traffic import TrafficRepository
+from league.registry.training import runs
 
 OPEN = "open"
 POLL_SECONDS = 0.02

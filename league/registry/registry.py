@@ -13,14 +13,14 @@ from league.registry.leagues import LeagueRepository
 from league.registry.publishing import VersionPublisher
 from league.registry.replicas import ReplicaRepository
 from league.registry.retention import RetentionRepository
-from league.registry.runs import RunRepository
 from league.registry.snapshots import SnapshotRepository
 from league.registry.storage import exclusive_lock
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database
 from league.registry.storage.object_artifacts import ObjectArtifactStore
 from league.registry.traffic import TrafficRepository
-from league.registry.training_nights import TrainingNightRepository
+from league.registry.training.nights import TrainingNightRepository
+from league.registry.training.runs import RunRepository
 from league.registry.verdicts import NightlyRunRepository, VerdictRepository
 from league.registry.versions import VersionRepository
 from league.settings import Storage

@@ -50,7 +50,7 @@ def is_metric(name: str, value: Any) -> bool:
 
 logger = logging.getLogger("policy_league")
 HEARTBEAT_SECONDS = 5.0
-"""Maximum interval between heartbeats, in seconds: far less than `league.registry.runs.HEARTBEAT_TIMEOUT`."""
+"""Maximum interval between heartbeats, in seconds: far less than `league.registry.training.runs.HEARTBEAT_TIMEOUT`."""
 FINAL_REPORT_SECONDS = 10.0
 """How long an ending driver waits for the registry, in seconds."""
 RETRY_SECONDS = 0.5

@@ -72,7 +72,7 @@ def test_a_wrong_return_value_is_a_malformed_action() -> None:
         (f"{MODULE}:missing", "bots.py\\) has no 'missing'"),
         (f"{MODULE}:NOT_A_BOT", "is a int: expected a function, or a class with a method `act`"),
         (f"{MODULE}:needs_more", "requires 'depth': expected the arguments observation, action_mask and rng"),
-        ("no_such_module:act", "cannot import 'no_such_module': .* were searched"),
+        ("no_such_module:act", "cannot import 'no_such_module': .*; searched: "),
     ],
 )
 def test_what_is_not_a_bot_is_rejected(name: str, message: str) -> None:

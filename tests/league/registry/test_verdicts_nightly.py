@@ -77,7 +77,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.waiting import until
 from pathlib import Path
-storage = Storage(Path(sys.argv[1]), sys.argv[2], sys.argv[3])
+storage = Storage(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
 with Registry.open(storage).exclusive_lock("nightly-chess"):
     print("held", flush=True)
     sys.stdin.read()

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from league.errors import ParityError
-from league.registry import runs
 from league.registry.registry import Registry
 from league.registry.storage.rows import RunRow
+from league.registry.training import runs
 from league.settings import Storage
 from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from open_spiel.python.algorithms.minimax import alpha_beta_search
 
-from league.policies.line_games import CONNECT_FOUR, TIC_TAC_TOE, LineGame
+from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE, LineGame
+from league.policies.line_games.solver import MAX_EMPTY, LineGameSolver
 from league.policies.scripted import script
-from league.policies.solver import MAX_EMPTY, LineGameSolver
 from tests.support.environments.line_games import environment_after, legal, observations, random_moves, spaces
 
 

@@ -7,11 +7,11 @@ import pytest
 from sqlalchemy import update
 
 from league.errors import InvalidInput, UnknownLeague, UnknownRun
-from league.registry import runs
 from league.registry.registry import Registry
-from league.registry.runs import HEARTBEAT_TIMEOUT
 from league.registry.storage.rows import RunPoint, RunRow
 from league.registry.storage.tables import RunTable
+from league.registry.training import runs
+from league.registry.training.runs import HEARTBEAT_TIMEOUT
 from tests.support.leagues.registries import LEAGUE
 
 SETTINGS = {"algorithm": "ppo", "lr": 3e-4}

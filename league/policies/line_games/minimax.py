@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from league.policies.actions import check_legal_action
 from league.policies.draws import Generators, choose, draw
-from league.policies.line_games import LineGame, line_game
+from league.policies.line_games.game import LineGame, line_game
 from league.policies.policy import Actions, Arrays
 from league.spaces import ACTION_MASK, OBSERVATION, Space
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.policies.line_games import CONNECT_FOUR, TIC_TAC_TOE, LineGame
-from league.policies.minimax import LOST, BatchedMinimax
+from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE, LineGame
+from league.policies.line_games.minimax import LOST, BatchedMinimax
+from league.policies.line_games.solver import LineGameSolver
 from league.policies.scripted import script
-from league.policies.solver import LineGameSolver
 from tests.support.environments.line_games import environment_after, observations, random_moves, spaces
 
 GAMES = {"connect_four": CONNECT_FOUR, "tictactoe": TIC_TAC_TOE}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from league.errors import ConfigError, ObservationError
 from league.policies.actions import check_legal_action
 from league.policies.draws import Generators, draw
-from league.policies.line_games import CONNECT_FOUR, TIC_TAC_TOE, LineGame, line_game
+from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE, LineGame, line_game
 from league.policies.policy import Actions, Arrays
 from league.spaces import ACTION_MASK, OBSERVATION, Space
 

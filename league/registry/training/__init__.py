@@ -1,0 +1,1 @@
+"""What training records in the registry: runs, and nights of training."""
