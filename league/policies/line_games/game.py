@@ -3,6 +3,7 @@
 `one_ply` wins immediately if possible, else prevents the opponent's immediate win, else plays like `random`.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from itertools import product
 
@@ -85,12 +86,8 @@ def line_game(name: str, observation: Space, action: Space) -> LineGame:
     raise EnvironmentMismatch(f"script:{name} supports only the spaces of connect four and tic-tac-toe")
 
 
-class OnePly:
-    """Looks one move ahead in connect four and tic-tac-toe."""
-
-    def __init__(self, observation: Space, action: Space) -> None:
-        self._game = line_game("one_ply", observation, action)
-        self._lines = self._game.lines()
+class BestMoves(ABC):
+    """A script that plays a random one of the moves that it considers best."""
 
     def act(
         self,
@@ -106,8 +103,19 @@ class OnePly:
         best = self.best(observations[OBSERVATION], legal)
         return Actions(choose(best, draw(rng, len(best))))
 
+    @abstractmethod
     def best(self, boards: NDArray, legal: NDArray) -> NDArray:
         """Return the actions that it chooses from: (k, rows, columns, 2) and (k, actions) bool → (k, actions) bool."""
+
+
+class OnePly(BestMoves):
+    """Looks one move ahead in connect four and tic-tac-toe."""
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        self._game = line_game("one_ply", observation, action)
+        self._lines = self._game.lines()
+
+    def best(self, boards: NDArray, legal: NDArray) -> NDArray:
         planes = boards.reshape(len(boards), -1, 2).astype(np.float32)
         empty = planes.sum(axis=2) == 0
         best = legal

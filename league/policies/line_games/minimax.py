@@ -6,11 +6,8 @@ All positions of a batch are searched at once with bitboards, so a teacher of th
 import numpy as np
 from numpy.typing import NDArray
 
-from league.policies.actions import check_legal_action
-from league.policies.draws import Generators, choose, draw
-from league.policies.line_games.game import LineGame, line_game
-from league.policies.policy import Actions, Arrays
-from league.spaces import ACTION_MASK, OBSERVATION, Space
+from league.policies.line_games.game import BestMoves, LineGame, line_game
+from league.spaces import Space
 
 Bitboards = NDArray[np.uint64]
 LOST = -128
@@ -98,28 +95,16 @@ class BatchedMinimax:
         return squares
 
 
-class Minimax:
+class Minimax(BestMoves):
     """Plays a random one of the moves that are best within `plies` moves, in connect four and tic-tac-toe."""
 
     def __init__(self, plies: int, observation: Space, action: Space) -> None:
         self._search = BatchedMinimax(line_game(f"minimax_{plies}", observation, action))
         self._plies = plies
 
-    def act(
-        self,
-        observations: Arrays,
-        *,
-        state: Arrays | None = None,  # noqa: ARG002
-        explore: bool = False,  # noqa: ARG002
-        rng: Generators | None = None,
-    ) -> Actions:
-        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
-        legal = observations[ACTION_MASK] != 0
-        check_legal_action(legal)
-        values = self._search.values(*self._search.positions(observations[OBSERVATION]), self._plies)
-        values = np.where(legal, values, np.int8(LOST))
-        best = legal & (values == values.max(axis=1, keepdims=True))
-        return Actions(choose(best, draw(rng, len(best))))
+    def best(self, boards: NDArray, legal: NDArray) -> NDArray:
+        values = np.where(legal, self._search.values(*self._search.positions(boards), self._plies), LOST)
+        return legal & (values == values.max(axis=1, keepdims=True))
 
 
 def _shift(pieces: Bitboards, distance: int) -> Bitboards:

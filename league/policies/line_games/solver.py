@@ -6,11 +6,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from league.policies.actions import check_legal_action
-from league.policies.draws import Generators, choose, draw
-from league.policies.line_games.game import LineGame, OnePly, line_game
-from league.policies.policy import Actions, Arrays
-from league.spaces import ACTION_MASK, OBSERVATION, Space
+from league.policies.line_games.game import BestMoves, LineGame, OnePly, line_game
+from league.spaces import Space
 
 MAX_EMPTY = 18
 """Number of empty squares up to which positions are solved."""
@@ -77,27 +74,17 @@ class LineGameSolver:
         return False
 
 
-class Solver:
+class Solver(BestMoves):
     """Plays a random one of the best actions if at most MAX_EMPTY squares are empty, else like `one_ply`."""
 
     def __init__(self, observation: Space, action: Space) -> None:
         self._solver = LineGameSolver(line_game("solver", observation, action))
         self._early = OnePly(observation, action)
 
-    def act(
-        self,
-        observations: Arrays,
-        *,
-        state: Arrays | None = None,  # noqa: ARG002
-        explore: bool = False,  # noqa: ARG002
-        rng: Generators | None = None,
-    ) -> Actions:
-        """Choose actions for a batch; see `Policy.act`. Raises IllegalMask if a row allows no action."""
-        boards, legal = observations[OBSERVATION], observations[ACTION_MASK] != 0
-        check_legal_action(legal)
+    def best(self, boards: NDArray, legal: NDArray) -> NDArray:
         best = self._early.best(boards, legal)
         for row in np.flatnonzero((boards.sum(axis=3) == 0).sum(axis=(1, 2)) <= MAX_EMPTY):
             outcomes = self._solver.outcomes(*self._solver.position(boards[row]))
             values = np.array([outcomes.get(action, -2) for action in range(legal.shape[1])])
             best[row] = legal[row] & (values == values[legal[row]].max())
-        return Actions(choose(best, draw(rng, len(best))))
+        return best

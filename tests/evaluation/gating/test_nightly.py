@@ -5,15 +5,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from filelock import FileLock
-from sqlalchemy.orm import Session
 
 from evaluation.gating import verdicts
 from evaluation.gating.nightly import nightly
@@ -26,11 +23,11 @@ from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError
 from league.histograms import BOUNDS
 from league.registry.registry import Registry
-from league.registry.storage.database import Database
 from league.registry.storage.rows import ShadowCounts
 from league.registry.verdicts import VerdictRepository
 from league.results.ledger import Ledger
 from league.settings import Storage
+from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
@@ -144,30 +141,6 @@ def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path) -> Non
     nightly(CONFIG, registry=local)
     nightly(CONFIG, registry=distributed, workers=2)
     assert state(local) == state(distributed)
-
-
-class ProcessDeath(BaseException):
-    """Simulates the death of the process."""
-
-
-@contextmanager
-def crash_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """Crash after the `writes`-th transaction; yields a counter of the transactions."""
-    original, count, caller = Database.write, [0], threading.get_ident()
-
-    @contextmanager
-    def write(database: Database) -> Iterator[Session]:
-        with original(database) as session:
-            yield session
-        if threading.get_ident() != caller:
-            return  # replicas of other tests report their metrics from threads of this process
-        count[0] += 1
-        if count[0] == writes:
-            raise ProcessDeath
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Database, "write", write)
-        yield count
 
 
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])

@@ -1,23 +1,20 @@
 """Nights of training with a trainer that publishes handwritten versions."""
 
 import shutil
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy.orm import Session
 
 from evaluation.gating.training_night import training_night
 from league.config.league import LeagueConfig
 from league.errors import AlreadyRunning, ConfigError
 from league.registry.registry import Registry
-from league.registry.storage.database import Database
 from league.results.ledger import Ledger
 from league.settings import Storage
+from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
@@ -146,30 +143,6 @@ def test_the_budget_of_an_exploiter_is_a_fraction_of_the_nights() -> None:
     assert (main.seed, main.minutes, main.steps, main.checkpoint_every) == (7, 4, 1000, 200_000)
     assert (exploiter.seed, exploiter.minutes, exploiter.steps, exploiter.checkpoint_every) == (8, 1, 250, None)
     assert [each.ref for each in main.opponents.fixed] == ["script:random"]
-
-
-class ProcessDeath(BaseException):
-    """Simulates the death of the process."""
-
-
-@contextmanager
-def crash_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """Crash after the `writes`-th transaction; yields a counter of the transactions."""
-    original, count, caller = Database.write, [0], threading.get_ident()
-
-    @contextmanager
-    def write(database: Database) -> Iterator[Session]:
-        with original(database) as session:
-            yield session
-        if threading.get_ident() != caller:
-            return
-        count[0] += 1
-        if count[0] == writes:
-            raise ProcessDeath
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Database, "write", write)
-        yield count
 
 
 @pytest.mark.slow
