@@ -18,8 +18,11 @@ WORKDIR /source
 COPY . .
 RUN pip install --no-cache-dir build==1.6.1 && python -m build --wheel --outdir /dist
 
-# What is common to both images. Ray keeps its session in /tmp/ray and shared memory in /dev/shm.
+# What is common to both images. Ray keeps its session in /tmp/ray and shared memory in /dev/shm. KubeRay's probes use
+# wget.
 FROM ${BASE} AS runtime
+# hadolint ignore=DL3008
+RUN apt-get update && apt-get install --yes --no-install-recommends wget && rm -rf /var/lib/apt/lists/*
 RUN groupadd --gid 1000 league && useradd --uid 1000 --gid league --create-home league \
     && install --directory --owner league --group league /league
 ENV PATH=/opt/league/bin:$PATH \

@@ -18,11 +18,13 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.simulations import coverage, golden, null_play, sampled_play
+from benchmarks.simulations import coverage, exploiter_gates, golden, null_play, sampled_play
 from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completion
 from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulations.simulated_years import boundary, chance, walk
-from evaluation.gating.gate import NIGHTS, AnchorResult, Decision, alpha_per_verdict, combine_results, decide
+from evaluation.gating.alpha_spending import NIGHTS, alpha_per_verdict
+from evaluation.gating.gate import Decision, decide
+from evaluation.gating.gate_result import AnchorResult, combine_results
 from evaluation.statistics.sequential import expected_games
 from league.config.gate import GateConfig
 from tests.support.leagues import tictactoe
@@ -94,7 +96,9 @@ def traps(quick: bool) -> bool:
     for _ in range(number):
         champion = _decided(settings, against_champion, rng)
         anchor = _decided(settings.against_anchor(None), against_anchor, rng)
-        seen = combine_results(champion, [AnchorResult("trap@1", margin, "s", anchor)], planned_anchors=1, forfeits=0)
+        seen = combine_results(
+            champion, [AnchorResult("trap@1", margin, "s", anchor)], planned_companions=1, forfeits=0
+        )
         beaten += champion.outcome == "promote"
         promoted += seen.outcome == "promote"
     print(f"  {number} traps: {beaten} beat the champion, {promoted} promoted (0)")
@@ -142,6 +146,37 @@ def sampled(quick: bool) -> bool:
     return met and bool(low <= 0.05)
 
 
+def exploiters(quick: bool) -> bool:
+    """Tests against exploiters at the default margin, and intervals of the difference in exploitability."""
+    number, margin, met = 200 if quick else 1_000, SINGLE.margin_against_exploiters, True
+    settings = SINGLE.model_copy(update={"max_blocks": 4000}).against_exploiter(margin)
+    for pairs in (1, 3):
+        found = {gap: exploiter_gates.simulated(settings, gap, pairs, number) for gap in (0.0, -margin)}
+        wrong = {0.0: ~found[0.0].promoted, -margin: found[-margin].promoted}
+        shares = {gap: float(each.mean()) for gap, each in wrong.items()}
+        lows = {gap: binomtest(int(each.sum()), number).proportion_ci(0.95).low for gap, each in wrong.items()}
+        blocks = {gap: float(each.blocks.mean()) for gap, each in found.items()}
+        print(
+            f"  {pairs} exploiter(s) of each, {number} gates: as exploitable: {shares[0.0]:.2%} refused (≤ 5 %) after"
+            f" {blocks[0.0]:.0f} rounds on average; more by {margin:g}: {shares[-margin]:.2%} passed (≤ 5 %) after"
+            f" {blocks[-margin]:.0f}"
+        )
+        met &= max(lows.values()) <= 0.05
+    for spread in (0.0, 0.03, 0.1):
+        rates = {
+            gap: float(exploiter_gates.simulated(settings, gap, 3, number, spread).promoted.mean())
+            for gap in (0.0, -margin)
+        }
+        by_block, by_both = exploiter_gates.coverage(number, spread)
+        print(
+            f"  3 exploiters with a standard deviation of {spread:g} between trainings: as exploitable on average:"
+            f" {1 - rates[0.0]:.2%} refused; more by {margin:g}: {rates[-margin]:.2%} passed; 95 % interval over"
+            f" blocks covers {by_block:.2%}, over blocks and exploiters {by_both:.2%} (95 %)"
+        )
+        met &= _high(round(by_both * number), number) >= 0.95
+    return met
+
+
 def order(quick: bool) -> bool:
     """Games whose duration depends on their result, on workers that finish them in any order."""
     number = 100 if quick else 1_000
@@ -175,6 +210,7 @@ PARTS: dict[str, Callable[[bool], bool]] = {
     "order": order,
     "play": play,
     "sampled": sampled,
+    "exploiters": exploiters,
     "intervals": intervals,
 }
 

@@ -181,7 +181,7 @@ class _Crowd:
             algorithm=CONFIG.training.algorithm,
             settings=CONFIG.training.model_dump(mode="json", by_alias=True),
             seed=number,
-            target=CONFIG.training.steps,
+            target=CONFIG.training.max_steps,
             parent=number or None,
         )
         walk = np.cumsum(self._rng.normal(0.002, 0.02, (RUN_POINTS, len(CURVES))), axis=0)

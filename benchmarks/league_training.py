@@ -44,8 +44,12 @@ OVERHEAD = 1.3
 SEEDS = range(5)
 ARMS: dict[str, dict[str, Any]] = {
     "self-play": {},
-    **{name: {"league": {"sampling": name, "window": 50}} for name in ("uniform", "pfsp", "nash")},
+    **{name: {"opponents": {"league": {"sampling": name, "window": 50}}} for name in ("uniform", "pfsp", "nash")},
+    "magnet": {"magnet": {"ref": "previous", "every": 10, "weight": 0.3}, "entropy": 0.0},
 }
+"""Settings of training in which the arms differ."""
+LESS_EXPLOITABLE = {"nash": "nash", "magnet": "last"}
+"""Arms that must be less exploitable than a third of self-play's last version, and what is compared of them."""
 BLOTTO = {
     "league": "blotto",
     "environment": {"entry_point": "examples.blotto:env", "vector": "examples.blotto_vector:BlottoVector"},
@@ -98,23 +102,29 @@ def update_times(algorithm: Algorithm, updates: int) -> tuple[float, float]:
 def blotto(quick: bool) -> bool:
     """Print the exploitability of all arms and seeds."""
     steps = 100_000 if quick else 1_000_000
-    for arm, opponents in ARMS.items():
-        last, nash = [], []
+    means: dict[tuple[str, str], float] = {}
+    for arm, settings in ARMS.items():
+        found: dict[str, list[float]] = {"last": [], "nash": []}
         for seed in SEEDS:
-            policies = published(opponents, seed, steps)
+            policies = published(settings, seed, steps)
             payoff = policies @ PAYOFF @ policies.T
-            last.append(exploitability(policies[-1]))
-            nash.append(exploitability(nash_averaging(payoff)[0] @ policies))
-            print(f"blotto, {arm}, seed {seed}: last {last[-1]:.3f}, nash {nash[-1]:.3f}", flush=True)
-        for name, found in (("last", last), ("nash", nash)):
-            print(f"blotto, {arm}, {name}: {statistics.mean(found):.3f} ({_each(found)})", flush=True)
-    return True
+            found["last"].append(exploitability(policies[-1]))
+            found["nash"].append(exploitability(nash_averaging(payoff)[0] @ policies))
+        for name, values in found.items():
+            means[arm, name] = statistics.mean(values)
+            print(f"blotto, {arm}, {name}: {means[arm, name]:.3f} ({_each(values)})", flush=True)
+    third = means["self-play", "last"] / 3
+    met = True
+    for compared in LESS_EXPLOITABLE.items():
+        found = means[compared]
+        met &= report_target(f"blotto, {', '.join(compared)}: {found:.3f}", f"{third:.3f}", found <= third)
+    return met
 
 
-def published(opponents: dict[str, Any], seed: int, steps: int) -> NDArray[np.float64]:
+def published(settings: dict[str, Any], seed: int, steps: int) -> NDArray[np.float64]:
     """Train a league of Blotto; return the action probabilities of all versions, (versions, actions)."""
-    training = BLOTTO_TRAINING | {"steps": steps, "checkpoint_every": steps // 25, "seed": seed}
-    config = LeagueConfig.from_mapping(BLOTTO | {"training": training | {"opponents": opponents}})
+    training = BLOTTO_TRAINING | {"steps": steps, "checkpoint_every": steps // 25, "seed": seed} | settings
+    config = LeagueConfig.from_mapping(BLOTTO | {"training": training})
     with tempfile.TemporaryDirectory() as home, closing(Registry.open(Storage.at(Path(home)))) as registry:
         versions = train(config, registry=registry, console=Console(file=io.StringIO()))
         return np.stack([_probabilities(version.ref, registry) for version in versions])

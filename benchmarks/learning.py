@@ -1,9 +1,9 @@
 """Do the shipped configurations learn? Each part trains one for a fixed time and measures the result.
 
-Parts: rps, cars_and_lights, shared_encoder, simple_spread, pistonball; leduc_vs_random, leduc_holdem_dqn,
-connect_four_dqn by DQN; two_step_game, simple_spread_qmix. With several seeds or opponents, two trainings run at a
-time, each in a process with one core; those of pistonball run in turn, on two cores. All seeds are printed. Returns are
-per agent and episode, with greedy policies in new episodes, unless stated otherwise.
+Parts: rps, cars_and_lights, shared_encoder, simple_spread, simple_spread_large_minibatches, pistonball;
+leduc_vs_random, leduc_holdem_dqn, connect_four_dqn by DQN; two_step_game, simple_spread_qmix. With several seeds or
+opponents, two trainings run at a time, each in a process with one core; those of pistonball run in turn, on two cores.
+All seeds are printed. Returns are per agent and episode, with greedy policies in new episodes, unless stated otherwise.
 """
 
 import argparse
@@ -142,6 +142,27 @@ def simple_spread(scale: float) -> bool:
     return report_target("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
 
 
+def simple_spread_large_minibatches(scale: float) -> bool:
+    """Three seeds with the network and the hyperparameters of the iteration that `benchmarks.sampling` times."""
+    settings = {
+        "train_batch_size": 12_000,
+        "minibatch_size": 960,
+        "epochs": 4,
+        "hidden": [256, 256],
+        "num_envs": "auto",
+    }
+    jobs = [LearningJob("simple_spread", settings | {"seed": seed}, steps=SPREAD_STEPS * scale) for seed in range(3)]
+    met = True
+    for job, each in zip(jobs, two_at_once(work, jobs), strict=True):
+        last, better = each.curve[-1], each.greedy.mean() - each.random.mean()
+        print(
+            f"seed {job.settings['seed']}: {last.steps:,} actions in {last.seconds:.0f} s; return"
+            f" {each.greedy.mean():.2f}, random {each.random.mean():.2f}, better by {better:.2f}"
+        )
+        met &= bool(better >= SPREAD_BETTER_BY)
+    return report_target("each seed better than random by", f"{SPREAD_BETTER_BY:g} per agent", met)
+
+
 def simple_spread_qmix(scale: float) -> bool:
     """Three seeds by QMIX, each with its curve."""
     jobs = [LearningJob("simple_spread_qmix", {"seed": seed}, steps=SPREAD_STEPS * scale) for seed in range(3)]
@@ -162,7 +183,7 @@ def simple_spread_qmix(scale: float) -> bool:
 PARTS: dict[str, Callable[[float], bool]] = {
     part.__name__: part
     for part in (
-        *(rps, cars_and_lights, shared_encoder, simple_spread, pistonball),
+        *(rps, cars_and_lights, shared_encoder, simple_spread, simple_spread_large_minibatches, pistonball),
         *(leduc_vs_random, leduc_holdem_dqn, connect_four_dqn),
         *(two_step_game, simple_spread_qmix),
     )

@@ -9,10 +9,10 @@ import sys
 
 from scipy.stats import binomtest
 
-from evaluation.matches.worker import MatchWorker, baselines
+from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
 from league.errors import LeagueError
-from league.policies.loading import pinned
+from league.policies.loading import baselines, pinned
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 
@@ -50,7 +50,7 @@ def _measure(ref: str, against: list[str] | None, games: int, seed: int, target_
     player = MatchWorker(row.config, registry)
     print(f"{version}, greedy, {games} games each, {row.config.play.opening_plies} random opening plies")
     met = True
-    for opponent in against or baselines(row.interface):
+    for opponent in against or baselines(row.config, row.interface):
         schedule = round_robin(row.config, row.interface, [version, opponent], games // 2, seed)
         points = [game.scores[0] for match in player.play(schedule, range(schedule.length)) for game in match.games]
         met &= _report(opponent, points, target_set)

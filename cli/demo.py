@@ -59,14 +59,17 @@ def demo(
 
 
 def _train(config: "LeagueConfig", minutes: float) -> None:
+    from evaluation.service.strength_process import strength_process
     from training.runs.train import train
 
     _step(
         1, f"Train for {minutes:g} minutes: self-play and games against script:one_ply (masked PPO, RLlib, Ray Tune)."
     )
     say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
-    paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS, checkpoint_every=None)
-    train(paced, registry=open_registry(), config_path=find(LEAGUE), console=console)
+    paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS)
+    registry = open_registry()
+    with strength_process(registry.storage) as measure:
+        train(paced, registry=registry, config_path=find(LEAGUE), console=console, measure=measure)
 
 
 def _evaluate(config: "LeagueConfig") -> None:

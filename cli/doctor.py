@@ -14,6 +14,7 @@ import typer
 
 from cli.output import emit, say, table
 from league.errors import LeagueError, last_line
+from league.ray_cluster import usable_cpus
 from league.settings import Storage
 from league.stack import OPTIONAL, VERIFIED, installed
 
@@ -48,6 +49,8 @@ def doctor(
         table(
             ("", "check", "result", "advice"),
             [(finding.status, finding.what, finding.found, finding.advice) for finding in findings],
+            prose=("result", "advice"),
+            optional=("advice",),
         )
         say(
             "\nAll checks passed."
@@ -83,7 +86,7 @@ def _stack() -> Iterator[Check]:
 
 
 def _processor() -> Iterator[Check]:
-    cores = os.cpu_count() or 1
+    cores = usable_cpus()
     yield Check(
         "CPU", "ok" if cores > 1 else "note", f"{cores} cores", "" if cores > 1 else "2 or more are recommended"
     )

@@ -21,10 +21,12 @@ def export(
     The files are verified against their digests. docs/exporting.md shows how to run them in a browser, Unity, Godot and
     C++. `league import` reads the directory.
     """
+    from league.policies.loading import require_one_policy
     from league.registry.storage.exports import export_version
 
     registry = open_registry()
     version = registry.versions.resolve(CheckpointRef.parse(ref))
+    require_one_policy(version)
     target = directory or Path(f"{version.league}-{version.number}")
     for file in export_version(version, registry.artifacts, target):
         say(str(file))

@@ -83,12 +83,14 @@ def list_(as_json: AsJson = False) -> None:
                 sorted(key.scopes),
                 "all" if key.leagues is None else sorted(key.leagues),
                 None if key.rate is None else f"{key.rate:g}/s",
-                key.created_at,
-                key.expires_at,
+                f"{key.created_at.astimezone():%Y-%m-%d}",
+                None if key.expires_at is None else f"{key.expires_at.astimezone():%Y-%m-%d %H:%M}",
                 _state(key),
             )
             for key in keys
         ],
+        prose=("scopes", "leagues"),
+        optional=("rate", "expires"),
     )
 
 

@@ -31,7 +31,19 @@ PANELS = {
     "Train": {
         "check-env": Subcommand("cli.training:check_env", "Test a league's environment against the contract."),
         "train": Subcommand("cli.training:train", "Train a league's policies and publish versions."),
+        "runs": Subcommand("cli.training:runs", "List a league's training runs, newest first."),
         "sweep": Subcommand("cli.training:sweep", "Train with each combination of settings and report the best."),
+    },
+    "Leagues": {
+        "init": Subcommand("cli.leagues.init:init", "Write a commented configuration that fits an environment."),
+        "list": Subcommand(
+            "cli.leagues.listing:list_", "List all leagues with versions, champion, last verdict and night."
+        ),
+        "archive": Subcommand("cli.leagues.listing:archive", "Archive a league, or make it active again."),
+        "compare": Subcommand(
+            "cli.leagues.comparison:compare", "Compare two training runs: settings, speed, curves and versions."
+        ),
+        "remove": Subcommand("cli.leagues.removal:remove", "Remove a league, or one of its versions, with all files."),
     },
     "Evaluate": {
         "evaluate": Subcommand("cli.evaluation:evaluate", "Play a tournament; print leaderboard and payoff matrix."),
@@ -50,8 +62,11 @@ PANELS = {
         "note": Subcommand("cli.versions:note", "Set or clear the note of a version."),
         "import": Subcommand("cli.importing:import_model", "Publish a model that was trained elsewhere as a version."),
         "export": Subcommand("cli.exporting:export", "Write the ONNX files and the manifest of a version."),
-        "promote": Subcommand("cli.versions:promote", "Make a version the champion, or move another alias to it."),
+        "promote": Subcommand(
+            "cli.versions:promote", "Make a version or a mixture the champion, or move another alias to it."
+        ),
         "retire": Subcommand("cli.retire:retire", "Remove files of old versions, and old access logs."),
+        "mixture": Subcommand("cli.versions:mixture", "Point an alias to the equilibrium of a league, or show it."),
         "rollback": Subcommand("cli.versions:rollback", "Restore the previous champion."),
     },
     "Serve": {

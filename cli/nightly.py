@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -10,18 +11,20 @@ from cli.options import CORES, AsJson, EvaluationCluster, Workers, open_registry
 from cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
 from cli.training import exit_on_interrupt
 from configs import find, names
-from league.errors import AlreadyRunning, LeagueError, UnknownLeague, one_line
+from league.errors import AlreadyRunning, ConfigError, LeagueError, UnknownLeague, one_line
 from league.files import disk_errors
 from league.refs import check_slug
 from league.settings import Storage
 
 if TYPE_CHECKING:
+    from evaluation.gating.trained_exploiters import Trainer
     from evaluation.results import Confirmation, NightlyReport
     from league.config.league import LeagueConfig
     from league.registry.registry import Registry
     from league.registry.storage.rows import TrainingNightRow
 
 FAULTS = 1
+INVALID = 2
 BUSY = 75
 """EX_TEMPFAIL of sysexits.h: try again later."""
 
@@ -31,7 +34,7 @@ def nightly(
         list[str] | None,
         typer.Argument(
             metavar="[LEAGUE|CONFIG]…",
-            help="Registered leagues, YAML files or bundled configurations. Default: all registered leagues.",
+            help="Registered leagues, YAML files or bundled configurations. Default: all that are not archived.",
         ),
     ] = None,
     train: Annotated[
@@ -54,16 +57,19 @@ def nightly(
     continues when the command is run again, without replaying recorded games. The report of each league is written
     to LEAGUE_HOME/reports.
 
+    If `gate.exploiters` requires it, exploiters are trained against each version that passed all other tests.
+
     With --train, the section `nightly` of the configuration sets the budget, the opponents and the exploiter's share.
 
     Exit codes: 0 success, with or without a promotion; 1 a version could not be tested, a league failed, or the
-    webhook could not be delivered; 2 invalid arguments; 75 another nightly run holds the lock of a league.
+    webhook could not be delivered; 2 invalid arguments, or a league's configuration is invalid; 75 another nightly run
+    holds the lock of a league.
     """
     from evaluation.reporting.webhook import deliver
     from league.ray_cluster import ray_session
 
     configs = _configs(leagues or ())
-    reports, nights, faults, busy = [], [], [], False
+    reports, nights, faults, invalid, busy = [], [], list[str](), list[str](), False
     for config in configs:
         try:
             with ray_session(address):
@@ -75,8 +81,13 @@ def nightly(
         except LeagueError as error:
             # The remaining leagues are still processed.
             sentence = f"{config.league}: {one_line(error)}"
-            busy |= isinstance(error, AlreadyRunning)
-            faults += [] if isinstance(error, AlreadyRunning) else [sentence]
+            match error:
+                case AlreadyRunning():
+                    busy = True
+                case ConfigError():
+                    invalid.append(sentence)
+                case _:
+                    faults.append(sentence)
             complain(f"league: {sentence}")
             continue
         if train:
@@ -86,23 +97,31 @@ def nightly(
             faults += [f"{config.league}: {fault}" for fault in report.faults]
     if as_json:
         documents = {"nights": [night_document(night) for night in nights]} if train else {}
-        emit({"leagues": [report.to_json() for report in reports], "faults": faults} | documents)
+        emit({"leagues": [report.to_json() for report in reports], "faults": [*faults, *invalid]} | documents)
     summary = [sentence for report in reports for sentence in summary_of(report)]
     summary += [sentence for night in nights for sentence in summary_of_night(night)]
     if webhook:
-        deliver(webhook, [*summary, *faults], reports)
-    if faults or busy:
-        sys.exit(FAULTS if faults else BUSY)
+        deliver(webhook, [*summary, *faults, *invalid], reports)
+    if faults or invalid or busy:
+        sys.exit(FAULTS if faults else INVALID if invalid else BUSY)
 
 
 def run_nightly(config: "LeagueConfig", workers: int = CORES, quiet: bool = False) -> "NightlyReport":
     """Run one league's nightly run, print the results, and write the league's report to LEAGUE_HOME/reports."""
     from evaluation.gating.nightly import nightly as run
+    from league.ray_cluster import connected
 
-    Storage.from_environment().export()
-    registry = open_registry()
-    with GameProgress(quiet) as listener:
-        report = run(config, registry=registry, workers=workers, listener=listener)
+    storage = Storage.from_environment()
+    storage.export()
+    registry, games = open_registry(), GameProgress(quiet)
+    with ExitStack() as stack:
+        if config.gate.exploiters.count:
+            stack.enter_context(exit_on_interrupt())
+            stack.enter_context(connected(None, storage))
+        listener = stack.enter_context(games)
+        report = run(
+            config, registry=registry, train=_trainer(registry, games, quiet), workers=workers, listener=listener
+        )
     _show(report, registry, config, quiet)
     return report
 
@@ -120,7 +139,9 @@ def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig",
         complain(f"{config.league}: {fault}")
     if not quiet:
         if not report.verdicts:
-            say(f"{config.league}: no new versions to test.")
+            has_versions = bool(registry.versions.all(config.league))
+            hint = "" if has_versions else " None is published yet: `league train CONFIG` publishes versions."
+            say(f"{config.league}: no new versions to test.{hint}")
         say()
         for sentence in summary_of(report):
             say(sentence)
@@ -137,34 +158,17 @@ def run_training_night(
     Returns:
         The night, and the report of the gate unless an earlier process completed it.
     """
-    from rich.console import Console
-
     from evaluation.gating.training_night import training_night
     from league.ray_cluster import connected
-    from league.refs import CheckpointRef
-    from training.runs.train import train as run
 
     storage = Storage.from_environment()
     storage.export()
     registry, games = open_registry(), GameProgress(quiet)
-
-    def train(settings: "LeagueConfig", *, name: str, parent: int | None, target: str | None) -> None:
-        with games.paused():
-            run(
-                settings,
-                registry=registry,
-                parent=None if parent is None else CheckpointRef(settings.league, parent),
-                role="main" if target is None else "exploiter",
-                target=None if target is None else CheckpointRef.parse(target),
-                name=name,
-                console=Console(quiet=True) if quiet else console,
-            )
-
     with exit_on_interrupt(), connected(None, storage), games as listener:
         night, report = training_night(
             config,
             registry=registry,
-            train=train,
+            train=_trainer(registry, games, quiet),
             workers=workers,
             listener=listener,
             announce=(lambda _: None) if quiet else say,
@@ -177,6 +181,36 @@ def run_training_night(
         for sentence in summary_of_night(night):
             say(sentence)
     return night, report
+
+
+def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer":
+    """Return a function that trains a run and shows its progress in place of that of games."""
+
+    def train(config: "LeagueConfig", *, name: str, parent: int | None, target: str | None) -> None:
+        from rich.console import Console
+
+        from evaluation.service.strength_process import strength_process
+        from league.refs import CheckpointRef
+        from training.runs.train import start_of_exploiter
+        from training.runs.train import train as run
+
+        start = None if parent is None else CheckpointRef(config.league, parent)
+        exploited = None if target is None else CheckpointRef.parse(target)
+        if exploited is not None and start is not None:
+            start = start_of_exploiter(registry, start, config)
+        with games.paused(), strength_process(registry.storage) as measure:
+            run(
+                config,
+                registry=registry,
+                parent=start,
+                role="main" if exploited is None else "exploiter",
+                target=exploited,
+                name=name,
+                console=Console(quiet=True) if quiet else console,
+                measure=measure,
+            )
+
+    return train
 
 
 def faults_of(night: "TrainingNightRow") -> list[str]:
@@ -218,7 +252,7 @@ def summary_of(report: "NightlyReport") -> list[str]:
 def _change(report: "NightlyReport") -> str:
     judged = f"{len(report.verdicts)} tested, " if report.verdicts else ""
     if report.champion is None:
-        return f"{judged}no champion, as no version has beaten script:random yet."
+        return f"{judged}there is no champion, as no version has passed the gate yet."
     if report.champion == report.champion_before:
         return f"{judged}the champion is still {report.champion}."
     return f"{judged}the champion is now {report.champion} (before: {report.champion_before or 'none'})."
@@ -234,23 +268,32 @@ def _gain(gain: "Confirmation") -> str:
 
 
 def _configs(named: Sequence[str]) -> "list[LeagueConfig]":
-    """Return the configurations of the named leagues and files; of all registered leagues if none is named."""
+    """Return the configurations of the named leagues and files; if none is named, of all that are not archived."""
     registry = open_registry()
     if not named:
-        found = [row.config for row in registry.leagues.all()]
-        if not found:
+        rows = registry.leagues.all()
+        for row in rows:
+            if row.archived_at is not None:
+                complain(f"{row.slug} is archived and skipped.")
+        found = [row.config for row in rows if row.archived_at is None]
+        if not rows:
             say("No league is registered yet. Name a configuration, such as connect_four or a YAML file.")
         return found
     return [_config(registry, name) for name in named]
 
 
 def _config(registry: "Registry", name: str) -> "LeagueConfig":
-    """Return the configuration of a registered league, else of a file or a bundled configuration."""
+    """Return the configuration of a registered league, else of a file or a bundled configuration.
+
+    Raises LeagueArchived.
+    """
     from league.config.league import LeagueConfig
 
     if not name.endswith((".yaml", ".yml")):
         try:
-            return registry.leagues.get(check_slug("league", name)).config
+            row = registry.leagues.get(check_slug("league", name))
+            row.require_active()
+            return row.config
         except UnknownLeague as error:
             if name not in names():
                 raise UnknownLeague(f"{error}; bundled configurations: {', '.join(names())}") from None

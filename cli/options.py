@@ -1,16 +1,17 @@
 """Arguments and options that several commands share, and the registry that they work on."""
 
 import gc
-import os
 from functools import cache
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from league.ray_cluster import usable_cpus
+
 if TYPE_CHECKING:
     from league.registry.registry import Registry
 
-CORES = os.cpu_count() or 1
+CORES = usable_cpus()
 DEFAULT_URL = "http://127.0.0.1:8000"
 """Of the policy server that `league serve` starts and `league act` calls."""
 

@@ -2,17 +2,21 @@
 
 import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import orjson
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, JustifyMethod
 from rich.table import Table
+from rich.text import Text
+
+from league.refs import short_verdict
 
 if TYPE_CHECKING:
-    from evaluation.results import Difference, Listener, Standing, VerdictReport
+    from evaluation.results import Difference, ExploitabilityReport, Listener, Standing, VerdictReport
     from evaluation.results import Progress as Games
 
 console = Console(highlight=False)
@@ -36,15 +40,81 @@ def complain(sentence: str) -> None:
     errors.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table with headers. Numeric columns are aligned to the right."""
-    sheet = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    rows = [tuple(row) for row in rows]
-    for index, column in enumerate(columns):
-        numeric = bool(rows) and all(isinstance(row[index], int | float | None) for row in rows)
-        sheet.add_column(column, justify="right" if numeric else "left", overflow="fold")
-    for row in rows:
-        sheet.add_row(*(text(value) for value in row))
+GAP = 2
+"""Spaces between the columns of a table."""
+NARROWEST_PROSE = 16
+"""Columns below which text is not wrapped."""
+
+
+def table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    *,
+    prose: Collection[str] = (),
+    optional: Collection[str] = (),
+) -> None:
+    """Print a table that fits the terminal. Numeric columns are aligned to the right.
+
+    Only prose is wrapped. If the columns do not fit side by side, the table continues below, with its first column
+    repeated.
+
+    Args:
+        columns: The headers.
+        rows: The values of each row.
+        prose: Columns of text that may be wrapped.
+        optional: Columns that are left out if no row has a value.
+    """
+    by_column = list(zip(*rows, strict=True)) or [()] * len(columns)
+    first, *others = [
+        _Column(name, values)
+        for name, values in zip(columns, by_column, strict=True)
+        if name not in optional or any(value not in (None, "") for value in values)
+    ]
+    label = min(first.width, console.width // 2)
+    blocks: list[list[tuple[_Column, int]]] = [[(first, label)]]
+    for column in others:
+        width = min(column.least if column.name in prose else column.width, console.width - label - GAP)
+        if len(blocks[-1]) > 1 and _total(blocks[-1]) + GAP + width > console.width:
+            blocks.append([(first, label)])
+        blocks[-1].append((column, width))
+    for number, block in enumerate(blocks):
+        if number:
+            console.print()
+        _print_block(_widened(block, console.width))
+
+
+class _Column:
+    """A column of a table. `width`: of its widest cell. `least`: the narrowest one that does not break words."""
+
+    def __init__(self, name: str, values: Sequence[Any]) -> None:
+        self.name, self.cells = name, [text(value) for value in values]
+        is_numeric = bool(values) and all(isinstance(value, int | float | None) for value in values)
+        self.justify: JustifyMethod = "right" if is_numeric else "left"
+        self.width = max(map(cell_len, (name, *self.cells)))
+        words = (word for cell in (name, *self.cells) for word in cell.split())
+        self.least = min(self.width, max(NARROWEST_PROSE, *map(cell_len, words)))
+
+
+def _total(block: Sequence[tuple[_Column, int]]) -> int:
+    return sum(width for _, width in block) + GAP * (len(block) - 1)
+
+
+def _widened(block: Sequence[tuple[_Column, int]], limit: int) -> list[tuple[_Column, int]]:
+    """Give the rest of the line to the columns that are narrower than their text, from left to right."""
+    spare, found = limit - _total(block), []
+    for column, width in block:
+        more = min(spare, column.width - width)
+        spare -= more
+        found.append((column, width + more))
+    return found
+
+
+def _print_block(block: Sequence[tuple[_Column, int]]) -> None:
+    sheet = Table(box=None, pad_edge=False, header_style="bold", padding=(0, GAP, 0, 0))
+    for column, width in block:
+        sheet.add_column(Text(column.name), justify=column.justify, overflow="fold", width=width)
+    for row in zip(*(column.cells for column, _ in block), strict=True):
+        sheet.add_row(*map(Text, row))
     console.print(sheet)
 
 
@@ -59,7 +129,7 @@ def text(value: Any) -> str:
             return f"{value:.3f}"
         case tuple() | list():
             return ", ".join(text(item) for item in value)
-    return CONTROL.sub("�", str(value)).replace("[", r"\[")
+    return CONTROL.sub("�", str(value))
 
 
 def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:
@@ -146,7 +216,7 @@ def show_leaderboard(leaderboard: "tuple[Standing, ...]") -> None:
 
 
 def verdict(report: "VerdictReport") -> str:
-    """`connect_four@2 against connect_four@1: promote after 40 games (40 unique), score 0.710, LLR +2.97 in […]`"""
+    """`0f3a62d1: connect_four@2 against connect_four@1: promote after 40 games (40 unique), score 0.710, …`"""
     score = "–" if report.score is None else f"{report.score:.3f}"
     low, high = report.bounds
     games = f"after {report.games} games ({report.unique_games} unique), score {score}"
@@ -160,8 +230,20 @@ def verdict(report: "VerdictReport") -> str:
         for each in report.exploiters
     )
     note = f": {report.note}" if report.note else ""
-    who = f"{report.candidate} against {report.opponent}"
+    exploiters += "" if report.exploitability is None else f"; {exploitability(report.exploitability)}"
+    who = f"{short_verdict(report.verdict)}: {report.candidate} against {report.opponent}"
     return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}"
+
+
+def exploitability(test: "ExploitabilityReport") -> str:
+    """`not more exploitable than connect_four@1 by 0.1 after 600 games: a best response scores at least 0.48 (0.45)`"""
+    found = f"{test.outcome} than {test.ref} by {test.margin:g} after {test.games} games"
+    if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
+        return found
+    return (
+        f"{found}: a best response scores at least {test.candidate.bound:.3f} (that to {test.ref}:"
+        f" {test.champion.bound:.3f}), its exploiters achieve {difference(test.difference_over_exploiters)} more"
+    )
 
 
 def difference(gap: "Difference") -> str:

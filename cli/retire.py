@@ -13,7 +13,7 @@ from league.errors import InvalidInput
 from league.refs import check_slug
 
 if TYPE_CHECKING:
-    from league.registry.retention import Removal
+    from league.registry.deletion.retention import Removal
 
 MEGABYTE = 10**6
 
@@ -68,7 +68,11 @@ def retire(
         if plan.versions or plan.training
     ]
     if rows:
-        table(("league", "retired versions", "training state of", "MB"), rows)
+        table(
+            ("league", "retired versions", "training state of", "MB"),
+            rows,
+            prose=("retired versions", "training state of"),
+        )
     if old_logs:
         say(f"{'Would remove' if dry_run else 'Removed'} {len(old_logs)} access log files.")
 

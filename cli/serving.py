@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from secrets import token_hex
 from typing import TYPE_CHECKING, Annotated, Any
 
 import orjson
@@ -23,7 +24,13 @@ def serve(
     ] = None,
     port: Annotated[int | None, typer.Option(help="HTTP port. Default: from deploy.yaml, 8000.")] = None,
     grpc_port: Annotated[int | None, typer.Option(help="gRPC port. Default: from deploy.yaml, 8001.")] = None,
-    replicas: Annotated[int | None, typer.Option(help="Number of server processes. Default: from deploy.yaml.")] = None,
+    replicas: Annotated[
+        int | None, typer.Option(min=1, help="Number of server processes. Default: from deploy.yaml, 2.")
+    ] = None,
+    max_replicas: Annotated[
+        int | None,
+        typer.Option(min=1, help="Start up to this number of server processes under load. Default: no more."),
+    ] = None,
     address: Annotated[
         str | None, typer.Option(help="Running Ray cluster. Default: start Ray on this machine.")
     ] = None,
@@ -50,28 +57,41 @@ def serve(
         port=port,
         grpc_port=grpc_port,
         replicas=replicas,
+        max_replicas=max_replicas,
         insecure=insecure,
         address=address,
-        on_ready=lambda url: say(
-            f"Serving the leagues of {storage.home} on {url}\n"
-            f"  {url}                                     web pages\n"
-            f"  {url}/docs                                API documentation\n"
-            f"  {url}/v1/leagues                          leagues as JSON\n"
-            f"  {url}/v1/policies/LEAGUE/action           POST an observation to get an action\n"
-            f"  {url}/v2/models/LEAGUE                    Open Inference Protocol over HTTP; also over gRPC\n"
-            f"{first_call(open_registry(), url)}\n"
+        on_ready=lambda url, logs: say(
+            f"Serving the leagues of {storage.home} on {url}\n{hints(open_registry(), url)}\n"
+            f"Logs of Ray and of the replicas: {logs}\n"
             "Stop: Ctrl-C"
         ),
     )
 
 
-def first_call(registry: "Registry", url: str) -> str:
-    """What to do first: call a champion, or get one."""
-    option = "" if url == DEFAULT_URL else f" --url {url}"
-    for league, alias in sorted(registry.aliases.all()):
-        if alias == CHAMPION:
-            return f"Try: league act {league}@{CHAMPION}{option}"
-    return "No league has a champion yet: league train CONFIG, then league nightly LEAGUE."
+def hints(registry: "Registry", url: str) -> str:
+    """The addresses of a server, and what to do first: call a champion, or get one.
+
+    The league is the one whose champion was promoted last.
+    """
+    promoted = {league: found.event for (league, alias), found in registry.aliases.all().items() if alias == CHAMPION}
+    newest = max(promoted, key=lambda league: promoted[league], default=None)
+    model = newest or "LEAGUE"
+    called = url.replace("//0.0.0.0:", "//127.0.0.1:")
+    addresses = {
+        called: "web pages",
+        f"{called}/docs": "API documentation",
+        f"{called}/v1/leagues": "leagues as JSON",
+        f"{called}/v1/policies/{model}/action": "POST an observation to get an action",
+        f"{called}/v2/models/{model}": "Open Inference Protocol over HTTP; also over gRPC",
+    }
+    width = max(map(len, addresses))
+    lines = [f"  {address:{width}}  {what}" for address, what in addresses.items()]
+    if newest is None:
+        lines.append("No league has a champion yet: league train CONFIG, then league nightly LEAGUE.")
+    else:
+        option = "" if called == DEFAULT_URL else f" --url {called}"
+        lines.append(f"Try: league act {newest}@{CHAMPION}{option}")
+    return "\n".join(lines)
 
 
 def act(
@@ -132,12 +152,12 @@ def _act_here(
 ) -> dict[str, Any]:
     import numpy as np
 
-    from league.policies.loading import load
+    from league.policies.loading import acting_version, load
     from league.seeds import generator
     from serve_app.codecs.observation_codec import ObservationReader, reject_strings
 
     registry = open_registry()
-    version = registry.versions.resolve(ref)
+    version = acting_version(registry.versions.resolve(ref), registry, token_hex())
     loaded = load(version.ref, policy=policy, registry=registry)
     space = version.manifest.policies[policy or next(iter(version.manifest.policies))].observation
     reject_strings(value)

@@ -120,7 +120,7 @@ def _show(registry: "Registry", league: str, as_json: bool) -> None:
     if shadowings:
         say()
         table(
-            ("candidate", "champion", "requests", "observations", "agreement", "p50 ms", "p95 ms", "failed", "dropped"),
+            ("shadow", "champion", "requests", "observed", "agreed", "p50 ms", "p95 ms", "failed", "dropped"),
             [
                 (
                     one.candidate,

@@ -1,23 +1,24 @@
-"""`league check-env`, `league train` and `league sweep`: environment checks and training."""
+"""`league check-env`, `league train`, `league runs` and `league sweep`: environment checks and training."""
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
-from cli.options import AsJson, Config, open_registry
+from cli.options import AsJson, Config, LeagueName, open_registry
 from cli.output import console, emit, say, table
 from configs import find
 from league.errors import ConfigError
-from league.refs import CheckpointRef, of_league
+from league.refs import CheckpointRef, check_slug, of_league
 
 if TYPE_CHECKING:
     from league.config.league import LeagueConfig
+    from league.registry.storage.rows import RunRow, StrengthRow, VersionRow
     from training.sweeps.sweep import SweepReport
 
 INTERRUPTED = 130
@@ -33,7 +34,7 @@ ObjectStore = Annotated[
 ]
 Dashboard = Annotated[bool, typer.Option("--dashboard", help="Start the local Ray's dashboard and print its URL.")]
 Minutes = Annotated[float | None, typer.Option(help="Maximum training time. Overrides CONFIG.")]
-Steps = Annotated[int | None, typer.Option(help="Maximum number of agent steps. Overrides CONFIG.")]
+Steps = Annotated[int | None, typer.Option(help="Maximum number of actions of all agents. Overrides CONFIG.")]
 Seed = Annotated[int | None, typer.Option(help="Random seed. Overrides CONFIG.")]
 Runners = Annotated[int | None, typer.Option(min=0, help="Number of sampling processes. Overrides CONFIG.")]
 Gpus = Annotated[float | None, typer.Option(min=0, help="Number of GPUs for the learner. Overrides CONFIG.")]
@@ -42,23 +43,32 @@ Gpus = Annotated[float | None, typer.Option(min=0, help="Number of GPUs for the 
 def check_env(
     config: Config,
     episodes: Annotated[int, typer.Option(min=1, help="Number of episodes, each played several times.")] = 3,
-    steps: Annotated[int, typer.Option(min=1, help="Maximum number of steps per episode.")] = 2000,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Maximum number of steps per episode. Default: play.max_moves.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Test a league's environment against the contract.
 
-    Plays episodes with random legal actions. Exits 1 on a violation; notes do not affect the exit code.
+    Plays episodes with random legal actions, and checks the scripts, bots and versions that CONFIG names. Exits 1 on a
+    violation; notes do not affect the exit code.
 
     Next step: `league train CONFIG`.
     """
     from league.config.league import LeagueConfig
-    from league.environments.conformance import examine
+    from league.environments.conformance.examination import examine
+    from league.policies.loading import errors_of_contestants
 
     league = LeagueConfig.load(find(config))
     found = examine(league, episodes, steps, seed)
+    if found.interface is not None:
+        for error in errors_of_contestants(league, found.interface, open_registry):
+            found.add("fault", str(error))
     if as_json:
-        emit(asdict(found) | {"passed": found.passed})
+        document = asdict(replace(found, interface=None))
+        del document["interface"]
+        emit(document | {"passed": found.passed})
     else:
         if found.lengths:
             state = "no global state" if found.state_size is None else f"a global state of {found.state_size:,} numbers"
@@ -69,6 +79,8 @@ def check_env(
             say(found.implementation)
             say(found.policies)
             say(found.actions)
+            if found.openings is not None:
+                say(str(found.openings))
         if (vectorised := found.vectorised) is not None:
             ratio = vectorised.steps_per_second / vectorised.stock_steps_per_second
             say(
@@ -77,7 +89,8 @@ def check_env(
                 f" {vectorised.stock_steps_per_second:,.0f} ({ratio:.0f}×)."
             )
         if found.findings:
-            table(("severity", "finding"), ((finding.severity, str(finding)) for finding in found.findings))
+            rows = [(finding.severity, str(finding)) for finding in found.findings]
+            table(("severity", "finding"), rows, prose=("finding",))
         if found.passed:
             say("The environment passes all checks." if not found.findings else "The environment passes, with notes.")
     raise typer.Exit(0 if found.passed else 1)
@@ -142,13 +155,15 @@ def train(
         )
         _submit(address, find(config), options, resume, (cpus, object_store, dashboard))
         return
+    from evaluation.service.strength_process import strength_process
     from league.ray_cluster import LocalRay
     from training.runs.train import train as run
 
-    with exit_on_interrupt():
+    registry = open_registry()
+    with exit_on_interrupt(), strength_process(registry.storage) as measure:
         published = run(
             league,
-            registry=open_registry(),
+            registry=registry,
             parent=_version(parent, league),
             role=role,
             target=_version(against, league),
@@ -157,12 +172,74 @@ def train(
             local=LocalRay(cpus, object_store, dashboard),
             config_path=find(config),
             console=console,
+            measure=measure,
         )
     if published:
         say(f"\nPublished {', '.join(version.ref for version in published)}.")
-        say(f"Next: league nightly {config}   (find the strongest version)")
+        say(f"Next: {next_step(config, published[-1])}")
     else:
         say("No version was published: the run ended before its first checkpoint.")
+
+
+def next_step(config: str, version: "VersionRow") -> str:
+    """The command that usually follows a run, whose newest version is `version`."""
+    if version.exploits is None:
+        return f"league nightly {config}   (find the strongest version)"
+    return f"league exploitability {version.exploits}   (play its exploiters against it)"
+
+
+def runs(
+    league: LeagueName,
+    limit: Annotated[int, typer.Option(min=1, max=1000, help="Maximum number of runs.")] = 20,
+    as_json: AsJson = False,
+) -> None:
+    """List a league's training runs, newest first.
+
+    Shows the role of their versions, their progress, and the last measured scores against the champion and an anchor
+    with 95 % intervals (`training.strength`).
+    """
+    registry = open_registry()
+    rows = registry.runs.newest(check_slug("league", league), limit=limit)
+    strength = {row.id: _newest_strength(registry.strength.of_run(league, row.id)) for row in rows}
+    if as_json:
+        emit({"league": league, "runs": [_run_document(row, strength[row.id]) for row in rows]})
+        return
+    if not rows:
+        say(f"{league} has no training runs yet. Start one: league train CONFIG")
+        return
+    table(
+        ("run", "state", "role", "steps", "minutes", "strength"),
+        [
+            (
+                row.id,
+                row.state,
+                row.role if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}",
+                row.steps,
+                round(row.seconds / 60, 1),
+                "; ".join(_score(each, league) for each in strength[row.id]),
+            )
+            for row in rows
+        ],
+        prose=("strength",),
+        optional=("strength",),
+    )
+
+
+def _newest_strength(rows: "Sequence[StrengthRow]") -> "list[StrengthRow]":
+    """The scores of the newest measured version."""
+    return [row for row in rows if row.version == rows[-1].version]
+
+
+def _score(row: "StrengthRow", league: str) -> str:
+    opponent = row.opponent.removeprefix(league)
+    return f"@{row.version}: {row.score:.0%} [{row.low:.0%}, {row.high:.0%}] against {opponent}"
+
+
+def _run_document(row: "RunRow", strength: "Sequence[StrengthRow]") -> dict[str, object]:
+    names = "state", "role", "exploits", "algorithm", "seed", "steps", "target", "seconds", "parent", "error"
+    times = "began_at", "heartbeat_at", "ended_at"
+    scores = [asdict(each) for each in strength]
+    return {"run": row.id} | {name: getattr(row, name) for name in (*names, *times)} | {"strength": scores}
 
 
 def sweep(
@@ -217,7 +294,7 @@ def _show(report: "SweepReport", config: str) -> None:
 
     names = list(report.trials[0].settings)
     table(
-        ("trial", *names, "score", "steps", "minutes", ""),
+        ("trial", *names, "score", "steps", "minutes", "note"),
         [
             (
                 trial.number,
@@ -229,6 +306,8 @@ def _show(report: "SweepReport", config: str) -> None:
             )
             for trial in report.trials
         ],
+        prose=("note",),
+        optional=("note",),
     )
     say(f"\nPlot the metrics: tensorboard --logdir {report.path}")
     if not report.is_whole:

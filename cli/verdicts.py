@@ -8,7 +8,9 @@ import typer
 from cli.options import Actor, AsJson, open_registry
 from cli.output import emit, say
 
-Verdict = Annotated[str, typer.Argument(metavar="VERDICT", help="ID of the verdict, as shown by `league history`.")]
+Verdict = Annotated[
+    str, typer.Argument(metavar="VERDICT", help="ID of the verdict or its first digits, as shown by `league history`.")
+]
 
 
 def verify(
@@ -42,4 +44,4 @@ def void(
     from evaluation.gating.verdicts import void as run
 
     row = run(open_registry(), verdict, actor=actor or getpass.getuser(), reason=reason, purge=purge)
-    say(f"{verdict} on {row.league}@{row.candidate} is now void.")
+    say(f"Verdict {row.short_id} on {row.league}@{row.candidate} is now void.")

@@ -1,6 +1,7 @@
-"""`league versions`, `note`, `promote`, `rollback` and `history`."""
+"""`league versions`, `note`, `promote`, `mixture`, `rollback` and `history`."""
 
 import getpass
+import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,13 +10,21 @@ import typer
 
 from cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
 from cli.output import elo, emit, say, table
-from league.errors import ConfigError, InvalidReference
-from league.refs import CHAMPION, CheckpointRef, check_alias, check_slug
+from league.errors import ConfigError, InvalidInput, InvalidReference
+from league.refs import (
+    CHAMPION,
+    CheckpointRef,
+    check_alias,
+    check_slug,
+    is_mixture,
+    parse_mixture,
+    short_verdict,
+)
 
 if TYPE_CHECKING:
-    from evaluation.results import Standing
     from league.registry.registry import Registry
     from league.registry.storage.rows import AliasEvent, VersionRow
+    from league.results.payoffs import MetaStrategy
 
 Ref = Annotated[str, typer.Argument(metavar="REF", help="Version, such as connect_four@3.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Wait until every registered replica serves it; exit 1 on timeout.")]
@@ -29,7 +38,7 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
     registry = open_registry()
     rows = registry.versions.all(check_slug("league", league))
     rated = _ratings(registry, league)
-    documents = [_document(row, rated.get(row.ref)) for row in rows]
+    documents = [_document(row, rated.get(row.ref, {})) for row in rows]
     if as_json:
         emit({"league": league, "versions": documents})
         return
@@ -42,41 +51,52 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
             (
                 row.number,
                 ", ".join(row.aliases) if row.retired_at is None else "retired",
-                row.role if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}",
+                _role(row),
                 elo(document["rating"], document["interval"]),
                 document["games"],
                 row.steps,
                 row.parent,
-                row.created_at,
+                f"{row.created_at.astimezone():%Y-%m-%d}",
                 row.note and row.note.text,
             )
             for row, document in zip(rows, documents, strict=True)
         ],
+        prose=("note",),
+        optional=("role", "parent", "note"),
     )
 
 
-def _ratings(registry: "Registry", league: str) -> "dict[str, Standing]":
-    """Return the leaderboard by reference. Without games, SciPy is not imported."""
+def _role(row: "VersionRow") -> str | None:
+    if row.mixture is not None:
+        return f"{row.role} of {row.mixture}"
+    return None if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}"
+
+
+def _ratings(registry: "Registry", league: str) -> dict[str, dict[str, Any]]:
+    """Return the leaderboard by reference. Without games, or if a server has computed it, SciPy is not imported."""
     from league.results.ledger import Ledger
 
     if not Ledger(registry).counts(league):
         return {}
+    if snapshot := registry.snapshots.current(league, "leaderboard"):
+        return {standing["ref"]: standing for standing in snapshot.document["leaderboard"]}
     from evaluation.matches.leaderboard import compute_leaderboard
 
-    return {standing.ref: standing for standing in compute_leaderboard(registry, league)}
+    return {standing.ref: standing.to_json() for standing in compute_leaderboard(registry, league)}
 
 
-def _document(row: "VersionRow", standing: Any) -> dict[str, Any]:
+def _document(row: "VersionRow", standing: dict[str, Any]) -> dict[str, Any]:
     return {
         "version": row.number,
         "aliases": list(row.aliases),
-        "rating": standing and standing.rating,
-        "interval": standing and standing.interval,
-        "games": standing.games if standing else 0,
+        "rating": standing.get("rating"),
+        "interval": standing.get("interval"),
+        "games": standing.get("games", 0),
         "steps": row.steps,
         "parent": row.parent,
         "role": row.role,
         "exploits": row.exploits,
+        "members": row.mixture and [member.model_dump() for member in row.mixture.members],
         "sha256": row.sha256,
         "created_at": row.created_at,
         "retired_at": row.retired_at,
@@ -98,8 +118,13 @@ def note(
 
 
 def promote(
-    ref: Ref,
-    alias: Annotated[str, typer.Option(help="The alias to move.")] = CHAMPION,
+    ref: Annotated[
+        str,
+        typer.Argument(
+            metavar="REF", help="Version, such as connect_four@3, or mixture, such as connect_four@3:0.6,@5:0.4."
+        ),
+    ],
+    alias: Annotated[str, typer.Option("--alias", "--to", help="The alias to move.")] = CHAMPION,
     expected: Annotated[
         str | None,
         typer.Option(
@@ -112,23 +137,102 @@ def promote(
     timeout: Timeout = 30.0,
     as_json: AsJson = False,
 ) -> None:
-    """Make a version the champion, or move another alias to it.
+    """Make a version or a mixture the champion, or move another alias to it.
+
+    A mixture becomes a version of its own, which plays each episode with one of its members, drawn by the
+    probabilities.
 
     Replicas serve the new version within a second; --wait waits for their confirmation. Without --expected, the current
     version of the alias is expected, so only one of two concurrent promotions succeeds.
     """
     registry = open_registry()
-    version = registry.versions.resolve(CheckpointRef.parse(ref))
-    current = registry.aliases.current(version.league).get(check_alias(alias))
+    check_alias(alias)
+    wanted = None if expected is None else (_expected(expected),)
+    version = _mixture(registry, ref) if is_mixture(ref) else registry.versions.resolve(CheckpointRef.parse(ref))
+    current = registry.aliases.current(version.league).get(alias)
     event = registry.aliases.set(
         version.league,
         alias,
         version.number,
-        expected=current if expected is None else _expected(expected),
+        expected=current if wanted is None else wanted[0],
         actor=actor or getpass.getuser(),
         reason=reason,
     )
     _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
+
+
+def _mixture(registry: "Registry", text: str) -> "VersionRow":
+    """Publish the mixture that a text describes."""
+    shares: dict[int, float] = {}
+    for ref, share in parse_mixture(text).items():
+        number = registry.versions.resolve(ref).number
+        shares[number] = shares.get(number, 0.0) + share
+    return registry.publisher.publish_mixture(next(iter(parse_mixture(text))).league, shares)
+
+
+def mixture(
+    league: LeagueName,
+    method: Annotated[
+        str, typer.Option(help="`nash`: equilibrium of maximum entropy; `alpha_rank`: evolutionary share.")
+    ] = "nash",
+    at_least: Annotated[
+        float, typer.Option(min=0, max=0.5, help="Leave out versions with a lower probability, and rescale the rest.")
+    ] = 0.01,
+    alias: Annotated[
+        str | None, typer.Option("--alias", "--to", help="The alias to move to the mixture. Default: only show it.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
+    reason: Reason = "equilibrium of the league",
+    actor: Actor = None,
+    wait: Wait = False,
+    timeout: Timeout = 30.0,
+    as_json: AsJson = False,
+) -> None:
+    """Point an alias to the equilibrium of a league, or show it.
+
+    The equilibrium is a mixture of the versions of the current environment. It is computed from the payoff matrix, the
+    mean scores of the recorded games between them, and shown before the alias moves.
+    """
+    from league.policies.loading import eligible
+    from league.results.ledger import Ledger
+    from league.results.payoffs import METHODS, meta_strategy
+
+    if method not in METHODS:
+        raise InvalidInput(f"--method {method!r}: expected {' or '.join(METHODS)}")
+    if alias is not None:
+        check_alias(alias)
+    registry = open_registry()
+    conditions = registry.leagues.get(check_slug("league", league)).conditions
+    refs = [row.ref for row in eligible(registry, league)]
+    found = meta_strategy(refs, Ledger(registry).results(league, conditions), method)
+    kept = {ref: share for ref, share in zip(found.refs, found.probabilities, strict=True) if share >= at_least}
+    shares = {ref: share / sum(kept.values()) for ref, share in kept.items()}
+    if not as_json:
+        _show(found, shares)
+    if alias is None:
+        if as_json:
+            emit({"league": league, "method": method, "games": found.games, "unmet": found.unmet, "members": shares})
+        return
+    if not yes:
+        if as_json or not sys.stdin.isatty():
+            raise InvalidInput("without a terminal, confirm with --yes, or omit --alias to show the mixture only")
+        typer.confirm(f"Point {league}@{alias} to it?", abort=True)
+    ref = next(iter(shares)) if len(shares) == 1 else ",".join(f"{ref}:{share!r}" for ref, share in shares.items())
+    promote(ref, alias=alias, reason=reason, actor=actor, wait=wait, timeout=timeout, as_json=as_json)
+
+
+def _show(found: "MetaStrategy", shares: dict[str, float]) -> None:
+    table(
+        ("version", "probability", "score against it"),
+        [
+            (ref, shares.get(ref, 0.0), score)
+            for ref, _, score in sorted(
+                zip(found.refs, found.probabilities, found.scores, strict=True), key=lambda row: -row[1]
+            )
+        ],
+    )
+    unmet = f" {found.unmet} pairs have not met and count as equally strong." if found.unmet else ""
+    say(f"Computed from {found.games:g} games.{unmet}")
 
 
 def _expected(text: str) -> int | None:
@@ -195,17 +299,36 @@ def history(
 ) -> None:
     """Show when and why an alias moved, and who moved it."""
     when = None if at is None else _moment(at)
-    events = open_registry().aliases.history(check_slug("league", league), check_alias(alias), when)
+    registry = open_registry()
+    events = registry.aliases.history(check_slug("league", league), check_alias(alias), when)
+    mixtures = registry.versions.mixtures(league, {event.version for event in events})
     if as_json:
-        emit({"league": league, "alias": alias, "events": [asdict(event) for event in events]})
+        members = {number: [each.model_dump() for each in one.members] for number, one in mixtures.items()}
+        documents = [asdict(event) | {"members": members.get(event.version)} for event in events]
+        emit({"league": league, "alias": alias, "events": documents})
         return
     if not events:
         say(f"{league}@{alias} has no history{'' if at is None else ' at that time'}.")
         return
     table(
         ("time", "version", "before", "actor", "reason", "verdict"),
-        [(event.at, event.version, event.previous, event.actor, event.reason, event.verdict) for event in events],
+        [
+            (
+                event.at,
+                event.version if event.version not in mixtures else f"{event.version} ({mixtures[event.version]})",
+                event.previous,
+                event.actor,
+                event.reason,
+                _short(event.verdict),
+            )
+            for event in events
+        ],
+        prose=("reason",),
     )
+
+
+def _short(verdict: str | None) -> str | None:
+    return None if verdict is None else short_verdict(verdict)
 
 
 def _moment(text: str) -> datetime:

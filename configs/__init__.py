@@ -26,5 +26,9 @@ def find(config: str) -> Path:
     if path.is_file() or path.suffix in (".yaml", ".yml") or len(path.parts) != 1:
         return path
     if config not in names():
-        raise ConfigError(f"{config!r} is neither a YAML file nor a bundled configuration: {', '.join(names())}")
+        near = path.with_suffix(".yaml")
+        hint = f"did you mean {near}?" if near.is_file() else "for a league of your own, name its file"
+        raise ConfigError(
+            f"{config!r} is neither a YAML file nor a bundled configuration ({', '.join(names())}): {hint}"
+        )
     return _DIRECTORY / f"{config}.yaml"

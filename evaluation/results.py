@@ -188,11 +188,11 @@ class EvaluationReport(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorReport(Document):
-    """One non-inferiority test with its evidence, as in VerdictReport.
+class CompanionReport(Document):
+    """A test of a verdict after that against the champion, with its evidence as in VerdictReport.
 
-    margin: by how much the candidate may be weaker, in the gate's unit. schedule: of the matches that count.
-    outcome: `not inferior`, `inferior`, `inconclusive`, or `open` if the verdict was voided before its end.
+    ref: the other contestant. margin: by how much the candidate may be worse. schedule: of the matches that count.
+    outcome: passed, failed, `inconclusive`, or `open` if the verdict was voided before its end.
     """
 
     ref: str
@@ -205,37 +205,50 @@ class AnchorReport(Document):
     games: int
     unique_games: int
     counts: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorReport(CompanionReport):
+    """One non-inferiority test. margin: in the gate's unit. outcome: `not inferior` or `inferior`."""
+
     score: float | None
     elo: float | None
     interval: tuple[float | None, float | None] | None
 
 
 @dataclass(frozen=True, slots=True)
-class ExploiterReport(Document):
-    """One paired test of candidate and champion against an exploiter, with its evidence.
+class ExploiterReport(CompanionReport):
+    """One paired test of candidate and champion against an exploiter.
 
-    exploits: the champion that the exploiter was trained against.
-    margin: by how much the candidate may be worse than the champion, as a share of all points or in returns.
-    schedule: of the matches that count. outcome: `not worse`, `worse`, `inconclusive`, or `open` as for an anchor.
+    margin: as a share of all points or in returns. outcome: `not worse` or `worse`.
     blocks: counted pairs of blocks. games: of both contestants. counts: pairs per cell, worst for the candidate first.
+    exploits: the champion that the exploiter was trained against.
     score, champion_score: mean scores of candidate and champion against the exploiter; None without games.
     difference: between candidate and champion, in the unit of the margin; None without games.
     """
 
-    ref: str
     exploits: str
-    margin: float
-    schedule: str
-    outcome: str
-    llr: float
-    bounds: tuple[float, float]
-    blocks: int
-    games: int
-    unique_games: int
-    counts: tuple[int, ...]
     score: float | None
     champion_score: float | None
     difference: Difference | None
+
+
+@dataclass(frozen=True, slots=True)
+class ExploitabilityReport(CompanionReport):
+    """The test of the candidate's learned exploitability against that of the champion, which is `ref`.
+
+    margin: as a share of all points or in returns. outcome: `not more exploitable` or `more exploitable`.
+    blocks: counted rounds; each exploiter plays one block in a round. games: of both contestants.
+    candidate, champion: lower bounds of their exploitability, from a fixed number of blocks; None before these.
+    difference: how much more exploitable the candidate is, in the unit of the margin, with an interval over blocks,
+    for these exploiters. difference_over_exploiters: the same with an interval over blocks and exploiters, which holds
+    for others trained in the same way, too. Both are from the fixed number of blocks.
+    """
+
+    candidate: Exploitability | None
+    champion: Exploitability | None
+    difference: Difference | None
+    difference_over_exploiters: Difference | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,6 +263,7 @@ class VerdictReport(Document):
     bounds are None.
     alpha: error probability spent by this verdict.
     anchors: non-inferiority tests after the opponent was beaten. exploiters: paired tests after these.
+    exploitability: the test of learned exploitability after all others; None if it was not reached or is not required.
     difference: mean return minus that of the opponent if contestants are compared on the same side or the gate
     tests returns, else None.
     promoted: whether this verdict made the candidate champion.
@@ -273,6 +287,7 @@ class VerdictReport(Document):
     alpha: float
     anchors: tuple[AnchorReport, ...] = ()
     exploiters: tuple[ExploiterReport, ...] = ()
+    exploitability: ExploitabilityReport | None = None
     difference: Difference | None = None
     note: str | None = None
 

@@ -8,6 +8,7 @@ information or simultaneous moves, usually only such mixed strategies are optima
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
+    from league.config.base import JSON
     from league.config.league import LeagueConfig
     from league.interface import Interface
 
@@ -36,6 +37,34 @@ class Conditions(NamedTuple):
     game_digest: str
     """See `LeagueConfig.game`."""
     actions: ActionSelection
+
+    @property
+    def name(self) -> str:
+        """A short name, unique within a league."""
+        return f"{self.game_digest[:DIGITS]}-{self.actions}"
+
+
+DIGITS = 12
+"""Length of abbreviated digests."""
+
+
+class GameChange(NamedTuple):
+    """A part of the game that differs; None if the game does not have it."""
+
+    name: str
+    before: str | None
+    now: str | None
+
+
+def game_changes(before: "JSON", now: "JSON") -> tuple[GameChange, ...]:
+    """Return how two games differ (`LeagueConfig.game`). Digests are abbreviated."""
+    names = dict.fromkeys((*before, *now))
+    changed = (name for name in names if before.get(name) != now.get(name))
+    return tuple(GameChange(name, _short(before.get(name)), _short(now.get(name))) for name in changed)
+
+
+def _short(value: Any) -> str | None:
+    return None if value is None else str(value)[:DIGITS]
 
 
 def action_selection(config: "LeagueConfig", interface: "Interface") -> ActionSelection:

@@ -5,6 +5,7 @@ searched as Python does. What the user's code imports is found in installed pack
 that a file in it cannot replace a library.
 """
 
+import difflib
 import importlib
 import os
 import sys
@@ -65,8 +66,15 @@ def import_entry_point(key: str, entry_point: str, folder: str | None = None) ->
     module_name, _, name = entry_point.partition(":")
     module = import_module(key, module_name, folder)
     if not hasattr(module, name):
-        raise ConfigError(f"{key}: {module_name!r} ({module.__file__}) has no {name!r}")
+        raise ConfigError(f"{key}: {missing(module, name)}")
     return getattr(module, name)
+
+
+def missing(module: ModuleType, name: str) -> str:
+    """`'game' (/home/ann/game.py) has no 'make_en', did you mean 'make_env'?`"""
+    close = difflib.get_close_matches(name, vars(module), n=1)
+    guess = "".join(f", did you mean {each!r}?" for each in close)
+    return f"{module.__name__!r} ({getattr(module, '__file__', 'built in')}) has no {name!r}{guess}"
 
 
 def _import_own(key: str, package: str, folders: Sequence[str]) -> None:

@@ -140,6 +140,10 @@ class NotPromotable(Conflict, code="not_promotable"):
     """The version's role excludes it from promotion."""
 
 
+class LeagueArchived(Conflict, code="league_archived"):
+    """Nothing is trained, published or tested in an archived league."""
+
+
 class KeyReused(Conflict, code="idempotency_key_reused"):
     """An Idempotency-Key was already used for a different request."""
 
@@ -190,6 +194,10 @@ class BoundExceeded(LeagueError, code="bound_exceeded"):
 
 class GameCrashed(LeagueError, code="game_crashed"):
     """The environment of a game raised an exception in a reset or after a legal action."""
+
+
+class ExploiterMissing(LeagueError, code="exploiter_missing"):
+    """A verdict waits for an exploiter that could not be trained."""
 
 
 class VerdictRefuted(LeagueError, code="verdict_refuted"):

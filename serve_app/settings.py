@@ -65,14 +65,14 @@ class ServeSettings(BaseModel):
     """How long an alias waits for its version to be loaded; then it keeps the previous one, and the timeout is reported
     as a fault. A load that succeeds later still takes effect."""
     poll: float = Field(default=0.2, gt=0)
-    """Interval between polls of the registry's aliases. A promotion reaches every replica after at most this plus
-    loading time; within one second if poll ≤ 0.5."""
+    """Interval between polls of the registry's change counter with SQLite. A promotion reaches every replica after at
+    most this plus loading time; within one second if poll ≤ 0.5. PostgreSQL notifies replicas of changes."""
     poll_slowest: float = Field(default=2.0, gt=0)
     """Maximum interval while the database fails; the interval doubles up to it. At least `poll`."""
     poll_events: float = Field(default=0.5, gt=0)
     """Interval between polls for event streams; nothing is polled while none is open."""
     heartbeat: float = Field(default=4.0, gt=0)
-    """Interval between repeated acknowledgements. At most a third of LIVENESS_TIMEOUT, so that two may be lost."""
+    """Interval between signs of life. At most a third of LIVENESS_TIMEOUT, so that two may be lost."""
     retry: float = Field(default=3.0, gt=0)
     """How long a version that failed to load is not tried again; also the `Retry-After` of a 503."""
     access_log: str | None = None

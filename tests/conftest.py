@@ -1,14 +1,19 @@
 """Fixtures and settings shared by the tests of several packages."""
 
+import os
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 from hypothesis import settings
 
 from league.registry.storage import database
+from league.settings import Storage
+from tests.support.databases import StorageAt
 from tests.support.schema import migrated_once
 from tests.support.servers import postgresql
 
@@ -40,6 +45,14 @@ def _shared_resource(file: str) -> str:
     return "browser" if file.startswith("tests/browser/") else shared
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run tests that are marked for it with each database; with PostgreSQL, `make test` runs those of the registry."""
+    if "storage_at" in metafunc.fixturenames and metafunc.definition.get_closest_marker("both_databases"):
+        of_registry = metafunc.module.__name__.startswith("tests.league.")
+        other = pytest.param("postgresql", marks=() if of_registry else pytest.mark.slow)
+        metafunc.parametrize("storage_at", ["sqlite", other], indirect=True)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def schema() -> Iterator[None]:
     """Run migrations, the slowest part of many tests, once in a process."""
@@ -60,9 +73,21 @@ def ray_session() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def postgresql_socket() -> Iterator[Path]:
-    """The socket of a PostgreSQL server; the test is skipped if its programs are not installed."""
+    """The socket of a PostgreSQL server; the test is skipped if its programs are not installed, and fails in CI."""
     programs = postgresql.programs()
     if programs is None:
-        pytest.skip("PostgreSQL is not installed")
+        missing = (
+            "the programs of a PostgreSQL server are not installed: `apt-get install postgresql` enables this test"
+        )
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(missing)
     with postgresql.server(programs) as socket:
         yield socket
+
+
+@pytest.fixture
+def storage_at(request: pytest.FixtureRequest) -> StorageAt:
+    """Returns the storage of an empty home: with SQLite, unless the test is marked `on_both_databases`."""
+    if getattr(request, "param", "sqlite") == "sqlite":
+        return Storage.at
+    socket = request.getfixturevalue("postgresql_socket")
+    return lambda home: replace(Storage.at(home), database_url=postgresql.create(socket, f"league_{uuid4().hex}"))

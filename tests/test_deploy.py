@@ -1,5 +1,6 @@
 """The deployment files agree with deploy.yaml, with the exported metrics, and with the documentation for operators."""
 
+import gzip
 import json
 import re
 import subprocess
@@ -9,11 +10,15 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 import yaml
 from packaging.utils import canonicalize_name
 
+from configs import names
+from league.settings import Storage
 from serve_app.observability.prometheus import METRICS
+from serve_app.runtime import haproxy_script
 from serve_app.settings import ServeSettings
 
 ROOT = Path(__file__).parent.parent
@@ -29,6 +34,8 @@ RULES = [
     for rule in group["rules"]
 ]
 DASHBOARD = json.loads((ROOT / "deploy/grafana/policy-league.json").read_text())
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+IMAGES = tuple(f"{name}:{PROJECT['version']}" for name in ("policy-league", "policy-league-trainer"))
 OPERATIONS = (ROOT / "docs/operations.md").read_text()
 
 
@@ -42,7 +49,9 @@ def test_the_cluster_serves_like_a_single_machine() -> None:
     expected = json.loads(json.dumps(DEPLOY))
     expected["http_options"]["host"] = "0.0.0.0"
     expected["applications"][0]["args"] |= {"grpc_local_only": False}
-    expected["applications"][0]["deployments"][0]["num_replicas"] = 4
+    deployment = expected["applications"][0]["deployments"][0] | {"max_replicas_per_node": 3}
+    deployment["autoscaling_config"] |= {"min_replicas": 4, "max_replicas": 6}
+    expected["applications"][0]["deployments"] = [deployment]
     assert expected == SERVED
 
 
@@ -61,14 +70,15 @@ def test_both_files_are_valid_for_ray_and_our_settings(document: Any) -> None:
 def test_each_pod_has_the_environment_the_files_and_the_image(template: Any) -> None:
     (container,) = template["spec"]["containers"]
     environment = {entry["name"]: entry.get("value") for entry in container["env"]}
-    expected = exports()
+    expected = exports() | {"RAY_SERVE_HAPROXY_BINARY_PATH": f"/opt/league/bin/{HAPROXY}"}
     assert {name: value for name, value in environment.items() if name in expected and name != "LEAGUE_HOME"} == {
         name: value
         for name, value in expected.items()
         if name not in ("LEAGUE_HOME", "RAY_AUTH_MODE")  # the operator sets the latter, with the token
     }
     assert CLUSTER["authOptions"] == {"mode": "token"}
-    assert "LEAGUE_DATABASE_URL" in environment, "SQLite supports only one machine"
+    storage_of(container).check_reach({"10.0.0.1", "10.0.0.2"})
+    assert container["image"] in IMAGES
     mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
     volumes = {volume["name"]: volume for volume in template["spec"]["volumes"]}
     assert {mount["name"] for mount in mounts.values()} == volumes.keys()
@@ -82,6 +92,83 @@ def test_each_pod_has_the_environment_the_files_and_the_image(template: Any) -> 
     assert volumes[home["name"]] == {"name": "home", "emptyDir": {}}, "each pod has its own"
     assert {port["containerPort"] for port in container["ports"]} == {8000, 8001}
     assert container["image"] == HEAD["spec"]["containers"][0]["image"]
+
+
+def storage_of(container: Any) -> Storage:
+    """The storage that a container's environment describes. The database's URL is a secret."""
+    environment = {entry["name"]: entry.get("value") for entry in container["env"]}
+    (url,) = [entry for entry in container["env"] if entry["name"] == "LEAGUE_DATABASE_URL"]
+    assert url["valueFrom"] == {"secretKeyRef": {"name": "policy-league", "key": "database-url"}}
+    home, artifacts = (Path(str(environment[name])) for name in ("LEAGUE_HOME", "LEAGUE_ARTIFACTS"))
+    return Storage(home, "postgresql+psycopg://database/league", artifacts)
+
+
+KUBERNETES = json.loads(gzip.decompress((ROOT / "tests/data/kubernetes.json.gz").read_bytes()))
+OBJECTS = [
+    document
+    for file in ("kuberay.yaml", "nightly/cronjob.yaml", "nightly/training-cronjob.yaml")
+    for document in yaml.safe_load_all((ROOT / "deploy" / file).read_text())
+]
+
+
+def faults(document: Any) -> list[str]:
+    """Where a Kubernetes object differs from the schema of its kind. Unknown fields are faults."""
+    schema = KUBERNETES["kinds"][document["kind"]] | {"$defs": KUBERNETES["$defs"]}
+    found = jsonschema.Draft202012Validator(schema).iter_errors(document)
+    return [f"{error.json_path}: {error.message}" for error in found]
+
+
+@pytest.mark.parametrize("document", OBJECTS, ids=lambda each: f"{each['kind']} {each['metadata']['name']}")
+def test_kubernetes_accepts_the_objects(document: Any) -> None:
+    assert faults(document) == []
+
+
+def test_an_unknown_field_is_a_fault() -> None:
+    service, job = (json.loads(json.dumps(document)) for document in (OBJECTS[0], OBJECTS[-1]))
+    service["spec"]["rayClusterConfig"]["headGroupSpec"]["template"]["spec"]["containers"][0]["volumes"] = []
+    job["spec"]["jobTemplate"]["spec"]["template"]["spec"]["securityContext"]["runAs"] = 1000
+    assert ["volumes" in fault for fault in faults(service)] == [True]
+    assert ["runAs" in fault for fault in faults(job)] == [True]
+
+
+POD_SPECS = [
+    HEAD["spec"],
+    WORKERS["template"]["spec"],
+    *(o["spec"]["jobTemplate"]["spec"]["template"]["spec"] for o in OBJECTS[2:]),
+]
+
+
+@pytest.mark.parametrize("spec", POD_SPECS, ids=["head", "workers", "nightly", "training night"])
+def test_pods_run_as_the_user_of_the_image(spec: Any) -> None:
+    (uid, gid) = re.findall(r"^USER (\d+):(\d+)$", (ROOT / "Dockerfile").read_text(), flags=re.M)[0]
+    context = spec["securityContext"]
+    assert context["runAsNonRoot"]
+    assert [context[key] for key in ("runAsUser", "runAsGroup", "fsGroup")] == [int(uid), int(gid), int(gid)]
+
+
+HAPROXY = "league-haproxy"
+
+
+def test_the_limits_of_haproxy_apply_wherever_serve_runs() -> None:
+    """Ray sets neither a limit for slow senders nor a timeout for idle WebSockets: its HAProxy is our wrapper."""
+    assert PROJECT["scripts"][HAPROXY] == f"{haproxy_script.__name__}:main"
+    assert exports()["RAY_SERVE_HAPROXY_BINARY_PATH"] == f"$(command -v {HAPROXY})"
+    assert f"python -m venv {Path(POD_HAPROXY).parents[1]}" in (ROOT / "Dockerfile").read_text()
+
+
+(POD_HAPROXY,) = (
+    entry["value"] for entry in HEAD["spec"]["containers"][0]["env"] if entry["name"] == "RAY_SERVE_HAPROXY_BINARY_PATH"
+)
+
+
+def test_the_cluster_survives_the_loss_of_its_head_and_of_a_pod() -> None:
+    assert CLUSTER["gcsFaultToleranceOptions"]["redisAddress"]
+    assert SERVICE["spec"]["excludeHeadPodFromServeSvc"]
+    assert CLUSTER["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
+    deployment = SERVED["applications"][0]["deployments"][0]
+    replicas, of_a_pod = deployment["autoscaling_config"], deployment["max_replicas_per_node"]
+    assert replicas["max_replicas"] / WORKERS["replicas"] <= of_a_pod
+    assert of_a_pod < replicas["min_replicas"]
 
 
 def test_the_pinned_ray_is_that_of_the_cluster() -> None:
@@ -167,39 +254,56 @@ def test_each_serving_setting_is_documented_with_its_default() -> None:
     assert {name: yaml.safe_load(value) for name, value in rows.items()} == defaults
 
 
-JOB = yaml.safe_load((ROOT / "deploy/nightly/cronjob.yaml").read_text())
-POD = JOB["spec"]["jobTemplate"]["spec"]["template"]["spec"]
+JOBS = OBJECTS[2:]
+NIGHTLY = ["league", "nightly"]
+TRAINING_NIGHT = [*NIGHTLY, "--train", "connect_four", "leduc_holdem"]
 
 
-def test_the_nightly_job_uses_the_registry_of_the_cluster() -> None:
-    (container,) = POD["containers"]
+@pytest.mark.parametrize(
+    ("job", "command"), zip(JOBS, [NIGHTLY, TRAINING_NIGHT], strict=True), ids=["nightly", "training night"]
+)
+def test_the_nightly_jobs_use_the_registry_of_the_cluster(job: Any, command: list[str]) -> None:
+    pod = job["spec"]["jobTemplate"]["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
     (server,) = HEAD["spec"]["containers"]
-    assert container["image"] == server["image"]
-    served = {entry["name"]: entry for entry in server["env"]}
-    for entry in container["env"]:
-        if entry["name"] in ("LEAGUE_HOME", "LEAGUE_ARTIFACTS", "LEAGUE_DATABASE_URL"):
-            assert entry == served[entry["name"]]
+    assert container["command"] == command
+    assert container["image"] in IMAGES
+    served = storage_of(server)
+    storage = storage_of(container)
+    assert (storage.database_url, storage.artifacts) == (served.database_url, served.artifacts)
+    storage.check_reach({"10.0.0.1", "10.0.0.2"})
     mounted = {mount["name"] for mount in container["volumeMounts"]}
-    assert mounted == {volume["name"] for volume in POD["volumes"]}
-    assert JOB["spec"]["concurrencyPolicy"] == "Forbid"
+    assert mounted == {volume["name"] for volume in pod["volumes"]}
+    assert job["spec"]["concurrencyPolicy"] == "Forbid"
+
+
+def test_a_training_night_writes_versions_and_keeps_its_runs_on_the_volume() -> None:
+    pod = JOBS[1]["spec"]["jobTemplate"]["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    (mount,) = [mount for mount in container["volumeMounts"] if mount["name"] == "league"]
+    storage = storage_of(container)
+    assert not mount.get("readOnly")
+    assert isinstance(storage.artifacts, Path)
+    assert all(path.is_relative_to(mount["mountPath"]) for path in (storage.home, storage.artifacts))
+    assert set(TRAINING_NIGHT[3:]) <= set(names())
+    assert "trainer" in container["image"], "the server's image has no PyTorch"
 
 
 def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
     from cli.nightly import BUSY, FAULTS
 
-    unit = (ROOT / "deploy/nightly/league-nightly.service").read_text()
-    assert f"SuccessExitStatus={BUSY}\n" in unit
-    (rule,) = [r for r in JOB["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
-    assert rule["onExitCodes"]["values"] == [FAULTS, 2]
-    (line,) = [line for line in (ROOT / "deploy/nightly/crontab").read_text().splitlines() if line[:1].isdigit()]
-    assert re.fullmatch(r"(\S+ ){5}cd .* \.venv/bin/league nightly >> .*", line)
-    assert POD["containers"][0]["command"] == ["league", "nightly"]
-    assert re.search(
-        r"^OnCalendar=\*-\*-\* \d\d:\d\d$", (ROOT / "deploy/nightly/league-nightly.timer").read_text(), flags=re.M
-    )
+    for job in JOBS:
+        (rule,) = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
+        assert rule["onExitCodes"]["values"] == [FAULTS, 2]
+    crontab = (ROOT / "deploy/nightly/crontab").read_text()
+    for unit, command in ("league-nightly", NIGHTLY), ("league-training-night", TRAINING_NIGHT):
+        service, timer = ((ROOT / f"deploy/nightly/{unit}.{kind}").read_text() for kind in ("service", "timer"))
+        assert f"SuccessExitStatus={BUSY}\n" in service
+        assert re.search(rf"^ExecStart=\S+/\.venv/bin/{' '.join(command)}$", service, flags=re.M)
+        assert re.search(r"^OnCalendar=\*-\*-\* \d\d:\d\d$", timer, flags=re.M)
+        assert re.search(rf"^(\S+ ){{5}}cd .* \.venv/bin/{' '.join(command)} >> ", crontab, flags=re.M)
 
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 TRAINING = {"onnx", "onnxscript", "tensorboard", "torch"}
 """Dependencies that only training imports."""
 
@@ -229,8 +333,8 @@ def test_serving_and_evaluation_import_no_dependency_of_training() -> None:
 
 def test_the_container_images_have_the_deployed_tags() -> None:
     dockerfile = (ROOT / "Dockerfile").read_text()
-    assert f"--target server --tag {HEAD['spec']['containers'][0]['image']} ." in dockerfile
-    assert PROJECT["version"] in HEAD["spec"]["containers"][0]["image"]
+    for target, image in zip(("server", "trainer"), IMAGES, strict=True):
+        assert f"--target {target} --tag {image} ." in dockerfile
     assert set(re.findall(r"^FROM \S+ AS (\w+)$", dockerfile, flags=re.M)) >= {"server", "trainer"}
     assert re.search(r"^USER 1000:1000$", dockerfile, flags=re.M), "Kubernetes checks that the user is not root"
 

@@ -133,6 +133,27 @@ def test_each_shown_league_is_a_valid_configuration(page: str, block: str) -> No
     LeagueConfig.from_mapping(yaml.safe_load(block), source=page)
 
 
+EXAMPLES = {"league", "environment.entry_point", "policies", "sides", "gate.anchors"}
+"""Keys whose values in the sample are examples: they are required, or their default is computed or empty."""
+
+
+def differing_keys(sample: Any, defaults: Any, key: str = "") -> Iterator[str]:
+    if key in EXAMPLES:
+        return
+    if isinstance(sample, dict) and isinstance(defaults, dict):
+        for name, value in sample.items():
+            yield from differing_keys(value, defaults.get(name, "no such key"), f"{key}.{name}".strip("."))
+    elif sample != defaults:
+        yield f"{key}: {sample!r}, default {defaults!r}"
+
+
+def test_the_sample_of_all_keys_shows_the_defaults() -> None:
+    sample = yaml.safe_load(fenced(DOCS / "configuration.md", "yaml")[0])
+    required = {"league": sample["league"], "environment": {"entry_point": sample["environment"]["entry_point"]}}
+    defaults = LeagueConfig.from_mapping(required).model_dump(by_alias=True, mode="json")
+    assert list(differing_keys(sample, defaults)) == []
+
+
 def settings_of(heading: str) -> dict[str, str]:
     """Key → default, from the table below a heading."""
     _, found, section = (DOCS / "configuration.md").read_text().partition(f"\n## {heading}\n")

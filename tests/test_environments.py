@@ -11,7 +11,7 @@ import pytest
 from evaluation.matches import tournament
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.conformance import examine
+from league.environments.conformance.examination import examine
 from league.policies import load
 from league.registry.registry import Registry
 from league.settings import Storage

@@ -62,7 +62,7 @@ def _round(registry: Registry, replica: StandaloneReplica, link: str, seconds: f
         _ip("link", "set", link, "down")
         cut, noticed = time.monotonic(), float("inf")
         while time.monotonic() - cut < seconds:
-            if noticed == float("inf") and "cannot poll aliases" in replica.log.read_text()[logged:]:
+            if noticed == float("inf") and "cannot poll the registry" in replica.log.read_text()[logged:]:
                 noticed = time.monotonic() - cut
             time.sleep(0.05)
         seen = _seen(registry, replica)

@@ -6,6 +6,7 @@ challenger are those of equal players, tilted exponentially to the required effe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,17 +58,28 @@ def _tilted(shares: tuple[float, ...], theta: float) -> Floats:
 
 
 def simulate(settings: GateConfig, shares: Floats, gates: int, seed: int) -> Gates:
-    """Many tests on random blocks, each stopped as by `evaluation.gating.gate.decide`."""
+    """Many tests on random blocks of two games, whose cells have the probabilities `shares`."""
     rng = np.random.default_rng(seed)
+    return simulate_draws(
+        settings, 5, gates, lambda running, steps: rng.choice(5, p=shares, size=(len(running), steps))
+    )
+
+
+Draw = Callable[[NDArray[np.int64], int], NDArray[np.int64]]
+"""Returns the cells of the next blocks of some gates. Arguments: their numbers, and the number of blocks of each.
+Result: shape (gates, blocks)."""
+
+
+def simulate_draws(settings: GateConfig, cells: int, gates: int, draw: Draw) -> Gates:
+    """Many tests on random blocks, each stopped as by `evaluation.gating.gate.decide`. cells: number of cells."""
     lower, upper = decision_bounds(settings)
     assert settings.model != "returns"
-    counts = np.zeros((gates, 5))
+    counts = np.zeros((gates, cells))
     promoted, blocks = np.zeros(gates, dtype=bool), np.full(gates, settings.max_blocks)
     running = np.arange(gates)
     for start in range(0, settings.max_blocks, AT_ONCE):
         steps = min(AT_ONCE, settings.max_blocks - start)
-        drawn = rng.choice(5, p=shares, size=(len(running), steps))
-        prefixes = np.eye(5)[drawn].cumsum(axis=1) + counts[running, None]
+        prefixes = np.eye(cells)[draw(running, steps)].cumsum(axis=1) + counts[running, None]
         curves = gsprt_llr(prefixes, settings.elo0, settings.elo1, settings.model)
         outside = (curves <= lower) | (curves >= upper)
         ended, at = outside.any(axis=1), outside.argmax(axis=1)

@@ -30,10 +30,11 @@ import ray
 from ray.cluster_utils import Cluster
 
 from evaluation.matches import tournament
-from evaluation.matches.worker import baselines, match_worker
+from evaluation.matches.worker import match_worker
 from evaluation.schedules.builders import round_robin
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from league.policies.loading import baselines
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match, Schedule

@@ -21,13 +21,13 @@ NUM_ENVS = 128
 
 
 def graph(algorithm: Algorithm, league: LeagueConfig) -> Policy:
-    """The exported graph of the policy of a league with one policy."""
+    """The exported graph of the policy of a league with one policy, which plays greedily in any league."""
     league_interface = interface_of(league)
     (policy,) = league_interface.policy_ids
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "policy.onnx"
         export_policy(algorithm.learner_group._learner.module[policy], league_interface.of_policy(policy), path)
-        return OnnxPolicy(path)
+        return OnnxPolicy(path, has_distribution=False)
 
 
 def games(trained: Policy, league: LeagueConfig, opponent: str, count: int, seed: int = 0) -> list[Game]:

@@ -1,5 +1,6 @@
 """The part of `benchmarks.learning` with pistonball: the return of the served policy, whose actions are greedy."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def _served(seed: int, scale: float) -> NDArray:
     with local_ray(cpus=3):
         algorithm = build_algorithm(league, interface(league))
         try:
-            curve = list(updates(algorithm, SECONDS * scale, league.training.steps))
+            curve = list(updates(algorithm, SECONDS * scale, league.training.max_steps or math.inf))
             played = games(graph(algorithm, league), league, "script:random", 2 * EPISODES, seed)
         finally:
             algorithm.stop()

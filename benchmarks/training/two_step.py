@@ -44,7 +44,7 @@ def learn(mixer: str, seed: int, **settings: object) -> LearningResult:
     algorithm = build_algorithm(league, interface(league))
     try:
         began = time.process_time()
-        while algorithm.steps < league.training.steps:
+        while league.training.budget_spent(algorithm.steps, seconds=0) < 1:
             algorithm.train()
         seconds = time.process_time() - began
         returned = greedy_returns(algorithm, EPISODES).mean()

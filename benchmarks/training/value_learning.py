@@ -128,8 +128,10 @@ def _train(
     one_thread()
     league = LeagueConfig.load(CONFIGS / f"{name}.yaml").with_training(runners=0, seed=seed)
     settings = league.training
-    every = settings.checkpoint_every or settings.steps
-    checkpoints: Sequence[int] = [*range(every, settings.steps, every), settings.steps]
+    budget = settings.max_steps
+    assert budget is not None, f"{name} has a budget of actions"
+    every = settings.checkpoint_steps or budget
+    checkpoints: Sequence[int] = [*range(every, budget, every), budget]
     with local_ray(cpus=1):
         algorithm = build_algorithm(league, interface(league))
         try:

@@ -1,66 +1,27 @@
-"""The gate: sequential tests against the champion and the anchors decide `promote`, `reject` or `inconclusive`.
+"""The sequential test of a gate, which decides `promote`, `reject` or `inconclusive`.
 
 The evidence is the score of each block, tested by a GSPRT on Elo. With the model `returns` it is the difference of
 returns, tested by betting. A decision is a function of the settings and of the blocks in schedule order. It does not
 depend on completion times, the number of workers, or blocks after the stopping block.
 
-docs/statistics.md explains how α is spent over a year, and why a candidate that must pass all tests is promoted
-wrongly with at most the α of one (R. L. Berger, "Multiparameter hypothesis testing and acceptance sampling",
-Technometrics 24, 1982).
+evaluation/gating/gate_result.py combines the tests of a candidate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.gating.observations import Observations, matches_each, observe
 from evaluation.matches.game_records import unique_games
-from evaluation.results import Difference
-from evaluation.statistics.payoff import student_interval
 from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config.gate import GateConfig
 from league.errors import BoundExceeded
 from league.results.records import GAMES_PER_BLOCK, Match
-
-YEAR = timedelta(days=365)
-
-NIGHTS = 365
-"""Nightly runs per year over which α is spent."""
-
-
-def alpha_per_verdict(candidates: int, alpha: float, nights: int = NIGHTS) -> float:
-    """The α of each verdict of a nightly run.
-
-    Args:
-        candidates: Candidates of the nightly run.
-        alpha: The α of a year.
-        nights: Nightly runs of a year.
-
-    Raises:
-        ValueError: Without candidates or runs, or for an alpha outside (0, 1).
-    """
-    if candidates < 1 or nights < 1 or not 0 < alpha < 1:
-        raise ValueError(
-            f"expected candidates >= 1, nights >= 1 and 0 < alpha < 1, got {candidates}, {nights}, {alpha}"
-        )
-    return alpha / nights / candidates
-
-
-def alpha_spent(verdicts: Iterable[tuple[datetime, float]], now: datetime) -> float:
-    """The α spent in the year before `now`. verdicts: when each was opened, and its α."""
-    return sum(alpha for opened_at, alpha in verdicts if now - YEAR < opened_at)
-
-
-def alpha_share(candidates: int, alpha: float, nights: int, spent: float) -> float:
-    """The α of each verdict of a nightly run when `spent` of the year's α is used; 0 if nothing is left."""
-    return max(0.0, min(alpha_per_verdict(candidates, alpha, nights), (alpha - spent) / candidates))
-
 
 Outcome = Literal["promote", "reject", "inconclusive"]
 
@@ -160,6 +121,20 @@ def decide_matches(settings: GateConfig, matches: Sequence[Match], candidate: st
     return replace(decision, unique_games=unique_games(matches[: decision.blocks]))
 
 
+def decide_pairs(
+    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, pairs: int = 1
+) -> Decision:
+    """Decide from matches of candidate and champion against exploiters, one match of each in turn.
+
+    pairs: pairs of matches in a round, which is one observation.
+    """
+    seen = observe(settings, matches, candidate, champion, pairs)
+    decision = decide(settings, seen.scores, seen.comparisons, seen.differences)
+    counted = matches[: decision.blocks * matches_each(champion, pairs)]
+    games = len(counted) * GAMES_PER_BLOCK
+    return replace(decision, games=games, unique_games=unique_games(counted), estimate=None)
+
+
 def shadow_shortfall(
     settings: GateConfig, observations: int, failed: int, agreement: float | None, latency_ms: float | None
 ) -> str | None:
@@ -203,10 +178,18 @@ class SequentialMonitor:
     It processes each block once. `decide_matches` makes the decision itself.
     """
 
-    def __init__(self, settings: GateConfig, candidate: str, champion: str | None = None) -> None:
-        """champion: for a test against an exploiter, the contestant of every second match."""
-        self._settings, self._candidate, self._champion = settings, candidate, champion
-        self._each = matches_each(champion)
+    def __init__(
+        self,
+        settings: GateConfig,
+        candidate: str,
+        champion: str | None = None,
+        pairs: int = 1,
+        at_least: int = 0,
+    ) -> None:
+        """champion, pairs: as in `observe`. at_least: observations to be made even if fewer decide the test."""
+        self._settings, self._candidate, self._champion, self._pairs = settings, candidate, champion, pairs
+        self._each, self._at_least = matches_each(champion, pairs), at_least
+        self._is_decided = False
         self.bounds = decision_bounds(settings)
         self.llr = 0.0
         self._counts: NDArray[np.int64] | None = None
@@ -214,15 +197,18 @@ class SequentialMonitor:
         self._seen = 0
 
     def is_over(self, matches: Sequence[Match]) -> bool:
-        """Whether the test is decided or exhausted. matches: all matches of the schedule so far, in order."""
+        """Whether the test is decided, and has the observations to be made, or is exhausted.
+
+        matches: all matches of the schedule so far, in order.
+        """
         end = min(len(matches) // self._each, self._settings.max_blocks)
         if end > self._seen:
             new = matches[self._seen * self._each : end * self._each]
-            curve = self._curve(observe(self._settings, new, self._candidate, self._champion))
+            curve = self._curve(observe(self._settings, new, self._candidate, self._champion, self._pairs))
             self.llr, self._seen = float(curve[-1]), end
-            if _crossed(curve, self.bounds).size:
-                return True
-        return self._seen >= self._settings.max_blocks
+            self._is_decided = self._is_decided or bool(_crossed(curve, self.bounds).size)
+        is_sufficient = self._is_decided and self._seen >= self._at_least
+        return is_sufficient or self._seen >= self._settings.max_blocks
 
     def _curve(self, new: Observations) -> NDArray[np.float64]:
         if self._settings.model == "returns":
@@ -277,150 +263,3 @@ def _cumulated(block_scores: Sequence[float], comparisons: int) -> NDArray[np.in
 
 def _crossed(curve: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.intp]:
     return np.flatnonzero((curve <= limits[0]) | (curve >= limits[1]))
-
-
-@dataclass(frozen=True, slots=True)
-class AnchorResult:
-    """A non-inferiority test against one anchor. margin: by how much the candidate may be weaker."""
-
-    ref: str
-    margin: float
-    schedule: str
-    decision: Decision
-
-    @property
-    def failure(self) -> str:
-        """What a `reject` shows."""
-        return f"is weaker than {self.ref}"
-
-    @property
-    def claim(self) -> str:
-        """What a `promote` shows."""
-        return f"is at most {self.margin:g} weaker than {self.ref}"
-
-
-@dataclass(frozen=True, slots=True)
-class ExploiterResult:
-    """A paired test of candidate and champion against one exploiter.
-
-    Attributes:
-        ref: The exploiter.
-        exploits: The champion that it was trained against.
-        margin: By how much the candidate may be worse than the champion.
-        schedule: Id of the schedule.
-        decision: The test, whose blocks are pairs of blocks.
-        scores: Mean scores of candidate and champion over the counted pairs; None without pairs.
-        difference: Score of the candidate minus the champion's, or its difference of returns if the gate tests returns.
-    """
-
-    ref: str
-    exploits: str
-    margin: float
-    schedule: str
-    decision: Decision
-    scores: tuple[float, float] | None
-    difference: Difference | None
-
-    @property
-    def failure(self) -> str:
-        """What a `reject` shows."""
-        return f"does worse than the champion against {self.ref}, an exploiter of {self.exploits}"
-
-    @property
-    def claim(self) -> str:
-        """What a `promote` shows."""
-        return f"is at most {self.margin:g} worse than the champion against {self.ref}, an exploiter of {self.exploits}"
-
-
-def decide_pairs(settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str) -> Decision:
-    """Decide from matches of candidate and champion against an exploiter, one match of each in turn."""
-    seen = observe(settings, matches, candidate, champion)
-    decision = decide(settings, seen.scores, seen.comparisons, seen.differences)
-    counted = matches[: decision.blocks * matches_each(champion)]
-    games = len(counted) * GAMES_PER_BLOCK
-    return replace(decision, games=games, unique_games=unique_games(counted), estimate=None)
-
-
-def exploiter_result(
-    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, exploiter: Mapping[str, Any]
-) -> ExploiterResult:
-    """Test candidate and champion against an exploiter. exploiter: its record in the settings of the verdict."""
-    ref, exploits, margin, schedule = (exploiter[name] for name in ("ref", "exploits", "margin", "schedule"))
-    test = settings.against_exploiter(margin)
-    decision = decide_pairs(test, matches, candidate, champion)
-    counted = matches[: 2 * decision.blocks]
-    gaps, scores = observe(test, counted, candidate, champion).gaps, None
-    if counted:
-        own, other = (
-            sum(match.score(match.contestants.index(each)) for match in counted if each in match.contestants)
-            for each in (candidate, champion)
-        )
-        scores = own / decision.blocks, other / decision.blocks
-    gap = student_interval(gaps) if gaps else None
-    return ExploiterResult(ref, exploits, margin, schedule, decision, scores, gap)
-
-
-CompanionResult = AnchorResult | ExploiterResult
-
-
-@dataclass(frozen=True, slots=True)
-class GateResult:
-    """Results of all tests of a candidate.
-
-    companions: started tests after that against the champion, in order, of `planned_companions` in total.
-    forfeits: forfeited games, or None if the gate allows them.
-    """
-
-    champion: Decision
-    companions: tuple[CompanionResult, ...] = ()
-    planned_companions: int = 0
-    forfeits: int | None = None
-
-    @property
-    def anchors(self) -> tuple[AnchorResult, ...]:
-        return tuple(each for each in self.companions if isinstance(each, AnchorResult))
-
-    @property
-    def exploiters(self) -> tuple[ExploiterResult, ...]:
-        return tuple(each for each in self.companions if isinstance(each, ExploiterResult))
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """Outcome of the verdict; None while a test is open."""
-        return self._conclusion()[0]
-
-    @property
-    def note(self) -> str | None:
-        """Why the candidate is not promoted although it beat the champion."""
-        return self._conclusion()[1]
-
-    def _conclusion(self) -> tuple[Outcome | None, str | None]:
-        if self.champion.outcome != "promote":
-            return self.champion.outcome, None
-        if self.forfeits:
-            return "reject", f"it forfeited {self.forfeits} games, but the gate allows none"
-        for test in self.companions:
-            if test.decision.outcome == "reject":
-                return "reject", f"it beat the champion, but {test.failure}"
-            if test.decision.outcome == "inconclusive":
-                return "inconclusive", (
-                    f"it beat the champion, but {test.decision.games} games do not show that it {test.claim}"
-                )
-        is_complete = len(self.companions) == self.planned_companions and all(map(_is_passed, self.companions))
-        return ("promote" if is_complete else None), None
-
-
-def _is_passed(test: CompanionResult) -> bool:
-    return test.decision.outcome == "promote"
-
-
-def combine_results(
-    champion: Decision, companions: Sequence[CompanionResult], planned_companions: int, forfeits: int | None
-) -> GateResult:
-    """Combine the tests up to the first one after the champion's that is not passed. Later ones are ignored."""
-    looked_at: list[CompanionResult] = []
-    for test in companions if champion.outcome == "promote" and not forfeits else ():
-        looked_at.append(test)
-        if not _is_passed(test):
-            break
-    return GateResult(champion, tuple(looked_at), planned_companions, forfeits)

@@ -12,7 +12,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 
 from evaluation.gating import verdicts
-from evaluation.gating.gate import alpha_share, alpha_spent
+from evaluation.gating.alpha_spending import alpha_share, alpha_spent
+from evaluation.gating.trained_exploiters import Trainer
+from evaluation.gating.verdict_report import confirmation
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.matches.tournament import fixed_baselines
@@ -24,6 +26,7 @@ from league.errors import (
     ArtifactCorrupt,
     BoundExceeded,
     EnvironmentMismatch,
+    ExploiterMissing,
     GameCrashed,
     GameHung,
     NotFound,
@@ -31,7 +34,7 @@ from league.errors import (
     RemoteError,
     WorkerLost,
 )
-from league.policies.loading import check_scripts, eligible
+from league.policies.loading import check_contestants, eligible
 from league.ray_cluster import ray_session
 from league.refs import CHAMPION
 from league.registry.registry import Registry
@@ -46,6 +49,7 @@ CONTESTANT_FAULTS = (
     ArtifactCorrupt,
     BoundExceeded,
     EnvironmentMismatch,
+    ExploiterMissing,
     GameCrashed,
     GameHung,
     NotFound,
@@ -57,7 +61,12 @@ CONTESTANT_FAULTS = (
 
 
 def nightly(
-    config: LeagueConfig, *, registry: Registry, workers: int = 0, listener: Listener | None = None
+    config: LeagueConfig,
+    *,
+    registry: Registry,
+    train: Trainer | None = None,
+    workers: int = 0,
+    listener: Listener | None = None,
 ) -> NightlyReport:
     """Gate all versions without a verdict, oldest first, each against the current champion.
 
@@ -67,21 +76,23 @@ def nightly(
     Args:
         config: Configuration of the league.
         registry: Registry of the league.
+        train: Trains the exploiters that `gate.exploiters` requires. Without it, verdicts that need them stay open.
         workers: Parallel Ray tasks; 0 plays in this process.
         listener: Receives progress and verdicts.
 
     Raises:
-        ConfigError: A script or bot of the configuration cannot play.
+        ConfigError: A script, a bot or an anchor of the configuration does not exist or cannot play.
         AlreadyRunning: Another nightly run of this league is active.
+        LeagueArchived: The league is archived.
         InterfaceChanged: The configuration no longer fits the league's versions.
         WorkerLost: Workers died repeatedly.
     """
     began = time.monotonic()
     with registry.exclusive_lock(f"nightly-{config.league}"), ray_session():
         found = interface(config)
-        check_scripts(config, found)
+        check_contestants(config, found, registry)
         registry.leagues.register(config, found)
-        nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), workers, listener)
+        nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), train, workers, listener)
         before = nightly_run.champion()
         nightly_run.run_gate()
         nightly_run.confirm()
@@ -102,8 +113,10 @@ def nightly(
 
 
 class _NightlyRun:
-    def __init__(self, registry: Registry, league: LeagueRow, workers: int, listener: Listener | None) -> None:
-        self._registry, self._league = registry, league
+    def __init__(
+        self, registry: Registry, league: LeagueRow, train: Trainer | None, workers: int, listener: Listener | None
+    ) -> None:
+        self._registry, self._league, self._train = registry, league, train
         self._workers, self._listener = workers, listener
         self._row: NightlyRunRow | None = None
         self.verdicts: list[VerdictReport] = []
@@ -174,7 +187,7 @@ class _NightlyRun:
     def confirm(self) -> None:
         """Play the missing confirmation matches of promotions."""
         for row in self._registry.verdicts.all(self._league.slug):
-            if row.outcome == "promote" and verdicts.confirmation(self._registry, row) is None:
+            if row.outcome == "promote" and confirmation(self._registry, row) is None:
                 with self._faults_of(f"the confirmation of {row.league}@{row.candidate}"):
                     gain = verdicts.confirm(self._registry, row, workers=self._workers, listener=self._listener)
                     if gain is not None:
@@ -215,7 +228,9 @@ class _NightlyRun:
 
     def _conclude(self, verdict: VerdictRow) -> None:
         with self._faults_of(f"{verdict.league}@{verdict.candidate} against {verdict.champion}"):
-            report = verdicts.conclude(self._registry, verdict, workers=self._workers, listener=self._listener)
+            report = verdicts.conclude(
+                self._registry, verdict, train=self._train, workers=self._workers, listener=self._listener
+            )
             self.verdicts.append(report)
             if self._listener:
                 self._listener(report)

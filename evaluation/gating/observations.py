@@ -1,14 +1,19 @@
-"""What a sequential test observes: blocks against an opponent, or pairs of blocks against an exploiter.
+"""What a sequential test observes: blocks against an opponent, or rounds in which candidate and champion are compared.
 
-In a pair, candidate and champion each play a block against the exploiter from the same seed, opening and seats. With
+In a round, candidate and champion each play a block against an exploiter from the same seed, opening and seats. With
 their scores s in [0, 1], the observation is (1 + s_candidate - s_champion) / 2, the score of a contest in which the
 candidate beats the champion by scoring more. What an opening is worth against the exploiter cancels.
+
+In the test of exploitability a round has several pairs of blocks, one for each pair of exploiters, all from the same
+seed. s is then the mean over the blocks of a round, because these are not independent.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from evaluation.matches.game_records import forfeit_difference
 from league.config.gate import GateConfig
@@ -31,17 +36,17 @@ class Observations:
 
     @property
     def gaps(self) -> list[float]:
-        """What the candidate achieved more than the champion in each pair, in the unit of the test's margin."""
+        """What the candidate achieved more than the champion in each round, in the unit of the test's margin."""
         return [2 * d for d in self.differences] or [2 * score - 1 for score in self.scores]
 
 
-def matches_each(champion: str | None) -> int:
-    """Matches per observation. champion: as in `observe`."""
-    return 1 if champion is None else 2
+def matches_each(champion: str | None, pairs: int = 1) -> int:
+    """Matches per observation. champion, pairs: as in `observe`."""
+    return 1 if champion is None else 2 * pairs
 
 
 def observe(
-    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str | None = None
+    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str | None = None, pairs: int = 1
 ) -> Observations:
     """Observe matches.
 
@@ -49,18 +54,25 @@ def observe(
         settings: Configuration of the gate.
         matches: Matches in schedule order.
         candidate: Reference of the candidate.
-        champion: For a test against an exploiter, the contestant of every second match. A last match without the other
-            one of its pair is ignored.
+        champion: For a comparison with the champion, the contestant of every second match. The matches of an incomplete
+            last round are ignored.
+        pairs: Pairs of matches in a round.
     """
-    own, other = matches[::2], matches[1::2]
     if champion is None:
         return _blocks(settings, matches, candidate)
-    mine, others = _blocks(settings, own[: len(other)], candidate), _blocks(settings, other, champion)
+    each = matches_each(champion, pairs)
+    whole = matches[: len(matches) // each * each]
+    mine, others = _blocks(settings, whole[::2], candidate), _blocks(settings, whole[1::2], champion)
     return Observations(
-        scores=[(1 + s - t) / 2 for s, t in zip(mine.scores, others.scores, strict=True)],
-        comparisons=2 * mine.comparisons,
-        differences=[(d - e) / 2 for d, e in zip(mine.differences, others.differences, strict=True)],
+        scores=[(1 + gap) / 2 for gap in _mean_gaps(mine.scores, others.scores, pairs)],
+        comparisons=2 * pairs * mine.comparisons,
+        differences=[gap / 2 for gap in _mean_gaps(mine.differences, others.differences, pairs)],
     )
+
+
+def _mean_gaps(own: Sequence[float], other: Sequence[float], pairs: int) -> list[float]:
+    gaps = np.asarray(own, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+    return [float(gap) for gap in gaps.reshape(-1, pairs).mean(axis=1)]
 
 
 def _blocks(settings: GateConfig, matches: Sequence[Match], contestant: str) -> Observations:

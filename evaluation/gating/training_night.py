@@ -8,28 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from evaluation.gating.exploitability import exploitability
 from evaluation.gating.nightly import nightly
+from evaluation.gating.trained_exploiters import Trainer, trainable_version, trained_exploiters
 from evaluation.results import Listener, NightlyReport
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, LeagueError, StorageError, one_line
+from league.policies.loading import check_contestants
 from league.refs import CHAMPION, CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import TrainingNightRow
 from league.seeds import derive
-
-
-class Trainer(Protocol):
-    """Trains and publishes versions. A call with the name of an earlier run continues that run."""
-
-    def __call__(self, config: LeagueConfig, /, *, name: str, parent: int | None, target: str | None) -> object:
-        """Train until the budget is spent. target: the version that an exploiter is trained against.
-
-        Raises LeagueError.
-        """
 
 
 @dataclass
@@ -45,7 +37,7 @@ class _Night:
     def versions(self, run: str) -> list[str]:
         """References of the versions that a training run has published."""
         rows = self.registry.versions.all(self.config.league)
-        return [row.ref for row in rows if row.source.partition("/")[0] == run]
+        return [row.ref for row in rows if row.run == run]
 
     def earlier(self, step: str, target: str) -> dict[str, Any] | None:
         """The newest successful result of a step for the same champion in an earlier night."""
@@ -84,7 +76,9 @@ def training_night(
         LeagueError: The errors of `nightly`.
     """
     with registry.exclusive_lock(f"training-night-{config.league}"):
-        registry.leagues.register(config, interface(config))
+        found = interface(config)
+        check_contestants(config, found, registry)
+        registry.leagues.register(config, found)
         row = registry.training_nights.open(config.league)
         night = _Night(config, registry, row, train, workers, listener)
         for number, (name, step) in enumerate(STEPS.items(), 1):
@@ -96,7 +90,10 @@ def training_night(
 
 def _train(night: _Night) -> dict[str, Any]:
     seed = _seed(night)
-    error = _attempt(night, night.config.of_night(seed), night.row.run, night.row.parent, None)
+    parent = night.row.parent
+    if parent is not None:
+        parent = trainable_version(night.registry, night.config.league, parent)
+    error = _attempt(night, night.config.of_night(seed), night.row.run, parent, None)
     return {"run": night.row.run, "versions": night.versions(night.row.run)} | error
 
 
@@ -118,7 +115,9 @@ def _attempt(night: _Night, config: LeagueConfig, run: str, parent: int | None, 
 
 def _gate(night: _Night) -> dict[str, Any]:
     registry, league = night.registry, night.config.league
-    night.gate_report = nightly(night.config, registry=registry, workers=night.workers, listener=night.listener)
+    night.gate_report = nightly(
+        night.config, registry=registry, train=night.train, workers=night.workers, listener=night.listener
+    )
     began = night.row.began_at
     verdicts = [
         {"candidate": f"{league}@{row.candidate}", "opponent": row.champion, "outcome": row.outcome}
@@ -135,18 +134,19 @@ def _gate(night: _Night) -> dict[str, Any]:
 
 
 def _exploiter(night: _Night) -> dict[str, Any]:
-    """Train an exploiter of the champion, unless there is one from an earlier night."""
+    """Train an exploiter of the champion, unless there is one from an earlier night or from the gate."""
     target, share = night.row.steps["gate"]["champion"], night.config.nightly.exploiter
     league = night.registry.leagues.get(night.config.league)
     if target is None or share == 0 or len(league.interface.sides) < 2:
         return {"target": target, "versions": []}
     if (earlier := night.earlier("exploiter", target)) is not None and earlier["versions"]:
         return earlier
-    run = night.row.exploiter_run
-    seed = _seed(night, "exploiter")
+    run, config = night.row.exploiter_run, night.config.of_night(_seed(night, "exploiter"), share)
+    if not night.versions(run) and (known := trained_exploiters(night.registry, league, target, config)):
+        return {"target": target, "versions": known}
     parent = CheckpointRef.parse(target).version
     assert isinstance(parent, int)
-    error = _attempt(night, night.config.of_night(seed, share), run, parent, target)
+    error = _attempt(night, config, run, trainable_version(night.registry, league.slug, parent), target)
     return {"target": target, "run": run, "versions": night.versions(run)} | error
 
 

@@ -6,16 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from evaluation.gating.gate import Decision
-from evaluation.gating.verdicts import (
+from evaluation.gating.verdict_report import (
     anchor_report,
     confirmation,
     difference_of_returns,
+    exploitability_report,
     exploiter_report,
     gate_of,
     gate_result,
     gate_statistics,
 )
-from evaluation.results import AnchorReport, Confirmation, Difference, Document, ExploiterReport, iso_timestamp
+from evaluation.results import (
+    AnchorReport,
+    Confirmation,
+    Difference,
+    Document,
+    ExploitabilityReport,
+    ExploiterReport,
+    iso_timestamp,
+)
 from league.registry.changes import OPEN
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent, VerdictRow
@@ -31,7 +40,7 @@ class VerdictEvidence(Document):
     counts: blocks per cell, worst for the candidate first.
     elo, interval, difference: as in a VerdictReport.
     alpha: error probability of the verdict. anchors: its non-inferiority tests. exploiters: its paired tests against
-    exploiters. confirmation: the confirmation match of its promotion.
+    exploiters. exploitability: as in a VerdictReport. confirmation: the confirmation match of its promotion.
     """
 
     verdict: str
@@ -58,6 +67,7 @@ class VerdictEvidence(Document):
     alpha: float
     anchors: tuple[AnchorReport, ...]
     exploiters: tuple[ExploiterReport, ...]
+    exploitability: ExploitabilityReport | None
     confirmation: Confirmation | None
 
 
@@ -85,6 +95,7 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
         alpha=verdict.alpha,
         anchors=tuple(map(anchor_report, seen.anchors)),
         exploiters=tuple(map(exploiter_report, seen.exploiters)),
+        exploitability=exploitability_report(seen.exploitability, candidate),
         confirmation=confirmation(registry, verdict),
     )
 

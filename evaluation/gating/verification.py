@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.gating.verdicts import gate_result, report_of, tested_schedules
+from evaluation.gating.verdict_report import gate_result, report_of
 from evaluation.playback.replay import replay
 from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
@@ -49,15 +49,20 @@ class Verification(Document):
 def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verification:
     """Recompute a closed verdict, and replay `replays` of its games, evenly spaced.
 
+    Args:
+        verdict: Its id, or a unique beginning of it or of its digest.
+        registry: The registry.
+        replays: Number of games to replay.
+
     Raises:
         VerdictRefuted: The record differs, with every difference in the message, or a game cannot be replayed.
         NotFound: There is no such verdict.
         InvalidInput: The verdict is open.
     """
-    row = registry.verdicts.get(verdict)
+    row = registry.verdicts.find(verdict)
     if row.outcome is None or row.evidence is None:
-        raise InvalidInput(f"verdict {verdict} is still open: `league nightly` resumes it")
-    matches = [match for name in tested_schedules(row) for match in _checked_matches(registry, row, name)]
+        raise InvalidInput(f"verdict {row.short_id} is still open: `league nightly` resumes it")
+    matches = [match for name in row.tested_schedules for match in _checked_matches(registry, row, name)]
     seen = gate_result(registry, row)
     # A verdict can be voided for reasons outside its games, at any point.
     outcome = VOID if row.outcome == VOID else str(seen.outcome)
@@ -72,9 +77,9 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
         if not _same(row.evidence.get(name), value)
     ]
     if wrong:
-        raise VerdictRefuted(f"the record of verdict {verdict} contradicts its games: {'; '.join(wrong)}")
+        raise VerdictRefuted(f"the record of verdict {row.short_id} contradicts its games: {'; '.join(wrong)}")
     replayed = _replay(registry, row, matches, replays)
-    return Verification(verdict, row.outcome, len(matches), len(computed), replayed)
+    return Verification(row.id, row.outcome, len(matches), len(computed), replayed)
 
 
 def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Match]:
@@ -84,10 +89,10 @@ def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Mat
     try:
         for position, match in enumerate(matches):
             if match.position != position:
-                raise VerdictRefuted(f"verdict {row.id} lacks match {position} of {name} but has a later one")
+                raise VerdictRefuted(f"verdict {row.short_id} lacks match {position} of {name} but has a later one")
             admit(match, schedule)
     except LedgerConflict as error:
-        raise VerdictRefuted(f"verdict {row.id} counts a match that contradicts its schedule: {error}") from error
+        raise VerdictRefuted(f"verdict {row.short_id} counts a match that contradicts its schedule: {error}") from error
     return matches
 
 
@@ -114,7 +119,7 @@ def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], repla
                 for _ in replay(environment, league.config, league.interface, match, index):
                     pass
             except EnvironmentMismatch as error:
-                raise VerdictRefuted(f"verdict {row.id}: {error}{_cause(registry, league, match)}") from error
+                raise VerdictRefuted(f"verdict {row.short_id}: {error}{_cause(registry, league, match)}") from error
     return wanted
 
 

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.matches.acting_versions import NO_MIXTURES, ActingVersions, acting_versions
 from evaluation.matches.game_state import ActionNumbers, AgentGenerators, AgentStates, action_keys
 from evaluation.matches.match_recorder import MatchRecorder
 from evaluation.matches.openings import OpeningMoves
@@ -27,6 +28,7 @@ from league.environments.stepping import Batch, BatchedEnvironment, Indices, Sta
 from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError, one_line
 from league.interface import Interface
 from league.policies.policy import Policy
+from league.registry.storage.mixture import Mixture
 from league.results.records import Match, Reason, Schedule
 from league.spaces import DictSpace, Leaf, Space
 
@@ -45,6 +47,7 @@ def play_matches(
     roster: Roster,
     max_moves: int = 10_000,
     deadline: Deadline = Deadline(),  # noqa: B008  frozen
+    mixtures: Mapping[str, Mixture] = NO_MIXTURES,
 ) -> list[Match]:
     """Play the matches at `positions` of a schedule and return them in that order.
 
@@ -53,9 +56,11 @@ def play_matches(
         positions: Positions of matches in it.
         environment: Parallel environments to play in.
         interface: Interface of the league.
-        roster: All contestants of these matches. Versions select actions as `schedule.actions` says.
+        roster: All contestants of these matches, with the members in place of mixtures. Versions select actions as
+            `schedule.actions` says.
         max_moves: Maximum environment steps of a game. Simultaneous actions are one step.
         deadline: Time limit of a game.
+        mixtures: Contestant → its members, for contestants that are mixtures.
 
     Raises:
         GameHung: A game exceeded `max_moves` or the deadline. The environment must not be used again.
@@ -64,7 +69,8 @@ def play_matches(
         EnvironmentMismatch: Openings of `schedule.opening_plies` steps always end the game.
     """
     plans = game_plans(schedule, list(positions))
-    loop = _GameLoop(schedule, plans, environment, interface, roster, max_moves, deadline.seconds)
+    acting = acting_versions(schedule, plans, mixtures)
+    loop = _GameLoop(schedule, plans, acting, environment, interface, roster, max_moves, deadline.seconds)
     try:
         with enforce_deadline(loop.check_deadline, deadline):
             loop.run()
@@ -88,6 +94,7 @@ class _GameLoop:
         self,
         schedule: Schedule,
         plans: GamePlans,
+        acting: ActingVersions,
         environment: BatchedEnvironment,
         interface: Interface,
         roster: Roster,
@@ -98,8 +105,8 @@ class _GameLoop:
         self._max_moves, self._max_seconds, self._plies = max_moves, max_seconds, schedule.opening_plies
         self._agents, side_of = environment.agents, agent_sides(environment.agents, interface)
         self._spaces = [_leaf(interface.agents[agent].action) for agent in self._agents]
-        self._seating = Seating(schedule, plans, interface, roster, self._agents, side_of)
-        self.recorder = MatchRecorder(schedule, plans, self._agents, side_of)
+        self._seating = Seating(schedule, plans, interface, roster, self._agents, side_of, acting)
+        self.recorder = MatchRecorder(schedule, plans, self._agents, side_of, acting.members)
         self._next_game = 0
         # Of each episode: its game, and the number of earlier attempts at it.
         self._games, self._attempts = np.zeros(0, np.int64), np.zeros(0, np.int64)

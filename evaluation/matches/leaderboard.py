@@ -11,6 +11,7 @@ from evaluation.results import Payoff, RatedVersion, Standing, iso_timestamp
 from evaluation.schedules.builders import ANCHOR
 from evaluation.statistics.bradley_terry import Rating, rate
 from evaluation.statistics.payoff import only_side, tabulate
+from league.conditions import Conditions
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent, LeagueRow, VersionRow
 from league.results.ledger import Ledger
@@ -123,8 +124,11 @@ class CountedGames:
     payoff matrix, or all if sides are rated.
     """
 
-    def __init__(self, registry: Registry, league: LeagueRow, max_upsets: int = 0) -> None:
-        """max_upsets: number of upsets to find."""
+    def __init__(
+        self, registry: Registry, league: LeagueRow, max_upsets: int = 0, conditions: Conditions | None = None
+    ) -> None:
+        """max_upsets: number of upsets to find. conditions: of the games, by default those of the league now."""
+        conditions = conditions or league.conditions
         self._sides = tuple(league.interface.sides)
         self._is_rated_by_side = scoring(league.config, league.interface) == "side" and len(self._sides) > 1
         ledger = Ledger(registry)
@@ -132,7 +136,7 @@ class CountedGames:
         schedules = {
             schedule.id: schedule
             for schedule in ledger.schedules(league.slug)
-            if schedule.id not in purged and (schedule.conditions, schedule.sides) == (league.conditions, self._sides)
+            if schedule.id not in purged and (schedule.conditions, schedule.sides) == (conditions, self._sides)
         }
         self._unrated = registry.versions.exploiter_refs(league.slug)
         results = (result for result in ledger.results(league.slug) if result.schedule in schedules)

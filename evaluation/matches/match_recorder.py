@@ -12,7 +12,7 @@ from evaluation.matches.action_log import ActionLog
 from evaluation.matches.returns import returns_of_games
 from evaluation.schedules.builders import GamePlans
 from league.environments.stepping import Indices
-from league.results.records import GAMES_PER_BLOCK, Forfeit, Game, Match, Reason, Schedule
+from league.results.records import GAMES_PER_BLOCK, Forfeit, Game, Match, Members, Reason, Schedule
 from league.results.scoring import scores
 
 
@@ -23,8 +23,15 @@ class MatchRecorder:
     recorded.
     """
 
-    def __init__(self, schedule: Schedule, plans: GamePlans, agents: Sequence[str], side_of: Sequence[int]) -> None:
-        self._schedule, self._plans = schedule, plans
+    def __init__(
+        self,
+        schedule: Schedule,
+        plans: GamePlans,
+        agents: Sequence[str],
+        side_of: Sequence[int],
+        members: Sequence[Members],
+    ) -> None:
+        self._schedule, self._plans, self._members = schedule, plans, members
         self._agents, self._side_of = agents, side_of
         self.actions = ActionLog()
         self._faults: defaultdict[int, dict[int, Reason]] = defaultdict(dict)
@@ -55,7 +62,7 @@ class MatchRecorder:
             losers = [{forfeit.contestant for forfeit in forfeits[game]} for game in block]
             points = scores([values[game] for game in block], schedule.scoring, losers)
             records = [
-                Game(sides[game], seeds[game], *actions[game], values[game], own, forfeits[game])
+                Game(sides[game], seeds[game], *actions[game], values[game], own, forfeits[game], self._members[game])
                 for game, own in zip(block, points, strict=True)
             ]
             matches.append(schedule.match(int(plans.positions[first]), records, seeds[first]))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evaluation.matches.acting_versions import ActingVersions
 from evaluation.schedules.builders import GamePlans
 from league.environments.stepping import Indices
 from league.interface import Interface
@@ -55,6 +56,7 @@ class Seating:
         roster: Roster,
         agents: Sequence[str],
         side_of: Sequence[int],
+        acting: ActingVersions,
     ) -> None:
         seated: dict[tuple[str | None, str], SeatedPolicy] = {
             (None, policy_id): SeatedPolicy(policy_id) for policy_id in interface.policy_ids
@@ -68,9 +70,9 @@ class Seating:
         self.policies = list(seated.values())
         number = {key: i for i, key in enumerate(seated)}
         self.in_opening = np.array([number[None, interface.policies[agent]] for agent in agents])
-        of_ref = np.full((len(schedule.contestants), len(agents)), NO_GROUP)
-        for index, ref in enumerate(schedule.contestants):
+        of_ref = np.full((len(acting.refs), len(agents)), NO_GROUP)
+        for index, ref in enumerate(acting.refs):
             if ref in roster:
                 of_ref[index] = [number[ref, roster[ref][agent][0]] for agent in agents]
-        refs = np.take_along_axis(plans.contestants, plans.sides[:, side_of], axis=1)
+        refs = np.take_along_axis(acting.indices, plans.sides[:, side_of], axis=1)
         self.after_opening: Indices = of_ref[refs, np.arange(len(agents))]

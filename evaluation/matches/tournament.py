@@ -24,7 +24,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from evaluation.matches.game_records import forfeits, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
-from evaluation.matches.worker import baselines, match_worker, num_envs
+from evaluation.matches.worker import match_worker, num_envs
 from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
 from evaluation.schedules.builders import ANCHOR
 from evaluation.schedules.tournament_plan import (
@@ -40,8 +40,8 @@ from evaluation.schedules.tournament_plan import (
 from evaluation.statistics.payoff import cross_play_table, tabulate
 from evaluation.statistics.population import population
 from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
-from league.policies.loading import check_eligible, check_plays, eligible, pinned
-from league.ray_cluster import ensure_local, node_addresses, ray_session
+from league.policies.loading import baselines, check_anchors, check_eligible, check_plays, eligible, pinned
+from league.ray_cluster import check_stack, check_stacks, ensure_local, node_addresses, node_ids, ray_session
 from league.refs import CHAMPION, ScriptRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow
@@ -49,6 +49,7 @@ from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match, Schedule
 from league.results.scoring import scoring
 from league.settings import Storage
+from league.stack import installed_with_this
 
 T = TypeVar("T")
 
@@ -84,6 +85,8 @@ is played in vain when a test stops or a worker dies."""
 
 RETRIES = 5
 """How often a chunk is retried after its worker died."""
+NODE_CHECK = 5.0
+"""Seconds without a result after which lost nodes are looked for."""
 
 StopCondition = Callable[[Sequence[Match]], bool]
 """All matches of a schedule so far, in order → whether to stop."""
@@ -172,11 +175,13 @@ def evaluate(
 
     Raises:
         InvalidInput: Options that do not fit together.
+        ConfigError: A version among the anchors of the league does not exist or cannot play.
         LeagueError: UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and the errors of
             `play_schedule`.
     """
     row = registry.leagues.follow_code(league)
     _check_options(schedule, against, budget)
+    check_anchors(row.config, registry)
     requested = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
     opponents: list[str] = []
     if schedule == "gauntlet":
@@ -283,6 +288,8 @@ def _describe(schedule: Schedule) -> str:
     first, *others = schedule.contestants
     if schedule.kind == "exploiter":
         return f"{first} and {others[0]} against {others[1]}"
+    if schedule.kind == "exploitability":
+        return f"{first} and {others[0]} against their exploiters"
     if len(others) == 1:
         return f"{first} against {others[0]}"
     return f"{first} against {len(others)} others" if schedule.kind == "gauntlet" else f"{len(others) + 1} contestants"
@@ -302,24 +309,34 @@ def _in_ray(
     """
     ensure_local(workers)
     storage.check_reach(node_addresses())
-    job = ray.put((schedule, storage, config))
+    check_stacks()
+    job = ray.put((schedule, storage, config, installed_with_this()))
     waiting = enumerate(chunks)
     flying: dict[ray.ObjectRef, int] = {}
     done: ReorderBuffer[list[Match]] = ReorderBuffer()
+    nodes = node_ids()
     while done.due < len(chunks):
         room = workers - len(flying) - len(done)
         flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
         if (chunk := done.take()) is not None:
             yield chunk
             continue
-        for ref in ray.wait(list(flying))[0]:
+        finished, _ = ray.wait(list(flying), timeout=NODE_CHECK)
+        for ref in finished:
             index = flying.pop(ref)
             done.put(index, _result(ref, schedule, chunks[index]))
+        if not finished:
+            before, nodes = nodes, node_ids()
+            if before - nodes:
+                # Ray repeats a task of a machine that vanished once its connection has been silent for minutes. The
+                # matches of a chunk are the same wherever and however often they are played.
+                flying = {_play_chunk.remote(job, chunks[index]): index for index in flying.values()}
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
-def _play_chunk(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
-    schedule, storage, config = job
+def _play_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
+    schedule, storage, config, stack = job
+    check_stack(stack, "of the driver")  # this node may have joined the cluster later
     return match_worker(storage, config).play(schedule, chunk, expendable=True)
 
 

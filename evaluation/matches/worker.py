@@ -10,17 +10,16 @@ from functools import lru_cache
 from evaluation.matches.game_loop import play_matches
 from evaluation.matches.seating import Roster
 from evaluation.matches.watchdog import Deadline
-from evaluation.schedules.builders import ANCHOR
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation, stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
-from league.interface import Interface
-from league.policies.loading import check_eligible, check_plays, configured_contestants, contestant
+from league.policies.loading import check_eligible, contestant
 from league.policies.policy import Policy
-from league.refs import ScriptRef
+from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
+from league.registry.storage.mixture import Mixture
 from league.results.records import Match, Schedule
 from league.settings import Storage
 
@@ -37,6 +36,7 @@ class MatchWorker:
         self._registry = registry
         self._environment: BatchedEnvironment | None = None
         self._contestants: OrderedDict[str, dict[str, tuple[str, Policy]]] = OrderedDict()
+        self._mixtures: dict[str, Mixture | None] = {}
         # Games create many objects. Without freezing, each collection would traverse everything that is loaded.
         gc.freeze()
 
@@ -54,16 +54,29 @@ class MatchWorker:
             )
         positions = list(positions)
         refs = dict.fromkeys(ref for position in positions for ref in schedule.contestants_at(position))
-        roster: Roster = {ref: self.contestant(ref) for ref in refs}
+        mixtures = {ref: mixture for ref in refs if (mixture := self._mixture(ref)) is not None}
+        members = [f"{schedule.league}@{number}" for mixture in mixtures.values() for number in mixture.versions]
+        playing = dict.fromkeys([*(ref for ref in refs if ref not in mixtures), *members])
+        roster: Roster = {ref: self.contestant(ref) for ref in playing}
         seated = self.interface.apart() if schedule.scoring == "team" else self.interface
         settings = self.config.play
         deadline = Deadline(settings.game_seconds, expendable)
         environment = self._environment or stepping(self.config.environment, num_envs(self.config))
         # An interrupted environment is neither reused nor closed, because closing may hang.
         self._environment = None
-        matches = play_matches(schedule, positions, environment, seated, roster, settings.max_moves, deadline)
+        matches = play_matches(schedule, positions, environment, seated, roster, settings.max_moves, deadline, mixtures)
         self._environment = environment
         return matches
+
+    def _mixture(self, ref: str) -> Mixture | None:
+        """The members of a fixed reference, if it is a mixture."""
+        if ref not in self._mixtures:
+            parsed = parse_ref(ref)
+            if isinstance(parsed, CheckpointRef):
+                self._mixtures[ref] = self._registry.versions.resolve(parsed).mixture
+            else:
+                self._mixtures[ref] = None
+        return self._mixtures[ref]
 
     def contestant(self, ref: str) -> dict[str, tuple[str, Policy]]:
         """agent → (policy id, policy) of a fixed reference, loaded and verified once.
@@ -90,19 +103,3 @@ def num_envs(config: LeagueConfig) -> int:
 def match_worker(storage: Storage, config: str) -> MatchWorker:
     """This process's worker for the league with this configuration, a JSON document."""
     return MatchWorker(LeagueConfig.model_validate_json(config), Registry.open(storage))
-
-
-BASELINES = (ANCHOR, str(ScriptRef("one_ply")))
-
-
-def baselines(config: LeagueConfig, interface: Interface) -> list[str]:
-    """The scripted baselines that can play a league, and the bots and remote models that its configuration names."""
-    return [*(ref for ref in BASELINES if _plays(ref, interface)), *configured_contestants(config)]
-
-
-def _plays(ref: str, interface: Interface) -> bool:
-    try:
-        check_plays(ScriptRef.parse(ref), interface)
-    except EnvironmentMismatch:
-        return False
-    return True

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from evaluation.matches.policy_calls import PolicyFault, action_fault
 from evaluation.matches.returns import agent_sides, contestant_returns
-from evaluation.matches.worker import baselines
 from evaluation.playback.action_names import action_names, direction_keys
 from evaluation.playback.environment_hooks import Board, Declarations, EnvironmentHooks
 from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of
@@ -26,7 +25,7 @@ from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput, one_line
 from league.interface import Interface
-from league.policies.loading import eligible
+from league.policies.loading import baselines, eligible
 from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.registry.registry import Registry
@@ -58,9 +57,10 @@ class PlayableAgent(Document):
 class Playability(Document):
     """What a person can play in a league.
 
-    why: reason if nothing can be played, else None. opponents: the newest versions that can play, newest first, then
-    scripts. draws: whether the environment renders images. board: rows of actions over the picture, if the environment
-    declares them. reveals: whether the pictures show what the environment hides from the agent.
+    why: reason if nothing can be played, else None. opponents: mixtures with an alias, the newest versions that can
+    play, newest first, then scripts. draws: whether the environment renders images. board: rows of actions over the
+    picture, if the environment declares them. reveals: whether the pictures show what the environment hides from the
+    agent.
     """
 
     league: str
@@ -79,13 +79,14 @@ def playability(config: LeagueConfig, registry: Registry, interface: Interface, 
     playable_agents = _playable_agents(config, interface, hooks.declared)
     kinds = sorted({type(spaces.action).__name__ for spaces in interface.agents.values()})
     why = None if playable_agents else f"human play needs Discrete actions, but its agents have {' and '.join(kinds)}"
+    mixtures = [row.ref for row in registry.versions.all(league) if row.mixture is not None and row.aliases]
     versions = [version.ref for version in reversed(eligible(registry, league))]
     return Playability(
         league=league,
         playable=bool(playable_agents),
         why=why,
         agents=playable_agents,
-        opponents=(*versions[:MOST_OPPONENTS], *baselines(config, interface)),
+        opponents=(*mixtures, *versions[:MOST_OPPONENTS], *baselines(config, interface)),
         draws=hooks.draws,
         board=hooks.declared.board,
         reveals=hooks.draws and not hooks.has_views and interface.hidden_information and len(interface.agents) > 1,

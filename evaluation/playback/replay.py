@@ -12,9 +12,17 @@ from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.single_game import GameStep, play_game, policy_output
 from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
-from league.errors import EnvironmentMismatch, IllegalAction, InvalidReference, LeagueError
+from league.errors import (
+    EnvironmentMismatch,
+    IllegalAction,
+    IllegalMask,
+    InvalidReference,
+    InvalidReward,
+    LeagueError,
+    ObservationError,
+)
 from league.interface import Interface
-from league.policies.loading import contestant, pinned
+from league.policies.loading import acting_ref, contestant, pinned
 from league.policies.policy import Actions, Arrays, Policy
 from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
@@ -56,7 +64,7 @@ def replay(
             yield step
             if is_forfeited:
                 break
-    except IllegalAction as error:
+    except (IllegalAction, IllegalMask, InvalidReward, ObservationError) as error:
         raise EnvironmentMismatch(f"match {match.id} cannot be replayed: {error}") from error
     assert step is not None, "a game has at least one step"
     agents = environment.agents
@@ -158,7 +166,7 @@ def live_game(refs: Sequence[str], registry: Registry, side: str | None = None, 
             "expected at least one version, such as connect_four@champion, which determines the league"
         )
     row = registry.leagues.get(versions[0].league)
-    names = [pinned(ref, row.slug, registry) for ref in refs]
+    names = [acting_ref(pinned(ref, row.slug, registry), registry, f"game {seed}") for ref in refs]
     players = {ref: contestant(ref, registry, row.interface) for ref in names}
     controllers = _controllers(names, row.interface, side)
     policies = {agent: players[ref][agent][1] for agent, ref in controllers.items()}
@@ -184,7 +192,8 @@ def recorded_game(match: str, game: int, registry: Registry, chances: bool = Fal
     row = registry.leagues.get(record.league)
     agents = list(row.interface.agents)
     seats = zip(agents, agent_sides(agents, seated(row.interface, record.games[game])), strict=True)
-    controllers = {agent: record.contestants[record.games[game].sides[side]] for agent, side in seats}
+    acting = record.acting(game)
+    controllers = {agent: acting[record.games[game].sides[side]] for agent, side in seats}
     players = _graphs(controllers, registry, row.interface) if chances else {}
     return GameSource(
         title=f"{match} · game {game}",

@@ -23,6 +23,7 @@ from evaluation.reporting.league_report import LeagueReport
 from evaluation.results import Confirmation, Difference, Standing
 from evaluation.schedules.builders import ANCHOR
 from league.files import disk_errors, replacing
+from league.refs import short_verdict
 from league.registry.changes import OPEN
 from league.results.records import Scoring
 
@@ -97,6 +98,7 @@ def _templates() -> Environment:
         "span": _span,
         "signed": _signed,
         "summary": _summary,
+        "short_verdict": short_verdict,
         "tone": _tone,
         "whisker": _whisker,
     }

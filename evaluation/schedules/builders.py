@@ -153,6 +153,35 @@ def exploiter_test(
     return replace(schedule, common_seeds=True)
 
 
+def exploitability_test(
+    config: LeagueConfig,
+    interface: Interface,
+    verdict: Schedule,
+    of_candidate: Sequence[str],
+    of_champion: Sequence[str],
+    rounds: int,
+) -> Schedule:
+    """The candidate of a verdict and its champion play up to `rounds` matches against each of their own exploiters.
+
+    Their matches alternate, the candidate's first. All matches of a round have the same seed, opening and seats.
+    """
+    number = len(of_candidate)
+    contestants = [*verdict.contestants, *of_candidate, *of_champion]
+    pairings = [pairing for i in range(number) for pairing in ((0, 2 + i), (1, 2 + number + i))]
+    length, seed = rounds * len(pairings), verdict.seed
+    schedule = _schedule(config, interface, "exploitability", contestants, pairings, length, seed, of=verdict.id)
+    return replace(schedule, common_seeds=True)
+
+
+def strength_test(config: LeagueConfig, interface: Interface, version: str, opponent: str, blocks: int) -> Schedule:
+    """A version that was published during training plays `blocks` matches against an opponent.
+
+    The seeds are equal for all versions and opponents of a league, so that scores differ less by chance.
+    """
+    schedule = _schedule(config, interface, "strength", [version, opponent], [(0, 1)], blocks, seed=0)
+    return replace(schedule, seed=derive(0, "strength"))
+
+
 def cross_play(
     config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int = 0
 ) -> Schedule:

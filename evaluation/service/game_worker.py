@@ -33,6 +33,7 @@ from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import GameCrashed, GameHung, LeagueError, one_line, to_document
+from league.policies.loading import acting_ref
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.service_requests import (
@@ -119,7 +120,8 @@ class GameWorker:
             return out.read_bytes()
 
     def _human_play(self, request: HumanPlayRequest, matches: MatchWorker) -> Document:
-        policies = {agent: policy for agent, (_, policy) in matches.contestant(request.opponent).items()}
+        opponent = acting_ref(request.opponent, self._registry, f"game {request.seed}")
+        policies = {agent: policy for agent, (_, policy) in matches.contestant(opponent).items()}
         try:
             return human_play(request, matches.config, matches.interface, policies, self._open, self._shown)
         except GameCrashed:

@@ -68,7 +68,9 @@ class GameWorkerPool:
         try:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(response)), timeout)
         except TimeoutError:
-            raise NotReady(f"a game of {request.league} is still being computed: repeat the request") from None
+            raise NotReady(
+                f"the environment of {request.league} is starting or busy: repeat the request for its response"
+            ) from None
         except Exception:
             if self._cache.get(line) is response:
                 del self._cache[line]  # errors are not cached
@@ -91,7 +93,7 @@ class GameWorkerPool:
             return
         idle = next((league for league, worker in self._workers.items() if not worker.is_busy), None)
         if idle is None:
-            raise Overloaded(f"games of {len(self._workers)} other leagues are being played: retry soon")
+            raise Overloaded(f"all {self._most} processes for games are in use by other leagues: retry soon")
         self._workers.pop(idle).close()
 
     def _evict(self) -> None:

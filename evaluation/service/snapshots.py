@@ -4,14 +4,15 @@
 
 | part | content |
 |---|---|
-| `summary` | counts of games, matches and unique games; scoring, sides and environment |
+| `summary` | counts of games, matches and unique games; scoring, sides and environment; earlier conditions |
 | `leaderboard` | `sides`, `leaderboard` (best first), `by_side` |
 | `payoff` | payoff matrix of the best contestants; null before the first game |
 | `ratings` | `versions`, oldest first |
+| `earlier/<conditions>/leaderboard`, `earlier/<conditions>/payoff` | the same for results under earlier conditions |
 | `verdict/<id>` | a verdict with its evidence; its curve has a few hundred points `[block, LLR]` |
 
-The first four parts are replaced together, each verdict separately, and only if they are stale. The process can be
-killed at any time. Several may run, one per league at a time.
+The first four parts are replaced together, each verdict and the results under earlier conditions separately, and only
+if they are stale. The process can be killed at any time. Several may run, one per league at a time.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from contextlib import suppress
 from typing import Any
 
 from evaluation.gating.verdict_evidence import verdict_evidence
-from evaluation.gating.verdicts import schedules_of
 from evaluation.matches.leaderboard import CountedGames, rated_version
+from evaluation.service.earlier_results import earlier_results, refresh_earlier_results, tables
 from evaluation.statistics.blas import single_threaded_blas
 from league.errors import AlreadyRunning, StorageError
 from league.registry.registry import Registry
@@ -48,6 +49,7 @@ def refresh(registry: Registry, league: str) -> None:
         mark = registry.snapshots.current_marks()[league]
         if registry.snapshots.marks(league).get(SUMMARY) != mark:
             _refresh_verdicts(registry, league)
+            refresh_earlier_results(registry, league)
             registry.snapshots.put(league, documents(registry, league), mark)
 
 
@@ -56,8 +58,6 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
     row, events = registry.leagues.get(league), registry.aliases.history(league)
     played = CountedGames(registry, row)
     sides, leaderboard = list(row.interface.sides), played.leaderboard
-    by_side = {side: [standing.to_json() for standing in own] for side, own in played.by_side().items()}
-    payoff = played.payoff()
     versions = [rated_version(version, leaderboard, events).to_json() for version in registry.versions.all(league)]
     return {
         SUMMARY: {
@@ -69,13 +69,9 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
             "sides": sides,
             "environment": row.config.environment.entry_point,
             "environment_digest": row.environment_digest,
+            "earlier": [each.to_json() for each in earlier_results(registry, row)],
         },
-        "leaderboard": {
-            "sides": sides,
-            "leaderboard": [standing.to_json() for standing in leaderboard],
-            "by_side": by_side,
-        },
-        "payoff": payoff.to_json() if payoff else None,
+        **tables(played, sides),
         "ratings": {"versions": versions},
     }
 
@@ -102,7 +98,7 @@ def _refresh_verdicts(registry: Registry, league: str) -> None:
 def _mark(verdict: VerdictRow, events: Sequence[AliasEvent], played: Mapping[str, int]) -> str:
     """Change token of everything that the evidence of a verdict depends on."""
     promoted = any(event.verdict == verdict.id for event in events)
-    matches = [played.get(schedule, 0) for schedule in schedules_of(verdict)]
+    matches = [played.get(schedule, 0) for schedule in verdict.schedules]
     return f"{FORMAT}; {verdict.outcome}; promoted: {promoted}; matches: {matches}"
 
 

@@ -21,6 +21,8 @@ from scipy.special import ndtri, stdtrit
 from evaluation.results import CrossPlay, Difference, Estimate, Payoff
 from league.results.records import Game, Match
 
+Floats = NDArray[np.float64]
+
 
 def paired_difference(matches: Iterable[Match], contestant: str, confidence: float = 0.95) -> Difference | None:
     """Mean return of `contestant` minus that of its opponent.
@@ -75,7 +77,30 @@ def student_interval(values: Sequence[float], confidence: float = 0.95) -> Diffe
     return Difference(mean, mean - half, mean + half)
 
 
-Floats = NDArray[np.float64]
+def crossed_interval(values: Floats, confidence: float = 0.95) -> Difference:
+    """Mean of values that depend on two independent samples, with an interval for both.
+
+    values[r, c] has an effect of row r and one of column c. With the sample variances v of the row means and w of the
+    column means, the variance of the mean is estimated as v/R + w/C. This counts the interaction of rows and columns
+    twice, so it is conservative. The degrees of freedom of Student's t are Satterthwaite's. A. B. Owen, "The pigeonhole
+    bootstrap" (2007); F. E. Satterthwaite, "An approximate distribution of estimates of variance components" (1946).
+
+    Args:
+        values: Shape (R, C). With a single row or column there is no interval.
+        confidence: Coverage of the interval.
+    """
+    mean = float(values.mean())
+    if min(values.shape) < 2:
+        return Difference(mean, None, None)
+    parts = [float(np.var(values.mean(axis=1 - axis), ddof=1)) / values.shape[axis] for axis in (0, 1)]
+    variance = sum(parts)
+    if variance == 0:
+        return Difference(mean, mean, mean)
+    freedom = variance**2 / sum(part**2 / (number - 1) for part, number in zip(parts, values.shape, strict=True))
+    half = float(stdtrit(freedom, 0.5 + confidence / 2)) * math.sqrt(variance)
+    return Difference(mean, mean - half, mean + half)
+
+
 Row = tuple[float | None, ...]
 
 

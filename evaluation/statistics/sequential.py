@@ -2,8 +2,8 @@
 
 A *block* is `n` games between two contestants from one opening with the sides rotated, so that the effects of seat and
 opening cancel. Its score lies on the grid `a_i = i / 2n`, `i = 0 … 2n`. One game per block gives the trinomial cells
-(L, D, W); two give the pentanomial cells (LL, LD, DD+WL, WD, WW). A pair of blocks has nine cells. Blocks are
-independent; the games of a block are not.
+(L, D, W); two give the pentanomial cells (LL, LD, DD+WL, WD, WW). A pair of blocks has nine cells, the mean of k pairs
+8 k + 1. Blocks are independent; the games of a block are not.
 
 The expected score of the model `logistic` is `s(e) = 1 / (1 + 10^(-e/400))`. For `normalized`, the effect size of one
 game is `(mu - 1/2) / sigma = e / (800 / ln 10)`, and that of a block of `n` games `sqrt(n)` times that. The formula of
@@ -346,8 +346,8 @@ def _check_hypotheses(elo0: float, elo1: float, model: Model, games: int) -> Non
 
 def _cells(counts: ArrayLike) -> Floats:
     cells = np.asarray(counts, dtype=np.float64)
-    if cells.ndim == 0 or cells.shape[-1] not in (3, 5, 9):
-        raise ValueError(f"counts must have 3, 5 or 9 cells, for 1, 2 or 4 games per block, got shape {cells.shape}")
+    if cells.ndim == 0 or cells.shape[-1] < 3 or cells.shape[-1] % 2 == 0:
+        raise ValueError(f"counts must have 2 n + 1 cells, for n >= 1 games per block, got shape {cells.shape}")
     if (cells < 0).any() or not np.isfinite(cells).all():
         raise ValueError("counts must be finite and non-negative")
     return cells

@@ -14,7 +14,7 @@ from league.client.responses import (
     parse_batch_action_response,
 )
 from league.errors import AliasMoved, InvalidInput
-from league.refs import CheckpointRef, check_alias, check_slug
+from league.refs import CheckpointRef, check_alias, check_slug, is_mixture, parse_mixture
 
 T = TypeVar("T")
 
@@ -110,14 +110,19 @@ ANY: Any = object()
 
 
 def promote(ref: str, alias: str, expected: int | None, reason: str | None, key: str | None) -> ApiCall[Promotion]:
-    """Point an alias at a version, `connect_four@3`. Raises InvalidReference or InvalidInput."""
-    version = CheckpointRef.parse(ref)
-    if not isinstance(version.version, int):
-        raise InvalidInput(f"{ref} is an alias, expected a version number")
-    body: JsonObject = {"version": version.version}
+    """Point an alias at a version, `connect_four@3`, or a mixture, `connect_four@3:0.6,@5:0.4`.
+
+    Raises InvalidReference or InvalidInput.
+    """
+    shares = parse_mixture(ref) if is_mixture(ref) else {CheckpointRef.parse(ref): 1.0}
+    for each in shares:
+        if not isinstance(each.version, int):
+            raise InvalidInput(f"{each} is an alias, expected a version number")
+    members = [{"version": each.version, "probability": share} for each, share in shares.items()]
+    body: JsonObject = {"members": members} if is_mixture(ref) else {"version": members[0]["version"]}
     if expected is not ANY:
         body["expected"] = expected
-    path = f"/v1/leagues/{version.league}/aliases/{check_alias(alias)}"
+    path = f"/v1/leagues/{next(iter(shares)).league}/aliases/{check_alias(alias)}"
     return _move_alias(path, body, reason, key)
 
 

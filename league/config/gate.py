@@ -29,6 +29,17 @@ class AnchorConfig(Part):
         return {"ref": value} if isinstance(value, str) else value
 
 
+class ExploitersConfig(Part):
+    """Exploiters that are trained for the test of a candidate's exploitability."""
+
+    count: int = Field(default=0, ge=0)
+    """Exploiters of the candidate, and as many of the champion. 0: no test."""
+    budget: float = Field(default=0.15, gt=0, le=1)
+    """Training budget of each, in steps and minutes, as a fraction of the candidate's run."""
+    blocks: int = Field(default=200, ge=2)
+    """Matches of each exploiter from which its score is estimated. The test itself may take fewer or more."""
+
+
 class GateConfig(Part):
     """The statistical test for promotions. See docs/statistics.md."""
 
@@ -63,8 +74,10 @@ class GateConfig(Part):
     exploited_champions: int = Field(default=2, ge=0)
     """Number of champions, the current one and previous ones, whose newest exploiters a candidate is tested against."""
     exploiter_margin: float | None = Field(default=None, gt=0)
-    """How much less than the champion a candidate may score against an exploiter, as a share of all points (default
-    0.1), or in returns with the model `returns` (default: `margin`)."""
+    """How much less than the champion a candidate may score against an exploiter, and how much more exploitable it may
+    be, as a share of all points (default 0.1), or in returns with the model `returns` (default: `margin`)."""
+    exploiters: ExploitersConfig = ExploitersConfig()
+    """Exploiters trained against a candidate that passed all other tests, and against the champion."""
     confirmation_blocks: int = Field(default=200, ge=0)
     """Blocks against the previous champion after a promotion, for an unbiased estimate of the improvement."""
     forfeits: bool = False

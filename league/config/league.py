@@ -85,6 +85,12 @@ class LeagueConfig(Part):
         except ValidationError as error:
             raise ConfigError(f"{source}: {describe_validation_error(cls, error)}") from error
 
+    @property
+    def training_openings(self) -> int:
+        """Maximum number of random moves at the start of an episode of training."""
+        own = self.training.opening_plies
+        return self.play.opening_plies if own is None else own
+
     def game(self) -> JSON:
         """Return what decides results: the environment's settings and code, and the rules of play, as flat JSON.
 
@@ -110,18 +116,31 @@ class LeagueConfig(Part):
             share: Fraction of the budget for an exploiter, whose last checkpoint alone is published. None: a main run.
         """
         night, training = self.nightly, self.training
-        part = 1.0 if share is None else share
-        minutes, steps = night.minutes or training.minutes, night.steps or training.steps
-        settings: dict[str, Any] = {
-            "seed": seed,
-            "minutes": None if minutes is None else minutes * part,
-            "steps": max(1, round(steps * part)),
-        }
+        limits = {"minutes": night.minutes or training.minutes, "steps": night.steps or training.steps}
+        whole = training.model_copy(update=limits)
         if share is not None:
-            settings |= {"checkpoint_every": None, "checkpoint_minutes": None}
+            return self.of_exploiter(seed, whole.max_steps, whole.minutes, share)
+        settings: dict[str, Any] = {"seed": seed, "minutes": whole.minutes, "steps": whole.max_steps}
         if night.opponents is not None:
             settings["opponents"] = night.opponents.model_dump(by_alias=True)
         return self.with_training(**settings)
+
+    def of_exploiter(self, seed: int, steps: int | None, minutes: float | None, share: float) -> Self:
+        """Return the configuration of the run of an exploiter, whose last checkpoint alone is published.
+
+        Args:
+            seed: Seed of the run.
+            steps: Actions of the run whose budget it shares; None for no limit.
+            minutes: Minutes of that run; None for no limit.
+            share: Fraction of that budget.
+        """
+        return self.with_training(
+            seed=seed,
+            minutes=None if minutes is None else minutes * share,
+            steps=None if steps is None else max(1, round(steps * share)),
+            checkpoint_every=None,
+            checkpoint_minutes=None,
+        )
 
 
 def _with_folder(document: Any, path: Path) -> Any:

@@ -8,6 +8,9 @@ from league.config.base import Part
 from league.config.network import ConvolutionConfig
 from league.config.opponents import OpponentsConfig
 
+DEFAULT_STEPS = 1_000_000
+DEFAULT_CHECKPOINT_EVERY = 200_000
+
 
 class PhaseConfig(Part):
     """A phase of training in which only some policies learn."""
@@ -17,19 +20,27 @@ class PhaseConfig(Part):
     """Number of updates. The phases are repeated in order."""
 
 
+class StrengthConfig(Part):
+    """Each version that a run publishes plays the champion and an anchor, in a process of low priority."""
+
+    games: int = Field(default=200, ge=2)
+    """Number of games per opponent, rounded down to blocks of two. Their seeds are the same for all versions."""
+
+
 class TrainingSettings(Part):
     """Settings common to all algorithms."""
 
     seed: int = Field(default=0, ge=0)
     """Seed of the run, from which all random choices are derived."""
-    steps: int = Field(default=1_000_000, ge=1)
-    """Number of actions of all agents after which training ends."""
+    steps: int | None = Field(default=None, ge=1)
+    """Number of actions of all agents after which training ends; null: 1,000,000, or unlimited if `minutes` is set."""
     minutes: float | None = Field(default=None, gt=0)
-    """Wall-clock limit of training, in addition to `steps`."""
-    checkpoint_every: int | None = Field(default=200_000, ge=1)
-    """Number of actions between published versions; null disables this trigger. The end of training also publishes."""
+    """Wall-clock limit of training; the earlier of the two limits applies."""
+    checkpoint_every: Annotated[int, Field(ge=1)] | Literal["auto"] | None = "auto"
+    """Number of actions between published versions; null: none. auto: 200,000, or none if `checkpoint_minutes` is set.
+    The end of training also publishes."""
     checkpoint_minutes: float | None = Field(default=None, gt=0)
-    """Wall-clock minutes between published versions; the earlier of the two triggers applies."""
+    """Wall-clock minutes between published versions; the earlier of the two intervals applies."""
     runners: int = Field(default=1, ge=0)
     """Number of sampling processes (env runners); 0 samples in the learner's process."""
     num_envs: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
@@ -50,15 +61,30 @@ class TrainingSettings(Part):
     version (`--from`), or their initial weights."""
     opponents: OpponentsConfig = OpponentsConfig()
     """Opponents. In their episodes one random side learns, and the opponent controls all others."""
+    strength: StrengthConfig | None = StrengthConfig()
+    """Matches of each published version against the champion and an anchor; null plays none."""
     gpus: float = Field(default=0, ge=0)
     """GPUs of the learner; a fraction shares a GPU."""
     runner_gpus: float = Field(default=0, ge=0)
     """GPUs of each runner for inference."""
     crashes: int = Field(default=3, ge=0)
     """Maximum number of consecutive exceptions after which an environment is recreated; the next one ends training."""
-    opening_plies: int = Field(default=0, ge=0)
+    opening_plies: int | None = Field(default=None, ge=0)
     """Maximum number of random legal moves at the start of each episode. They are excluded from training and lead to
-    positions that self-play alone would not visit."""
+    positions that self-play alone would not visit. Null: `play.opening_plies`, so that training visits the positions
+    that matches start from."""
+
+    @property
+    def max_steps(self) -> int | None:
+        """Number of actions after which training ends; None if only the time is limited."""
+        return DEFAULT_STEPS if self.steps is None and self.minutes is None else self.steps
+
+    @property
+    def checkpoint_steps(self) -> int | None:
+        """Number of actions between published versions; None without such an interval."""
+        if self.checkpoint_every == "auto":
+            return DEFAULT_CHECKPOINT_EVERY if self.checkpoint_minutes is None else None
+        return self.checkpoint_every
 
     def budget_spent(self, steps: int, seconds: float) -> float:
         """Return the fraction of the budget that a run has spent, of steps or of time, whichever is larger; at most 1.
@@ -67,8 +93,9 @@ class TrainingSettings(Part):
             steps: Actions of the run, without those of parent versions.
             seconds: Training time of the run.
         """
+        of_steps = steps / self.max_steps if self.max_steps is not None else 0.0
         of_time = seconds / (60 * self.minutes) if self.minutes is not None else 0.0
-        return min(max(steps / self.steps, of_time), 1.0)
+        return min(max(of_steps, of_time), 1.0)
 
 
 class NightlyConfig(Part):

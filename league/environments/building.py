@@ -21,7 +21,8 @@ from league.conditions import hides_information
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
-from league.entry_points import import_entry_point, import_module
+from league.entry_points import import_entry_point, import_module, missing
+from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError
@@ -106,7 +107,7 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
             f"environment.wrappers: {config.wrappers[0].name} (number 1): SuperSuit supports only PettingZoo"
             " environments; for an RLlib environment, transform observations in its own code"
         )
-    return with_cycles(wrapped(env, config.wrappers))
+    return with_info_masks(with_cycles(wrapped(env, config.wrappers)), f"{config.model_dump_json()}{config.folder}")
 
 
 def observation_space(env: Any, agent: str) -> gymnasium.Space[Any]:
@@ -185,7 +186,9 @@ def _constructor(config: EnvironmentConfig) -> Any:
     else:
         name = "parallel_env"
     if not callable(getattr(module, name, None)):
-        expected = "an existing function" if colon else "a PettingZoo module with it, or package.module:function"
+        if colon:
+            raise ConfigError(f"environment.entry_point: {missing(module, name)}")
+        expected = "a PettingZoo module with it, or package.module:function"
         raise ConfigError(f"environment.entry_point: {module_name!r} has no {name!r}: expected {expected}")
     return getattr(module, name)
 
@@ -254,7 +257,7 @@ def describe_policies(interface: Interface) -> str:
     parts = []
     for policy in interface.policy_ids:
         own = [agent for agent in interface.agents if interface.policies[agent] == policy]
-        agents = own[0] if len(own) == 1 else f"{own[0]} and {len(own) - 1} more"
+        agents = ", ".join(own) if len(own) <= 3 else f"{own[0]} and {len(own) - 1} more"
         parts.append(f"{policy} ({agents})")
     return f"{'Policy' if len(parts) == 1 else 'Policies'}: {', '.join(parts)}."
 

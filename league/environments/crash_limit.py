@@ -19,9 +19,13 @@ class CrashLimit:
         self._consecutive = np.zeros(num_envs, np.int64)
 
     def count(self, env: int, seed: int, error: Exception) -> None:
-        """Count a crash in the episode with that seed, and log it. Raises `error` if it is one too many."""
+        """Count a crash in the episode with that seed, and log it.
+
+        Raises `error` if it is one too many, with a note that names the seed.
+        """
         self._consecutive[env] += 1
         if self._consecutive[env] > self._most:
+            error.add_note(f"in the episode with seed {seed}")
             raise error
         logger.warning(
             "The environment raised in the episode with seed %d and is recreated (%d of %d consecutive times): %s",

@@ -4,32 +4,50 @@ Only versions trained in the league's current environment take part in its match
 would be compared on a task that they were not trained for, even if the spaces are equal.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
+from functools import partial
 
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
-from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, LeagueError, UnknownPolicy
+from league.errors import (
+    ConfigError,
+    EnvironmentMismatch,
+    InvalidInput,
+    LeagueError,
+    UnknownAlias,
+    UnknownLeague,
+    UnknownPolicy,
+    UnknownVersion,
+)
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.open_inference import fixed_version, remote_policies
 from league.policies.policy import Policy
 from league.policies.scripted import script
-from league.refs import CheckpointRef, RemoteRef, ScriptRef, of_league, parse_ref
+from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, of_league, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.manifest import MAIN
 from league.registry.storage.rows import VersionRow
 
+ANCHORS = "gate.anchors"
+BASELINES = ("script:random", "script:one_ply")
 
-def load(ref: str, policy: str | None = None, registry: Registry | None = None) -> Policy:
+
+def load(
+    ref: str, policy: str | None = None, registry: Registry | None = None, *, episode: str | None = None
+) -> Policy:
     """Load and verify a policy of a version: `load("connect_four@champion").act({"observation": …})`.
 
     Args:
         ref: The version, by number or alias.
         policy: The policy id; optional if the version has one policy.
         registry: The registry; by default the one configured by environment variables.
+        episode: Name of the episode that the policy will play. Of a mixture, it selects the member, the same one as in
+            requests with this `X-League-Key`.
 
     Raises:
+        InvalidInput: The version is a mixture, and no episode is given.
         InvalidReference: The reference is malformed.
         UnknownLeague: The league does not exist.
         UnknownVersion: The version does not exist.
@@ -38,10 +56,43 @@ def load(ref: str, policy: str | None = None, registry: Registry | None = None) 
         ArtifactCorrupt: A file differs from the manifest.
     """
     checkpoint = CheckpointRef.parse(ref)
-    if registry is not None:
-        return _policy(registry, registry.versions.resolve(checkpoint), policy)
-    with closing(Registry.open()) as opened:
-        return load(ref, policy, opened)
+    if registry is None:
+        with closing(Registry.open()) as opened:
+            return load(ref, policy, opened, episode=episode)
+    version = registry.versions.resolve(checkpoint)
+    if episode is not None:
+        version = acting_version(version, registry, episode)
+    return _policy(registry, version, policy)
+
+
+def acting_version(version: VersionRow, registry: Registry, episode: str) -> VersionRow:
+    """Return the version that plays an episode: the member of a mixture, or the version itself."""
+    if version.mixture is None:
+        return version
+    return registry.versions.get(version.league, version.mixture.version_of(version.league, episode.encode()))
+
+
+def acting_ref(ref: str, registry: Registry, episode: str) -> str:
+    """Return the reference of the contestant that plays an episode: of a mixture, that of the member."""
+    parsed = parse_ref(ref)
+    if not isinstance(parsed, CheckpointRef):
+        return ref
+    return acting_version(registry.versions.resolve(parsed), registry, episode).ref
+
+
+def players(ref: str, registry: Registry) -> dict[str, float]:
+    """Return who plays the episodes of a fixed contestant, with probabilities: the members of a mixture, or itself."""
+    parsed = parse_ref(ref)
+    mixture = registry.versions.resolve(parsed).mixture if isinstance(parsed, CheckpointRef) else None
+    if mixture is None or not isinstance(parsed, CheckpointRef):
+        return {ref: 1.0}
+    return {f"{parsed.league}@{member.version}": member.probability for member in mixture.members}
+
+
+def require_one_policy(version: VersionRow) -> None:
+    """Raise InvalidInput, which names the members, if a version is a mixture."""
+    if version.mixture is not None:
+        raise InvalidInput(f"{version.ref} is a mixture ({version.mixture}): name one of its members")
 
 
 def contestant(ref: str, registry: Registry | None, interface: Interface) -> dict[str, tuple[str, Policy]]:
@@ -86,6 +137,7 @@ def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface
 
 
 def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Policy:
+    require_one_policy(version)
     known = version.manifest.policies
     if policy is None and len(known) == 1:
         policy = next(iter(known))
@@ -153,29 +205,112 @@ def _not_configured(ref: str, config: LeagueConfig, kind: str, known: list[str])
     )
 
 
-def check_scripts(config: LeagueConfig, interface: Interface) -> None:
-    """Check the scripts, bots and remote models that a configuration names.
+def check_contestants(config: LeagueConfig, interface: Interface, registry: Registry) -> None:
+    """Check the scripts, bots and remote models that a configuration names, and the versions among its anchors.
+
+    Versions among the opponents are checked when training resolves them.
 
     Raises:
-        ConfigError: One does not exist, cannot be imported or reached, or does not support the spaces. Names its key.
+        ConfigError: One does not exist, cannot be imported or reached, or cannot play in this league. Names its key.
     """
-    named = [("gate.anchors", anchor.ref) for anchor in config.gate.anchors]
+    for error in _errors_of_contestants(config, partial(_check_script, interface=interface)):
+        raise error
+    check_anchors(config, registry)
+
+
+def check_anchors(config: LeagueConfig, registry: Registry) -> None:
+    """Check the versions among the anchors of a configuration.
+
+    Raises:
+        ConfigError: One does not exist, or cannot play in this league.
+    """
+    for error in _errors_of_contestants(config, partial(_check_anchor, config=config, registry=registry)):
+        raise error
+
+
+def errors_of_contestants(
+    config: LeagueConfig, interface: Interface, open_registry: Callable[[], Registry]
+) -> list[ConfigError]:
+    """Return what is wrong with the scripts, bots, remote models and versions that a configuration names.
+
+    The registry is opened if a version is named.
+    """
+
+    def check(key: str, ref: CheckpointRef | ScriptRef | RemoteRef) -> None:
+        _check_script(key, ref, interface)
+        if isinstance(ref, CheckpointRef):
+            _check_version(ref, config, open_registry())
+
+    return list(_errors_of_contestants(config, check))
+
+
+def _check_script(_: str, ref: CheckpointRef | ScriptRef | RemoteRef, interface: Interface) -> None:
+    if not isinstance(ref, CheckpointRef):
+        check_plays(ref, interface)
+
+
+def _check_anchor(
+    key: str, ref: CheckpointRef | ScriptRef | RemoteRef, config: LeagueConfig, registry: Registry
+) -> None:
+    if key == ANCHORS and isinstance(ref, CheckpointRef):
+        _check_version(ref, config, registry)
+
+
+def _check_version(ref: CheckpointRef, config: LeagueConfig, registry: Registry) -> None:
+    """Raise NotFound or EnvironmentMismatch unless the version exists and can play in the league.
+
+    The alias of the champion may not exist yet, nor may any alias of a league without versions.
+    """
+    _check_league(ref, config.league)
+    try:
+        registry.versions.resolve(ref)
+    except UnknownAlias:
+        if ref.version == CHAMPION or not registry.versions.all(config.league):
+            return
+        raise
+    except UnknownLeague as error:
+        if isinstance(ref.version, str):
+            return
+        raise UnknownVersion(f"league {config.league} has no version yet: train it first") from error
+    check_eligible(str(ref), registry, config)
+
+
+def _errors_of_contestants(
+    config: LeagueConfig, check: Callable[[str, CheckpointRef | ScriptRef | RemoteRef], None]
+) -> Iterator[ConfigError]:
+    """Call `check` with the key of each reference that a configuration names, and the reference; yield its errors."""
+    named = [(ANCHORS, anchor.ref) for anchor in config.gate.anchors]
     named += [("training.opponents", opponent.ref) for opponent in config.training.opponents.fixed]
     if isinstance(config.training, PPOConfig) and config.training.teacher is not None:
         named.append(("training.teacher", config.training.teacher.ref))
     for key, ref in named:
-        parsed = parse_ref(of_league(ref, config.league))
-        if not isinstance(parsed, CheckpointRef):
-            try:
-                check_plays(parsed, interface)
-            except LeagueError as error:
-                raise ConfigError(f"{key}: {error}") from error
+        try:
+            check(key, parse_ref(of_league(ref, config.league)))
+        except LeagueError as error:
+            wrapped = ConfigError(f"{key}: {error}")
+            wrapped.__cause__ = error
+            yield wrapped
 
 
 def configured_contestants(config: LeagueConfig) -> list[str]:
     """Return the bots and remote models among the anchors and opponents of a configuration."""
     named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents.fixed]
     return [ref for ref in dict.fromkeys(named) if _is_bot(ref) or _is_remote(ref)]
+
+
+def baselines(config: LeagueConfig, interface: Interface) -> list[str]:
+    """Return the scripted baselines that can play a league, and the bots and remote models that its configuration
+    names.
+    """
+    return [*(ref for ref in BASELINES if _plays(ref, interface)), *configured_contestants(config)]
+
+
+def _plays(ref: str, interface: Interface) -> bool:
+    try:
+        check_plays(ScriptRef.parse(ref), interface)
+    except EnvironmentMismatch:
+        return False
+    return True
 
 
 def _configured_remotes(config: LeagueConfig) -> list[RemoteRef]:

@@ -12,7 +12,7 @@ from league.policies.actions import dist_inputs_size, to_environment
 from league.policies.draws import Generators, UniformNumbers, sample
 from league.policies.policy import Actions, Arrays
 from league.registry.storage.manifest import PolicyManifest
-from league.spaces import Discrete, Space
+from league.spaces import OBSERVATION, Discrete, Space
 
 ACTION = "action"
 DIST_INPUTS = "action_dist_inputs"
@@ -56,7 +56,7 @@ class OnnxPolicy:
 
     def act(
         self,
-        observations: Arrays,
+        observations: Arrays | NDArray,
         *,
         state: Arrays | None = None,
         explore: bool = False,
@@ -65,7 +65,7 @@ class OnnxPolicy:
         """Choose actions for a batch; see `Policy.act`. `dist_inputs` are returned only with `explore`.
 
         Args:
-            observations: See `Policy.act`.
+            observations: See `Policy.act`; or the array `observation` alone.
             state: Arrays (k, …) named `state_in_<i>`; None at the start of episodes.
             explore: See `Policy.act`.
             rng: See `Policy.act`.
@@ -86,12 +86,13 @@ class OnnxPolicy:
             after[LAST_ACTION] = raw[:, np.newaxis].astype(np.float32) + 1
         return Actions(to_environment(raw, self._action), after, outputs[1])
 
-    def distribution(self, observations: Arrays, *, state: Arrays | None = None) -> Actions:
+    def distribution(self, observations: Arrays | NDArray, *, state: Arrays | None = None) -> Actions:
         """Choose greedy actions and return `dist_inputs`, too; see `act`."""
         outputs = self._run(observations, state, self._exploring)
         return Actions(outputs[0], self._state(outputs[2:]), outputs[1])
 
-    def _run(self, observations: Arrays, state: Arrays | None, outputs: list[str]) -> list[NDArray]:
+    def _run(self, given: Arrays | NDArray, state: Arrays | None, outputs: list[str]) -> list[NDArray]:
+        observations = {OBSERVATION: given} if isinstance(given, np.ndarray) else given
         try:
             feed = {name: observations[name] for name in self._observed}
             if self._recurrent:

@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 from league.errors import AliasMoved, NothingToRollBack
 from league.refs import CHAMPION, check_alias
 from league.registry import leagues, verdicts, versions
+from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, repeat_after_deadlock
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import AliasEvent, AliasTarget, detached
@@ -196,6 +197,7 @@ def _require(last: AliasEventTable | None, league: str, alias: str, expected: in
 def _record(
     session: Session, league: str, alias: str, last: AliasEventTable | None, event: AliasEventTable
 ) -> AliasEvent:
+    change_counter.count(session, "aliases")
     event.league, event.alias = league, alias
     event.previous = last.version if last else None
     # Clocks of machines differ. Events are ordered by id, and their times must not contradict that order.

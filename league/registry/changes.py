@@ -1,22 +1,23 @@
-"""Change tokens of leagues, and waiting until all replicas follow a change."""
+"""Changes: counts for replicas, tokens of leagues, and waiting until all replicas follow one."""
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from datetime import timedelta
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, ScalarSelect, and_, func, or_, select, true
 
 from league.errors import AliasMoved, Conflict, NotReady
 from league.registry import aliases, evaluations, replicas
-from league.registry.aliases import AliasRepository
 from league.registry.replicas import LIVENESS_TIMEOUT, ReplicaRepository
+from league.registry.storage import change_counter
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.rows import Acknowledgement, AliasEvent, ChangeToken, Traffic
+from league.registry.storage.rows import Acknowledgement, AliasEvent, ChangeCounts, ChangeToken, Traffic
 from league.registry.storage.tables import (
     READY,
-    AliasEventTable,
+    AcknowledgementTable,
+    AliasTable,
     EvaluationTable,
+    ReplicaTable,
     RunTable,
     SnapshotTable,
     TrafficEventTable,
@@ -24,7 +25,6 @@ from league.registry.storage.tables import (
     VersionNoteTable,
     VersionTable,
 )
-from league.registry.traffic import TrafficRepository
 from league.registry.training import runs
 
 OPEN = "open"
@@ -32,13 +32,19 @@ POLL_SECONDS = 0.02
 
 
 class ChangeRepository(Repository):
-    """Computes change tokens and waits for replicas."""
+    """Counts changes, computes change tokens and waits for replicas."""
 
     def __init__(self, database: Database) -> None:
         super().__init__(database)
-        self._aliases = AliasRepository(database)
-        self._traffic = TrafficRepository(database)
         self._replicas = ReplicaRepository(database)
+
+    def counts(self) -> ChangeCounts:
+        """Return how often aliases, traffic settings and API keys have changed, by one cheap query.
+
+        What is read afterwards contains all these changes.
+        """
+        with self._database.read() as session:
+            return change_counter.counts(session)
 
     def token(self, league: str, since: timedelta = LIVENESS_TIMEOUT) -> ChangeToken:
         """Return the change token of a league, which differs after any change. Raises UnknownLeague.
@@ -49,16 +55,14 @@ class ChangeRepository(Repository):
         outcomes = select(VerdictTable.outcome, func.count()).filter_by(league=league).group_by(VerdictTable.outcome)
         newest_run = select(RunTable.id).filter_by(league=league).order_by(RunTable.began_at.desc(), RunTable.id.desc())
         with self._database.read() as session:
-            acknowledged = replicas.acknowledgements(session, league)
-            serving = Counter(each.version for each in acknowledged if each.version and each.silence < since)
             return ChangeToken(
                 league=league,
                 aliases=aliases.current(session, league),
-                event=session.scalar(select(func.max(AliasEventTable.id)).filter_by(league=league)),
+                event=session.scalar(select(func.max(AliasTable.event)).filter_by(league=league)),
                 version=session.scalar(select(func.max(VersionTable.number)).filter_by(league=league, state=READY)),
                 note=session.scalar(select(func.max(VersionNoteTable.id)).filter_by(league=league)),
                 traffic=session.scalar(select(func.max(TrafficEventTable.id)).filter_by(league=league)),
-                serving=dict(sorted(serving.items())),
+                serving=replicas.serving(session, league, since),
                 verdicts={outcome or OPEN: count for outcome, count in session.execute(outcomes)},
                 evaluation=session.scalar(select(func.max(EvaluationTable.id)).filter_by(league=league)),
                 evaluations=evaluations.active(session, league),
@@ -77,17 +81,24 @@ class ChangeRepository(Repository):
         timeout: in seconds. Raises AliasMoved if the alias points elsewhere by now, or NotReady, which names the
         replicas that do not follow, and why.
         """
-        league, alias, version = event.league, event.alias, event.version
+        league, alias = event.league, event.alias
+        now = select(AliasTable.version, AliasTable.event).filter_by(league=league, name=alias).subquery()
+        acknowledged = AcknowledgementTable
 
-        def check() -> None:
-            if (now := self._aliases.current(league).get(alias)) != version:
-                raise AliasMoved(f"{league}@{alias} was set to version {now} in the meantime")
+        def check(version: int | None) -> None:
+            if version != event.version:
+                raise AliasMoved(f"{league}@{alias} was set to version {version} in the meantime")
 
         return self._wait(
             league,
-            f"{league}@{alias} is version {version}",
+            f"{league}@{alias} is version {event.version}",
+            now=select(now.c.version).scalar_subquery(),
             check=check,
-            follows=lambda found: (found.event or 0) >= event.id and found.aliases.get(alias) == version,
+            # The alias may have moved away and back since.
+            agrees=ReplicaTable.event >= select(now.c.event).scalar_subquery(),
+            acknowledges=and_(
+                acknowledged.event >= event.id, acknowledged.aliases[alias].as_integer() == event.version
+            ),
             describe=lambda found: _serves(found, alias),
             timeout=timeout,
             sleep=sleep,
@@ -102,15 +113,17 @@ class ChangeRepository(Repository):
         that do not follow, and why.
         """
 
-        def check() -> None:
-            if self._traffic.current(setting.league).id != setting.id:
+        def check(newest: int | None) -> None:
+            if newest != setting.id:
                 raise Conflict(f"the traffic of {setting.league} was changed in the meantime")
 
         return self._wait(
             setting.league,
             f"the traffic of {setting.league} is set",
+            now=select(func.max(TrafficEventTable.id)).filter_by(league=setting.league).scalar_subquery(),
             check=check,
-            follows=lambda found: found.traffic == setting.id,
+            agrees=true(),
+            acknowledges=AcknowledgementTable.traffic == setting.id,
             describe=lambda found: found.fault or "has not applied the setting",
             timeout=timeout,
             sleep=sleep,
@@ -121,24 +134,46 @@ class ChangeRepository(Repository):
         league: str,
         done: str,
         *,
-        check: Callable[[], None],
-        follows: Callable[[Acknowledgement], bool],
+        now: ScalarSelect[int | None],
+        check: Callable[[int | None], None],
+        agrees: ColumnElement[bool],
+        acknowledges: ColumnElement[bool],
         describe: Callable[[Acknowledgement], str],
         timeout: float,
         sleep: Callable[[float], None],
     ) -> list[str]:
-        """Poll until all replicas follow. `check` raises if they never will; `describe` says why one does not."""
+        """Poll until all replicas follow: they have read the change and agree, or acknowledge it for the league.
+
+        `now` is what the change has set, and `check` raises if it was changed again; both are read by the statement
+        that counts replicas. `describe` says why a replica does not follow.
+        """
+        # Ids of events can be used again after a league was removed; counts cannot.
+        has_read = ReplicaTable.changes >= self.counts().to_acknowledge
+        follows = or_(and_(AcknowledgementTable.replica.is_(None), has_read, agrees), acknowledges)
+        count = select(func.count(), func.count().filter(follows), now).select_from(
+            replicas.with_acknowledgement(league)
+        )
         deadline = time.monotonic() + timeout
         while True:
-            check()
-            found = self._replicas.acknowledgements(league)
-            late = [one for one in found if not follows(one)]
-            if found and not late:
-                return [one.replica for one in found]
+            with self._database.read() as session:
+                registered, following, current = session.execute(count).one()
+            check(current)
+            if registered and following == registered:
+                return self._names(league, follows)
             if time.monotonic() >= deadline:
-                reasons = [f"{one.replica} {_silence(one)}{describe(one)}" for one in late]
-                raise NotReady(f"{done}, but after {timeout:g} s {_why(len(found), reasons)}")
+                late = set(self._names(league, follows.is_not(true())))
+                reasons = [
+                    f"{one.replica} {_silence(one)}{describe(one)}"
+                    for one in self._replicas.acknowledgements(league)
+                    if one.replica in late
+                ]
+                raise NotReady(f"{done}, but after {timeout:g} s {_why(registered, reasons)}")
             sleep(POLL_SECONDS)
+
+    def _names(self, league: str, condition: ColumnElement[bool]) -> list[str]:
+        query = select(ReplicaTable.replica).select_from(replicas.with_acknowledgement(league)).where(condition)
+        with self._database.read() as session:
+            return list(session.scalars(query.order_by(ReplicaTable.replica)))
 
 
 def _why(registered: int, reasons: list[str]) -> str:

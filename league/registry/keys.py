@@ -17,6 +17,7 @@ from sqlalchemy import select
 from league.errors import InvalidInput, NameTaken, UnknownKey
 from league.refs import check_slug
 from league.registry import leagues
+from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert
 from league.registry.storage.rows import KeyRow, detached
 from league.registry.storage.tables import ApiKeyTable
@@ -62,6 +63,7 @@ class KeyRepository(Repository):
         with self._database.write() as session:
             for league in only_leagues:
                 leagues.require(session, league)
+            change_counter.count(session, "keys")
             if not insert(session, ApiKeyTable, [values]):
                 raise NameTaken(f"a key {name!r} exists or existed: names of keys are not reused")
             return _row(session.get_one(ApiKeyTable, id_)), token
@@ -82,7 +84,9 @@ class KeyRepository(Repository):
                 known = ", ".join(session.scalars(select(ApiKeyTable.name).order_by(ApiKeyTable.name))) or "none yet"
                 raise UnknownKey(f"there is no key {name!r}; known: {known}")
             key = found[0]
-            key.revoked_at = key.revoked_at or datetime.now(UTC)
+            if key.revoked_at is None:
+                change_counter.count(session, "keys")
+                key.revoked_at = datetime.now(UTC)
             return _row(key)
 
 

@@ -1,5 +1,6 @@
 """Registered leagues. The row of a league is the lock that serialises all changes to the league."""
 
+import difflib
 import logging
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
@@ -7,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from league.conditions import game_changes
 from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface, digest
-from league.registry.storage.database import Repository, insert
-from league.registry.storage.rows import LeagueRow, detached
-from league.registry.storage.tables import READY, LeagueTable, MatchTable, VersionTable
+from league.registry.storage.database import Repository, insert, upsert
+from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, require_active
+from league.registry.storage.tables import READY, EarlierGameTable, LeagueTable, MatchTable, VersionTable
 
 if TYPE_CHECKING:
     from league.config.league import LeagueConfig
@@ -26,7 +28,7 @@ class LeagueRepository(Repository):
     def register(self, config: "LeagueConfig", interface: Interface) -> None:
         """Add a league or update its configuration. Warns if results exist and what decides them has changed.
 
-        Raises InterfaceChanged if published versions have another interface.
+        Raises LeagueArchived, or InterfaceChanged if published versions have another interface.
         """
         values = {
             "config": config.model_dump(mode="json", by_alias=True),
@@ -40,7 +42,7 @@ class LeagueRepository(Repository):
         with self._database.write() as session:
             if insert(session, LeagueTable, [first | values]):
                 return
-            known = lock(session, config.league)
+            known = lock_active(session, config.league)
             if known.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
                 raise InterfaceChanged(
                     f"league {config.league} has versions with other spaces or policies than this configuration: "
@@ -51,8 +53,10 @@ class LeagueRepository(Repository):
                     "league %s: %s. Earlier results can be viewed, but no longer count in ratings, payoffs and"
                     " verdicts.",
                     config.league,
-                    _changes(known.game, game),
+                    _describe_changes(known.game, game),
                 )
+                earlier = {"game": known.game, "replaced_at": datetime.now(UTC)}
+                upsert(session, EarlierGameTable, {"league": known.slug, "digest": known.game_digest}, earlier)
             for name, value in values.items():
                 setattr(known, name, value)
 
@@ -61,6 +65,14 @@ class LeagueRepository(Repository):
         with self._database.read() as session:
             return _row(session.get(LeagueTable, league) or _unknown(session, league))
 
+    def earlier_games(self, league: str) -> list[EarlierGameRow]:
+        """Return the other games that the league had when results existed, newest first. Raises UnknownLeague."""
+        table = EarlierGameTable
+        query = select(table).filter_by(league=league).order_by(table.replaced_at.desc(), table.digest)
+        with self._database.read() as session:
+            row = session.get(LeagueTable, league) or _unknown(session, league)
+            return [detached(EarlierGameRow, each) for each in session.scalars(query) if each.digest != row.game_digest]
+
     def follow_code(self, league: str) -> LeagueRow:
         """Return one league, registered again if the code of its environment has changed. Raises UnknownLeague."""
         row = self.get(league)
@@ -68,6 +80,19 @@ class LeagueRepository(Repository):
             return row
         self.register(row.config, row.interface)
         return self.get(league)
+
+    def archive(self, league: str, undo: bool = False) -> LeagueRow:
+        """Archive a league, or make it active again. Idempotent. Raises UnknownLeague."""
+        with self._database.write() as session:
+            row = lock(session, league)
+            row.archived_at = None if undo else row.archived_at or datetime.now(UTC)
+            return _row(row)
+
+    def names(self) -> dict[str, datetime | None]:
+        """Return league → since when it is archived, sorted by name. Does not read configurations."""
+        query = select(LeagueTable.slug, LeagueTable.archived_at).order_by(LeagueTable.slug)
+        with self._database.read() as session:
+            return dict(session.execute(query).tuples().all())
 
     def all(self) -> list[LeagueRow]:
         """Return all leagues, sorted by name."""
@@ -89,6 +114,13 @@ def lock(session: Session, league: str) -> LeagueTable:
     return session.get(LeagueTable, league, with_for_update={"key_share": True}) or _unknown(session, league)
 
 
+def lock_active(session: Session, league: str) -> LeagueTable:
+    """Lock a league until the transaction ends. Raises UnknownLeague or LeagueArchived."""
+    row = lock(session, league)
+    require_active(league, row.archived_at)
+    return row
+
+
 def _has_versions(session: Session, league: str) -> bool:
     ready = select(VersionTable.number).filter_by(league=league, state=READY)
     return session.scalar(ready.limit(1)) is not None
@@ -98,19 +130,19 @@ def _has_results(session: Session, league: str) -> bool:
     return session.scalar(select(MatchTable.position).filter_by(league=league).limit(1)) is not None
 
 
-def _changes(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """Describe the differences of two games. Digests are abbreviated."""
+def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Describe the differences of two games."""
     if not before:
         return "what decides results (the environment's code, its libraries, the rules of play) was not recorded before"
-    names = [name for name in before | now if before.get(name) != now.get(name)]
     return "the game has changed: " + ", ".join(
-        f"{name} {str(before.get(name))[:12]} → {str(now.get(name))[:12]}" for name in names
+        f"{change.name} {change.before} → {change.now}" for change in game_changes(before, now)
     )
 
 
 def _unknown(session: Session, league: str) -> LeagueTable:
-    known = ", ".join(session.scalars(select(LeagueTable.slug).order_by(LeagueTable.slug)))
-    raise UnknownLeague(f"there is no league {league!r}; known: {known or 'none yet'}")
+    known = list(session.scalars(select(LeagueTable.slug).order_by(LeagueTable.slug)))
+    guess = "".join(f", did you mean {name!r}?" for name in difflib.get_close_matches(league, known, n=1))
+    raise UnknownLeague(f"there is no league {league!r}{guess or '; known: ' + (', '.join(known) or 'none yet')}")
 
 
 def _row(league: LeagueTable) -> LeagueRow:

@@ -10,7 +10,7 @@ longer become ready. A crash at any point leaves a row that `stale` finds later.
 import hashlib
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,14 +18,22 @@ from pathlib import Path
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from league.errors import EnvironmentMismatch, InterfaceChanged, StorageError
+from league.errors import (
+    EnvironmentMismatch,
+    InterfaceChanged,
+    InvalidInput,
+    NotPromotable,
+    StorageError,
+    VersionRetired,
+)
 from league.files import DISK_FULL_OR_READ_ONLY, disk_errors
 from league.registry import leagues, versions
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository, row_count
-from league.registry.storage.manifest import Manifest
+from league.registry.storage.manifest import EXPLOITER, MIXTURE, Manifest
+from league.registry.storage.mixture import Member, Mixture, normalised
 from league.registry.storage.rows import VersionRow
-from league.registry.storage.tables import ABANDONED, PUBLISHING, READY, VersionTable
+from league.registry.storage.tables import ABANDONED, PUBLISHING, READY, LeagueTable, VersionTable
 from league.registry.versions import VersionRepository
 
 PUBLICATION_TIMEOUT = timedelta(days=1)
@@ -46,7 +54,7 @@ class VersionPublisher(Repository):
         """Publish the files that `build` writes as the next version, completely or not at all.
 
         source: identifies the checkpoint. If it was published before, the existing version is returned.
-        Raises UnknownLeague, UnknownVersion (of the parent), InterfaceChanged, and whatever `build` raises.
+        Raises UnknownLeague, LeagueArchived, UnknownVersion (of the parent), InterfaceChanged, and what `build` raises.
         """
         self.sweep(league)
         with self._database.write() as session:
@@ -56,6 +64,39 @@ class VersionPublisher(Repository):
         if ready is None:
             ready = self._build(league, number, build, source, parent)
         return self._versions.get(league, ready)
+
+    def publish_mixture(self, league: str, shares: Mapping[int, float]) -> VersionRow:
+        """Publish a mixture, or return the version that has these members and probabilities already.
+
+        Whatever refers to a version can therefore refer to a mixture: aliases and their history, verdicts, schedules,
+        canaries.
+
+        Args:
+            league: The league.
+            shares: Version → probability. They must sum to 1 within TOLERANCE, and are normalised.
+
+        Raises:
+            UnknownLeague: The league does not exist.
+            UnknownVersion: A member does not exist.
+            VersionRetired: A member has no files any more.
+            NotPromotable: A member is an exploiter.
+            EnvironmentMismatch: A member has another interface or environment than the league or the other members.
+            InvalidInput: The probabilities do not sum to 1, there are fewer than two members, or one is a mixture.
+        """
+        probabilities = normalised(shares)
+        members = [self._versions.get(league, number) for number in probabilities]
+        with self._database.read() as session:
+            interface_digest = session.get_one(LeagueTable, league).interface_digest
+        for member in members:
+            _check_member(member, members[0], interface_digest)
+        mixture = Mixture(
+            members=tuple(
+                Member(version=member.number, probability=probabilities[member.number], sha256=member.sha256)
+                for member in members
+            )
+        )
+        source = "mixture/" + ",".join(f"{number}:{probability!r}" for number, probability in probabilities.items())
+        return self.publish(league, lambda _, number: _manifest_of_mixture(number, members, mixture), source=source)
 
     def sweep(self, league: str) -> None:
         """Remove what publishers that died have left."""
@@ -91,9 +132,47 @@ class VersionPublisher(Repository):
             forget(session, league, number)
 
 
+def _check_member(member: VersionRow, first: VersionRow, interface_digest: str) -> None:
+    if member.retired_at is not None:
+        raise VersionRetired(f"{member.ref} was retired and its files were removed: it cannot play in a mixture")
+    if member.mixture is not None:
+        raise InvalidInput(f"{member.ref} is a mixture ({member.mixture}): the members of a mixture must be versions")
+    if member.role == EXPLOITER:
+        raise NotPromotable(f"{member.ref} has the role {EXPLOITER} (of {member.exploits}): it cannot be in a mixture")
+    if member.manifest.interface.digest() != interface_digest:
+        raise EnvironmentMismatch(f"{member.ref} has other spaces or policies than league {member.league} has now")
+    if member.manifest.environment_digest != first.manifest.environment_digest:
+        raise EnvironmentMismatch(
+            f"{first.ref} and {member.ref} were trained in different environments: they cannot be in one mixture"
+        )
+
+
+def _manifest_of_mixture(number: int, members: list[VersionRow], mixture: Mixture) -> Manifest:
+    first = members[0].manifest
+    return Manifest(
+        league=first.league,
+        version=number,
+        created_at=datetime.now(UTC),
+        interface=first.interface,
+        policies={},
+        environment=first.environment,
+        environment_digest=first.environment_digest,
+        algorithm=MIXTURE,
+        settings={},
+        seed=0,
+        steps=max(member.steps for member in members),
+        role=MIXTURE,
+        mixture=mixture,
+        stack={},
+    )
+
+
 def reserve(session: Session, league: str, source: str, parent: int | None, above: int) -> int:
-    """Reserve the next version number, higher than `above`. Raises UnknownLeague, or UnknownVersion of the parent."""
-    row = leagues.lock(session, league)
+    """Reserve the next version number, higher than `above`.
+
+    Raises UnknownLeague, LeagueArchived, or UnknownVersion of the parent.
+    """
+    row = leagues.lock_active(session, league)
     if parent is not None:
         versions.require(session, league, parent)
     row.last_version = max(row.last_version, above) + 1
@@ -167,8 +246,8 @@ def stale(session: Session, league: str) -> list[int]:
 
 
 def this_process() -> str:
-    """Return `host:pid:start`, where `start` distinguishes processes that reuse a pid, if the system reports it."""
-    return f"{socket.gethostname()}:{os.getpid()}:{_start(os.getpid())}"
+    """Return `machine:pid:start`, where `start` distinguishes processes that reuse a pid, if the system reports it."""
+    return f"{_machine()}:{os.getpid()}:{_start(os.getpid())}"
 
 
 def is_dead(publisher: str, reserved_at: datetime) -> bool:
@@ -176,10 +255,22 @@ def is_dead(publisher: str, reserved_at: datetime) -> bool:
 
     If this is wrong, that process loses its publication and nothing else: the version can no longer become ready.
     """
-    host, pid, start = publisher.rsplit(":", 2)
+    machine, pid, start = publisher.rsplit(":", 2)
     if datetime.now(UTC) - reserved_at > PUBLICATION_TIMEOUT:
         return True
-    return host == socket.gethostname() and not (_exists(int(pid)) and _start(int(pid)) == start)
+    return machine == _machine() and not (_exists(int(pid)) and _start(int(pid)) == start)
+
+
+def _machine() -> str:
+    """Host name, last start and container, if the system reports them: several may have the same name."""
+    try:
+        boot, container = (
+            Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+            os.stat("/proc/self/ns/pid").st_ino,
+        )
+    except OSError:
+        return socket.gethostname()
+    return f"{socket.gethostname()}/{boot}/{container}"
 
 
 def _leave_publishing(session: Session, league: str, number: int, values: dict[str, str | None]) -> bool:

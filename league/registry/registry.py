@@ -7,12 +7,13 @@ from typing import Self
 
 from league.registry.aliases import AliasRepository
 from league.registry.changes import ChangeRepository
+from league.registry.deletion.removal import RemovalRepository
+from league.registry.deletion.retention import RetentionRepository
 from league.registry.evaluations import EvaluationRepository
 from league.registry.keys import KeyRepository
 from league.registry.leagues import LeagueRepository
 from league.registry.publishing import VersionPublisher
 from league.registry.replicas import ReplicaRepository
-from league.registry.retention import RetentionRepository
 from league.registry.snapshots import SnapshotRepository
 from league.registry.storage import exclusive_lock
 from league.registry.storage.artifacts import ArtifactStore
@@ -21,6 +22,7 @@ from league.registry.storage.object_artifacts import ObjectArtifactStore
 from league.registry.traffic import TrafficRepository
 from league.registry.training.nights import TrainingNightRepository
 from league.registry.training.runs import RunRepository
+from league.registry.training.strength import StrengthRepository
 from league.registry.verdicts import NightlyRunRepository, VerdictRepository
 from league.registry.versions import VersionRepository
 from league.settings import Storage
@@ -43,6 +45,7 @@ class Registry:
         self.leagues = LeagueRepository(database)
         self.versions = VersionRepository(database, self.artifacts)
         self.retention = RetentionRepository(database, self.artifacts)
+        self.removal = RemovalRepository(database, self.artifacts, storage.home)
         self.publisher = VersionPublisher(database, self.artifacts)
         self.aliases = AliasRepository(database)
         self.traffic = TrafficRepository(database)
@@ -54,16 +57,18 @@ class Registry:
         self.training_nights = TrainingNightRepository(database)
         self.evaluations = EvaluationRepository(database)
         self.runs = RunRepository(database)
+        self.strength = StrengthRepository(database)
         self.snapshots = SnapshotRepository(database)
 
     @classmethod
-    def open(cls, storage: Storage | None = None, create: bool = True) -> Self:
+    def open(cls, storage: Storage | None = None, create: bool = True, listens: bool = False) -> Self:
         """Open the registry at `storage`, by default from the environment, and migrate its schema if necessary.
 
-        create: create an SQLite database that does not exist.
+        create: create an SQLite database that does not exist. listens: for one thread, with one connection that
+        PostgreSQL notifies of changes which replicas follow.
         """
         storage = storage or Storage.from_environment()
-        return cls(storage, Database(storage.database_url, create))
+        return cls(storage, Database(storage.database_url, create, listens))
 
     def close(self) -> None:
         """Close the database connections."""

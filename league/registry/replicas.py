@@ -1,20 +1,42 @@
-"""What serving replicas report: that they run, the versions that they serve, and their metrics.
+"""What serving replicas report: that they run, what they have read, what they serve, and their metrics.
+
+A replica has one row that says how far it has read the changes of the registry. It serves what the registry required
+then, except of leagues for which it has an acknowledgement as well: while a version is loaded, or after a
+failure. So following a change, or 1,000 of them, is one update. Replicas of earlier releases have an acknowledgement
+for each league.
 
 All times are those of the database's clock, because the clocks of replicas may differ.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from datetime import timedelta
-from types import MappingProxyType
+from functools import cache
 from typing import Any
 
-from sqlalchemy import and_, delete, select, update
+from sqlalchemy import ColumnElement, Join, and_, case, delete, func, select, true, update
 from sqlalchemy.orm import Session
 
+from league.refs import CHAMPION
 from league.registry import leagues, traffic
-from league.registry.storage.database import Repository, clock, insert, row_count, upsert
-from league.registry.storage.rows import Acknowledgement, RegisteredReplica, ShadowCounts, detached
-from league.registry.storage.tables import AcknowledgementTable, ReplicaReportTable, ReplicaTable
+from league.registry.storage.database import Repository, clock, insert, row_count, sql_clock, upsert, upsert_all
+from league.registry.storage.rows import (
+    Acknowledgement,
+    AliasTarget,
+    ReadPosition,
+    RegisteredReplica,
+    ServedState,
+    ShadowCounts,
+    detached,
+)
+from league.registry.storage.tables import (
+    AcknowledgementTable,
+    AliasEventTable,
+    AliasTable,
+    ReplicaReportTable,
+    ReplicaTable,
+    VersionTable,
+)
 
 KEPT = timedelta(days=1)
 """Replicas that died without deregistering are removed after this time, unless another replica notices earlier."""
@@ -25,67 +47,73 @@ LIVENESS_TIMEOUT = timedelta(seconds=15)
 class ReplicaRepository(Repository):
     """Writes and reads the reports of replicas."""
 
-    def register(self, replica: str, process: Mapping[str, str]) -> None:
-        """Record that a replica runs, and remove replicas that have been silent for KEPT.
+    def register(self, replica: str, process: Mapping[str, str]) -> bool:
+        """Record that a replica runs.
 
         A replica registers before it reads the aliases for the first time, and then repeatedly.
-        process: where it runs; see RegisteredReplica.
+        process: where it runs; see RegisteredReplica. Returns whether it was registered already; if not, nothing that
+        it has acknowledged is known.
         """
         with self._database.write() as session:
-            now = clock(session)
-            upsert(session, ReplicaTable, {"replica": replica}, {"process": dict(process), "seen_at": now})
-            for old in session.scalars(select(ReplicaTable.replica).where(ReplicaTable.seen_at < now - KEPT)).all():
-                _remove(session, old)
+            now = sql_clock(session)
+            running = update(ReplicaTable).filter_by(replica=replica).values(process=dict(process), seen_at=now)
+            is_known = row_count(session, running) > 0
+            if not is_known:
+                _remove(session, replica)
+                insert(session, ReplicaTable, [{"replica": replica, "process": process, "seen_at": clock(session)}])
+            return is_known
 
     def registered(self) -> list[RegisteredReplica]:
         """Return all replicas that have registered and were not removed."""
         with self._database.read() as session:
-            now = clock(session)
-            found = session.scalars(select(ReplicaTable).order_by(ReplicaTable.replica))
-            return [detached(RegisteredReplica, row, silence=now - row.seen_at) for row in found]
+            return _registered(session, true())
+
+    def silent(self) -> list[RegisteredReplica]:
+        """Return the registered replicas that are silent."""
+        with self._database.read() as session:
+            return _registered(session, ReplicaTable.seen_at <= sql_clock(session) - LIVENESS_TIMEOUT)
 
     def acknowledge(
         self,
         replica: str,
-        league: str,
-        version: int | None,
-        sha256: str | None,
-        fault: str | None = None,
-        aliases: Mapping[str, int] = MappingProxyType({}),
-        traffic: int | None = None,
-        event: int | None = None,
-    ) -> None:
-        """Replace the acknowledgement of a replica for a league. Raises UnknownLeague.
+        position: ReadPosition,
+        differing: Mapping[str, ServedState],
+        settled: Collection[str] | None = None,
+    ) -> bool:
+        """Record what a registered replica has read, and what it serves of leagues where this differs.
 
-        version, sha256: the champion that it serves. fault: why it does not serve what it should. aliases: alias →
-        version that it serves. traffic: id of the traffic setting that it follows. event: id of the newest alias event
-        of the league that it has read.
+        position: how far it has read.
+        differing: league → what it serves. settled: leagues that differed at an earlier call, and do not any
+        more; None: all others.
+        Returns False, and records nothing, if the replica is not registered: another one took it for dead.
         """
-        values = {
-            "version": version,
-            "sha256": sha256,
-            "fault": fault,
-            "aliases": dict(aliases),
-            "traffic": traffic,
-            "event": event,
-        }
         with self._database.write() as session:
-            leagues.require(session, league)
-            now = clock(session)
-            upsert(session, AcknowledgementTable, {"replica": replica, "league": league}, values | {"seen_at": now})
-            seen = update(ReplicaTable).filter_by(replica=replica).values(seen_at=now)
-            if not row_count(session, seen):  # another replica took it for dead
-                insert(session, ReplicaTable, [{"replica": replica, "process": {}, "seen_at": now}])
+            seen = {"seen_at": sql_clock(session)} | position._asdict()
+            if not row_count(session, update(ReplicaTable).filter_by(replica=replica).values(seen)):
+                return False
+            earlier = delete(AcknowledgementTable).filter_by(replica=replica)
+            if settled is None:
+                session.execute(earlier)
+            elif settled:
+                session.execute(earlier.where(AcknowledgementTable.league.in_(settled)))
+            if differing:
+                now = clock(session)
+                rows = [
+                    {"replica": replica, "league": league, "seen_at": now} | asdict(state)
+                    for league, state in differing.items()
+                ]
+                upsert_all(session, AcknowledgementTable, ("replica", "league"), rows)
+            return True
 
     def acknowledgements(self, league: str) -> list[Acknowledgement]:
         """Return what each registered replica serves of a league, by replica. Raises UnknownLeague."""
         with self._database.read() as session:
             return acknowledgements(session, league)
 
-    def write_report(self, replica: str, document: dict[str, Any], counts: Iterable[ShadowCounts] = ()) -> None:
+    def write_report(self, replica: str, document: dict[str, Any], counts: Collection[ShadowCounts] = ()) -> None:
         """Replace the metrics report of a replica and its shadow counters since it started."""
         with self._database.write() as session:
-            values = {"document": document, "at": clock(session)}
+            values = {"document": document, "at": sql_clock(session)}
             upsert(session, ReplicaReportTable, {"replica": replica}, values)
             traffic.write_shadow_counts(session, replica, counts)
 
@@ -107,19 +135,91 @@ def acknowledgements(session: Session, league: str) -> list[Acknowledgement]:
     """Return what each registered replica serves of a league, by replica. Raises UnknownLeague."""
     leagues.require(session, league)
     now = clock(session)
-    of_league = and_(AcknowledgementTable.replica == ReplicaTable.replica, AcknowledgementTable.league == league)
-    query = select(ReplicaTable, AcknowledgementTable).outerjoin(AcknowledgementTable, of_league)
-    nothing = AcknowledgementTable(league=league, aliases={})
+    state_at = cache(lambda event, setting: _required(session, league, event, setting))
+    query = select(ReplicaTable, AcknowledgementTable).select_from(with_acknowledgement(league))
     return [
         detached(
             Acknowledgement,
-            row or nothing,
+            row or state_at(replica.event, replica.traffic),
             replica=replica.replica,
+            league=league,
             seen_at=replica.seen_at,
             silence=now - replica.seen_at,
         )
-        for replica, row in session.execute(query.order_by(ReplicaTable.replica)).tuples()
+        for replica, row in session.execute(query.order_by(ReplicaTable.replica))
     ]
+
+
+def with_acknowledgement(league: str) -> Join:
+    """The registered replicas, each with its acknowledgement for a league, or nulls."""
+    table = ReplicaTable.__table__
+    of_league = and_(AcknowledgementTable.replica == ReplicaTable.replica, AcknowledgementTable.league == league)
+    return table.outerjoin(AcknowledgementTable.__table__, of_league)
+
+
+def serving(session: Session, league: str, since: timedelta) -> dict[int, int]:
+    """Return version → number of replicas that serve it as champion and have reported in the last `since`."""
+    newest = func.coalesce(select(func.max(AliasTable.event)).filter_by(league=league).scalar_subquery(), 0)
+    # All that have read the newest event of the league are one group.
+    read = case(
+        (AcknowledgementTable.replica.is_not(None), None),
+        (ReplicaTable.event >= newest, newest),
+        else_=ReplicaTable.event,
+    )
+    groups = (
+        select(AcknowledgementTable.version, read, func.count())
+        .select_from(with_acknowledgement(league))
+        .where(ReplicaTable.seen_at > sql_clock(session) - since)
+        .group_by(AcknowledgementTable.version, read)
+    )
+    found: dict[int, int] = {}
+    for acknowledged, event, number in session.execute(groups):
+        champion = None if event is None else _aliases_at(session, league, event).get(CHAMPION)
+        version = champion.version if champion else acknowledged
+        if version is not None:
+            found[version] = found.get(version, 0) + number
+    return dict(sorted(found.items()))
+
+
+def _required(session: Session, league: str, event: int | None, setting: int | None) -> ServedState:
+    """What the registry required of a league when `event` and `setting` were the newest that a replica had read."""
+    if event is None:
+        return ServedState()
+    targets = _aliases_at(session, league, event)
+    aliases = {alias: target.version for alias, target in targets.items()}
+    version = aliases.get(CHAMPION)
+    sha256 = session.scalar(select(VersionTable.sha256).filter_by(league=league, number=version))
+    followed = traffic.setting_at(session, league, setting or 0)
+    pinned = () if followed is None else (followed.canary, followed.shadow)
+    numbers = {str(one.version): one.version for one in pinned if one and isinstance(one.version, int)}
+    return ServedState(
+        version=version,
+        sha256=sha256,
+        aliases=aliases | numbers,
+        event=max((target.event for target in targets.values()), default=None),
+        traffic=followed.id if followed else None,
+    )
+
+
+def _aliases_at(session: Session, league: str, event: int) -> dict[str, AliasTarget]:
+    """Return alias → its target when `event` was the newest."""
+    now = select(AliasTable.name, AliasTable.version, AliasTable.event).filter_by(league=league)
+    found = {alias: AliasTarget(version, moved) for alias, version, moved in session.execute(now)}
+    for alias in [alias for alias, target in found.items() if target.event > event]:
+        del found[alias]
+        table = AliasEventTable
+        earlier = select(table.version, table.id).filter_by(league=league, alias=alias).where(table.id <= event)
+        if target := session.execute(earlier.order_by(table.id.desc()).limit(1)).one_or_none():
+            found[alias] = AliasTarget(*target)
+    return found
+
+
+def _registered(session: Session, condition: ColumnElement[bool]) -> list[RegisteredReplica]:
+    found = session.scalars(select(ReplicaTable).where(condition).order_by(ReplicaTable.replica)).all()
+    if not found:
+        return []
+    now = clock(session)
+    return [detached(RegisteredReplica, row, silence=now - row.seen_at) for row in found]
 
 
 def _remove(session: Session, replica: str) -> None:

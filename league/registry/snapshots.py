@@ -30,8 +30,15 @@ from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 4
+FORMAT = 5
 """Version of the document format. A new format invalidates all snapshots."""
+
+
+def earlier_part(conditions: str, part: str) -> str:
+    """Return the name of a part about results under earlier conditions (`Conditions.name`)."""
+    return f"earlier/{conditions}/{part}"
+
+
 _COUNTS: dict[str, Executable] = {
     "matches": select(MatchTable.league, func.count()).group_by(MatchTable.league),
     "purged schedules": select(ScheduleTable.league, func.count())
@@ -62,6 +69,11 @@ class SnapshotRepository(Repository):
                 leagues.require(session, league)
                 return None
             return _row(snapshot)
+
+    def current(self, league: str, part: str) -> SnapshotRow | None:
+        """Return a part that was computed from the league's current data, else None. Raises UnknownLeague."""
+        snapshot = self.get(league, part)
+        return snapshot if snapshot is not None and snapshot.mark == self.current_marks()[league] else None
 
     def of_part(self, part: str) -> dict[str, SnapshotRow]:
         """Return league → this part, of the leagues that have it."""

@@ -6,7 +6,7 @@ alias that it follows. Each replica writes its shadow counters since it started,
 idempotent; the counters are kept after the replica stops.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from enum import Enum
@@ -18,6 +18,7 @@ from league.errors import InvalidInput
 from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, parse_version
 from league.registry import leagues, versions
+from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, repeat_after_deadlock, upsert
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic, detached
@@ -96,8 +97,10 @@ class TrafficRepository(Repository):
         return [_sum(league, *pair, counts) for pair, counts in found.items()]
 
 
-def write_shadow_counts(session: Session, replica: str, counts: Iterable[ShadowCounts]) -> None:
-    """Replace the shadow counters of `replica`; deletes old ones of all replicas."""
+def write_shadow_counts(session: Session, replica: str, counts: Collection[ShadowCounts]) -> None:
+    """Replace the shadow counters of `replica`, and delete old ones of all replicas."""
+    if not counts:
+        return
     now = datetime.now(UTC)
     for count in counts:
         values = asdict(count)
@@ -124,6 +127,7 @@ def _set(
             _check(session, league, portion)
     if now.id is not None and wanted == (now.canary, now.shadow):
         return now
+    change_counter.count(session, "traffic")
     event = TrafficEventTable(league=league, actor=actor, reason=reason, at=datetime.now(UTC))
     (event.canary, event.canary_share), (event.shadow, event.shadow_share) = (
         (str(portion.version), portion.share) if isinstance(portion, Portion) else (None, None) for portion in wanted
@@ -139,6 +143,13 @@ def current_setting(session: Session, league: str) -> Traffic:
     query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc()).limit(1)
     event = session.scalar(query)
     return Traffic(league=league) if event is None else _row(event)
+
+
+def setting_at(session: Session, league: str, newest: int) -> Traffic | None:
+    """Return the setting that was in force when the setting with the id `newest`, of any league, was the newest."""
+    query = select(TrafficEventTable).filter_by(league=league).where(TrafficEventTable.id <= newest)
+    event = session.scalar(query.order_by(TrafficEventTable.id.desc()).limit(1))
+    return None if event is None else _row(event)
 
 
 def _check(session: Session, league: str, portion: Portion) -> None:

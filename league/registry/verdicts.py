@@ -4,20 +4,23 @@ A verdict is opened before the first match that it counts, and closed once. Afte
 person. A nightly run stores its candidates before the first verdict, so that an interrupted run resumes with the same.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import func, select, tuple_
 from sqlalchemy.orm import Session
 
-from league.errors import Conflict, InvalidInput, UnknownVerdict
+from league.errors import Conflict, InvalidInput, InvalidReference, UnknownVerdict
+from league.refs import SHORT_VERDICT, VERDICT, verdict_digest
 from league.registry import leagues, versions
 from league.registry.storage.database import Repository, insert, repeat_after_deadlock
 from league.registry.storage.rows import NightlyRunRow, VerdictRow, detached
 from league.registry.storage.tables import AliasEventTable, NightlyRunTable, VerdictTable
 
 VOID = "void"
+MAX_LISTED = 5
+"""Verdicts in a message about an ambiguous id."""
 
 
 class VerdictRepository(Repository):
@@ -38,6 +41,18 @@ class VerdictRepository(Repository):
                 if (found := getattr(verdict, name)) != value:
                     raise Conflict(f"verdict {schedule} was opened with {name} {found!r}, not {value!r}")
             return _row(verdict)
+
+    @repeat_after_deadlock
+    def settle(self, verdict: str, name: str, value: dict[str, Any]) -> VerdictRow:
+        """Set a setting that was None when the verdict was opened, and return the verdict.
+
+        A setting that is set, and a closed verdict, stay as they are. Raises UnknownVerdict.
+        """
+        with self._database.write() as session:
+            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            if row.outcome is None and row.settings[name] is None:
+                row.settings = row.settings | {name: value}
+            return _row(row)
 
     @repeat_after_deadlock
     def close(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
@@ -71,6 +86,32 @@ class VerdictRepository(Repository):
         """Return one verdict. Raises UnknownVerdict."""
         with self._database.read() as session:
             return _row(session.get(VerdictTable, verdict) or _unknown(verdict))
+
+    def find(self, text: str, league: str | None = None) -> VerdictRow:
+        """Return the verdict with this id, or the only one whose id or digest begins with it.
+
+        league: search the verdicts of this league only.
+
+        Raises UnknownLeague, UnknownVerdict, or InvalidReference with the candidates if there are several.
+        """
+        table = VerdictTable
+        begins = table.id.startswith(text, autoescape=True) | table.id.contains(VERDICT + text, autoescape=True)
+        with self._database.read() as session:
+            if league is not None:
+                leagues.require(session, league)
+            if (exact := session.get(table, text)) is not None and league in (None, exact.league):
+                return _row(exact)
+            rows = [_row(row) for row in session.scalars(select(table).where(begins).order_by(table.id))]
+        found = [
+            row
+            for row in rows
+            if league in (None, row.league) and (row.id.startswith(text) or verdict_digest(row.id).startswith(text))
+        ]
+        if not text or not found:
+            _unknown(text)
+        if len(found) > 1:
+            raise InvalidReference(f"verdict {text!r} is ambiguous: {_candidates(found)}")
+        return found[0]
 
     def all(self, league: str) -> list[VerdictRow]:
         """Return all verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
@@ -123,12 +164,32 @@ class NightlyRunRepository(Repository):
             return _nightly_row(run)
 
     @repeat_after_deadlock
+    def settle(self, verdict: str, name: str, value: dict[str, Any]) -> VerdictRow:
+        """Set a setting that was None when the verdict was opened, and return the verdict.
+
+        A setting that is set, and a closed verdict, stay as they are. Raises UnknownVerdict.
+        """
+        with self._database.write() as session:
+            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            if row.outcome is None and row.settings[name] is None:
+                row.settings = row.settings | {name: value}
+            return _row(row)
+
+    @repeat_after_deadlock
     def close(self, run: int, report: dict[str, Any] | None) -> None:
         """End a nightly run and store its report. Idempotent."""
         with self._database.write() as session:
             row = session.get_one(NightlyRunTable, run)
             if row.ended_at is None:
                 row.report, row.ended_at = report, datetime.now(UTC)
+
+    def last_ended(self) -> dict[str, datetime]:
+        """Return league → when its last nightly run ended, of the leagues that have had one."""
+        table = NightlyRunTable
+        query = select(table.league, func.max(table.ended_at)).where(table.ended_at.is_not(None))
+        with self._database.read() as session:
+            found = session.execute(query.group_by(table.league)).tuples()
+            return {league: ended_at for league, ended_at in found if ended_at is not None}
 
     def all(self, league: str) -> list[NightlyRunRow]:
         """Return all nightly runs of a league, oldest first. Raises UnknownLeague."""
@@ -143,6 +204,19 @@ def require_open(session: Session, verdict: str) -> None:
     row = session.get(VerdictTable, verdict)
     if row is not None and row.outcome is not None:
         raise Conflict(f"verdict {verdict} is {row.outcome!r}: it cannot promote a version")
+
+
+def _candidates(rows: Sequence[VerdictRow]) -> str:
+    """List the first verdicts with as many characters of their digests as distinguish all of them."""
+    digests = [verdict_digest(row.id) for row in rows]
+    lengths = range(SHORT_VERDICT, max(map(len, digests)) + 1)
+    length = next((each for each in lengths if len({digest[:each] for digest in digests}) == len(rows)), None)
+    listed = [
+        f"{row.id if length is None else digest[:length]} ({row.league}@{row.candidate} against {row.champion})"
+        for row, digest in zip(rows[:MAX_LISTED], digests, strict=False)
+    ]
+    more = f" and {len(rows) - MAX_LISTED} more" if len(rows) > MAX_LISTED else ""
+    return ", ".join(listed) + more
 
 
 def _unknown(verdict: str) -> VerdictTable:

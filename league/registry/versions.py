@@ -12,7 +12,8 @@ from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.manifest import EXPLOITER, Manifest
+from league.registry.storage.manifest import EXPLOITER, MIXTURE, TRAINING, Manifest
+from league.registry.storage.mixture import Mixture
 from league.registry.storage.rows import Note, VersionRow, detached
 from league.registry.storage.tables import READY, AliasTable, VersionNoteTable, VersionTable
 
@@ -89,6 +90,11 @@ class VersionRepository(Repository):
                 found.setdefault(name, []).append(number)
         return found
 
+    def mixtures(self, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
+        """Return the mixtures among some versions, by one cheap query."""
+        with self._database.read() as session:
+            return mixtures(session, league, numbers)
+
     def fetch(self, league: str, number: int) -> Path:
         """Return a local directory with the verified files of a version. Raises ArtifactCorrupt or VersionRetired."""
         return self._artifacts.verify(league, number, self._with_files(league, number).sha256)
@@ -103,6 +109,10 @@ class VersionRepository(Repository):
             raise VersionRetired(f"{league}@{number} has no {folder} state any more: `league retire` removed it")
         self._artifacts.copy(manifest, folder, target)
         return target
+
+    def has_training(self, version: VersionRow) -> bool:
+        """Return whether a version has the training state from which training continues."""
+        return version.retired_at is None and self._artifacts.has_folder(version.league, version.number, TRAINING)
 
     def set_note(self, ref: CheckpointRef, text: str, *, actor: str) -> VersionRow:
         """Replace the note of a version; an empty text removes it.
@@ -147,10 +157,13 @@ def require(session: Session, league: str, number: int) -> None:
 
 
 def require_files(session: Session, league: str, number: int) -> None:
-    """Raise UnknownLeague, UnknownVersion or VersionRetired unless the version is ready and has its files."""
-    require(session, league, number)
-    if session.get_one(VersionTable, (league, number)).retired_at is not None:
-        _retired(league, number)
+    """Raise UnknownLeague, UnknownVersion or VersionRetired unless the version is ready and has its files, as have its
+    members if it is a mixture.
+    """
+    for each in (number, *sorted(members(session, league, [number]))):
+        require(session, league, each)
+        if session.get_one(VersionTable, (league, each)).retired_at is not None:
+            _retired(league, each)
 
 
 def require_promotable(session: Session, league: str, number: int) -> None:
@@ -161,6 +174,23 @@ def require_promotable(session: Session, league: str, number: int) -> None:
         raise NotPromotable(
             f"{league}@{number} has the role {EXPLOITER} (of {version.exploits}): it cannot be promoted"
         )
+
+
+def mixtures(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
+    """Return the mixtures among some versions."""
+    query = select(VersionTable.number, VersionTable.manifest).filter_by(league=league, state=READY, role=MIXTURE)
+    found: dict[int, Mixture] = {}
+    for number, text in session.execute(query.where(VersionTable.number.in_(numbers))):
+        assert text is not None, "a ready version has a manifest"
+        mixture = Manifest.from_json(text, source=f"the manifest of {league}@{number}").mixture
+        assert mixture is not None, "the manifest checks it"
+        found[number] = mixture
+    return found
+
+
+def members(session: Session, league: str, numbers: Collection[int]) -> set[int]:
+    """Return the members of the mixtures among some versions."""
+    return {number for mixture in mixtures(session, league, numbers).values() for number in mixture.versions}
 
 
 def _retired(league: str, number: int) -> None:
@@ -180,7 +210,7 @@ def _unknown(session: Session, league: str, number: int) -> VersionRow:
     leagues.require(session, league)
     ready = select(VersionTable.number).filter_by(league=league, state=READY)
     last = session.scalar(ready.order_by(VersionTable.number.desc()).limit(1))
-    newest = f"the newest is {last}" if last else "none is published yet"
+    newest = f"the newest is {last}" if last else "none is published yet: `league train CONFIG` publishes versions"
     raise UnknownVersion(f"league {league} has no version {number}; {newest}")
 
 

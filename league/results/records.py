@@ -20,6 +20,9 @@ Scoring = Literal["game", "side", "team"]
 """What a contestant is compared with: its opponent in the same `game`, the other contestant on the same `side` in the
 other game of the block, or nothing if both are one `team`. See scoring.py."""
 
+Members = tuple[int | None, ...]
+"""The member that played for each contestant of a game, None for one that is no mixture; empty without mixtures."""
+
 GAMES_PER_BLOCK = 2
 
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
@@ -40,8 +43,8 @@ class Schedule:
     id: str
     league: str
     kind: str
-    """`verdict`, `anchor`, `exploiter`, `confirmation`, `gauntlet`; `round_robin`, `challenge`, `adaptive` or
-    `cross_play`"""
+    """`verdict`, `anchor`, `exploiter`, `exploitability`, `confirmation`, `gauntlet`; `round_robin`, `challenge`,
+    `adaptive` or `cross_play`"""
     seed: int
     environment_digest: str
     game_digest: str
@@ -142,6 +145,8 @@ class Game:
     A forfeited game ends at the forfeit, without the actions of that step. Its returns are those collected until then:
     they are checked in a replay but not compared. forfeits: at most one per contestant, two if both had to act at the
     same step and neither did.
+
+    members[c] is the version that played for contestant c, if that is a mixture.
     """
 
     sides: tuple[int, ...]
@@ -151,6 +156,7 @@ class Game:
     returns: tuple[float | None, ...]
     scores: tuple[float | None, ...]
     forfeits: tuple[Forfeit, ...] = ()
+    members: Members = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +204,14 @@ class Match:
     seed: int
     environment_digest: str
     games: tuple[Game, ...]
+
+    def acting(self, game: int) -> tuple[str, ...]:
+        """Return who played for the contestants in a game: in place of a mixture, its member."""
+        members = self.games[game].members or (None,) * len(self.contestants)
+        return tuple(
+            ref if member is None else f"{self.league}@{member}"
+            for ref, member in zip(self.contestants, members, strict=True)
+        )
 
     def score(self, contestant: int) -> float:
         """Return the mean score of a contestant (index) over its games, in [0, 1]."""
@@ -252,7 +266,7 @@ def load_schedule(text: str) -> Schedule:
 
 def dump_games(games: Sequence[Game]) -> str:
     """Return a block as JSON: the common seed and opening, and [sides, actions, returns, scores] of each game, followed
-    by [contestant, agent, reason] of each forfeit."""
+    by [contestant, agent, reason] of each forfeit and {"members": [version, …]} if a mixture took part."""
     first = games[0]
     return _ENCODER.encode([first.seed, first.opening, [_game(game) for game in games]])
 
@@ -268,9 +282,10 @@ def load_games(text: str) -> tuple[Game, ...]:
             tuple(actions),
             tuple(returns),
             tuple(scores),
-            tuple(Forfeit(*forfeit) for forfeit in forfeits),
+            tuple(Forfeit(*part) for part in rest if isinstance(part, list)),
+            next((tuple(part["members"]) for part in rest if isinstance(part, dict)), ()),
         )
-        for sides, actions, returns, scores, *forfeits in games
+        for sides, actions, returns, scores, *rest in games
     )
 
 
@@ -281,6 +296,7 @@ def _game(game: Game) -> list[Any]:
         game.returns,
         game.scores,
         *([forfeit.contestant, forfeit.agent, forfeit.reason] for forfeit in game.forfeits),
+        *([{"members": game.members}] if game.members else ()),
     ]
 
 

@@ -4,19 +4,13 @@ Lookup by digest in a dictionary leaks nothing useful through timing: an attacke
 towards the digest of a key.
 """
 
-import asyncio
 import hashlib
-from collections.abc import AsyncIterator, Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Sequence
 from time import monotonic, time
 
 from league.errors import StorageError
 from league.registry.keys import TOKEN_LENGTH
-from league.registry.registry import Registry
 from league.registry.storage.rows import KeyRow
-from serve_app.models.polling import Polling
-from serve_app.settings import ServeSettings
 
 
 class TokenBucket:
@@ -80,9 +74,14 @@ class ApiKeyCache:
         self.is_empty = True
         """Whether the registry has never had a key."""
 
-    def update(self, rows: Iterable[KeyRow]) -> None:
-        """Replace the keys. A key that is unchanged keeps its token bucket."""
-        rows = list(rows)
+    def update(self, rows: Sequence[KeyRow]) -> None:
+        """Replace the keys. A key that is unchanged keeps its token bucket.
+
+        Raises StorageError if there are none, but were some before.
+        """
+        if not rows and not self.is_empty:
+            # Revoked keys stay in the registry. With an empty cache the server would accept requests without a key.
+            raise StorageError("the registry has no API keys, but had some before: it is a different database")
         self._keys = {bytes.fromhex(row.sha256): self._key(row) for row in rows if row.revoked_at is None}
         self.is_empty = not rows
 
@@ -102,33 +101,3 @@ class ApiKeyCache:
         if known is not None and known.row == row:
             return known
         return ApiKey(row, None if row.rate is None else TokenBucket(row.rate))
-
-
-class ApiKeyWatcher:
-    """Keeps the key cache up to date, independently of the alias watcher: a version that loads slowly does not delay a
-    revocation. While the database is unavailable, the cached keys stay valid.
-    """
-
-    def __init__(self, registry: Registry, api_keys: ApiKeyCache, settings: ServeSettings) -> None:
-        self._registry = registry
-        self._api_keys = api_keys
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="keys")
-        self._polling = Polling(self.poll_once, "API keys", settings)
-
-    @asynccontextmanager
-    async def watching(self) -> AsyncIterator[None]:
-        """Poll the keys while the context is active; enters after the first successful poll."""
-        try:
-            async with self._polling.running():
-                yield
-        finally:
-            self._thread.shutdown(wait=False, cancel_futures=True)
-
-    async def poll_once(self) -> None:
-        """Read the keys once. Raises StorageError."""
-        rows = await asyncio.get_running_loop().run_in_executor(self._thread, self._registry.keys.all)
-        if not rows and not self._api_keys.is_empty:
-            # Revoked keys stay in the registry. With an empty cache the server would accept requests without a key.
-            raise StorageError("the registry has no API keys, but had some before: it is a different database")
-        self._api_keys.update(rows)
-        self._polling.mark_ready()

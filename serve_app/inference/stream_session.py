@@ -1,7 +1,7 @@
 """A stream session: answers each message with the version and recurrent state that the stream keeps.
 
 A stream is pinned to a version, or follows an alias. A stream that follows an alias switches versions of a recurrent
-policy only when all its episodes start anew.
+policy, and members of a mixture, only when all its episodes start anew.
 """
 
 import asyncio
@@ -44,7 +44,7 @@ from serve_app.inference.stream_codec import BinaryCodec, parse_request
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.resolver import ModelResolver, policy_ref
 from serve_app.models.shadow import Shadow
-from serve_app.models.traffic_split import Headers, TrafficSplit
+from serve_app.models.traffic_split import Headers, TrafficSplit, acting
 from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.runtime.ray_serve import logger
@@ -92,7 +92,7 @@ class StreamSession:
     """The session of one connection; messages are passed in one at a time.
 
     follows: the alias to follow; None pins the version of `served`. headers: those of the handshake; the caller's key
-    may route a stream that follows the champion to the canary.
+    may route a stream that follows the champion to the canary, and selects the member of a mixture.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class StreamSession:
         reject_unknown_keys(document, KEYS | STREAM_ONLY_KEYS)
         own = document.keys() & STREAM_ONLY_KEYS
         if document.keys() == {"reset"} and parse_flag(document, "reset"):
-            self._served, self._state = self._current(), None
+            self._served, self._state = self._current(is_anew=True), None
             return _text({"reset": True} | self._served.signature)
         return_state, reset = parse_flag(document, "return_state"), document.get("reset", False)
         for key in own:
@@ -204,8 +204,9 @@ class StreamSession:
         return served, read_state(request.tokens, model, served.version.sha256, served.policy.state)
 
     def _continue(self, rows: int, is_anew: bool, resets: NDArray | None) -> tuple[ServedPolicy, Arrays | None]:
-        if self._state is None or is_anew or (resets is not None and resets.all()):
-            return self._current(), None
+        is_anew = is_anew or (resets is not None and bool(resets.all()))
+        if self._state is None or is_anew:
+            return self._current(is_anew), None
         held = len(next(iter(self._state.values())))
         if held != rows:
             raise InvalidState(f"the last message had {held} observations, this one has {rows}: a reset is required")
@@ -216,13 +217,17 @@ class StreamSession:
             array[resets] = 0
         return self._served, state
 
-    def _current(self) -> ServedPolicy:
-        """The version that answers new episodes."""
+    def _current(self, is_anew: bool) -> ServedPolicy:
+        """The version that answers now, if no recurrent state depends on it. is_anew: whether episodes start."""
         if self._follows is None:
             return self._served
         version = self._dependencies.slots.get(self._ref.league, self._follows) or self._served.version
         if self._follows == CHAMPION and self._dependencies.traffic.canaries:
             version = self._dependencies.traffic.route(version, self._headers)
+        # An episode stays with the member of a mixture that it began with.
+        if version.mixture is not None:
+            is_member = self._served.version in version.members
+            version = self._served.version if is_member and not is_anew else acting(version, self._headers)
         if version is self._served.version:
             return self._served
         return ServedPolicy.of(self._model, version, version.policy(self._ref.policy))

@@ -4,7 +4,7 @@ index.
 Descriptions are JSON documents, from which the gRPC messages are built, too.
 """
 
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from importlib.metadata import version as installed
 
 from league.errors import StorageError
@@ -24,7 +24,7 @@ NOT_LOADED = "loaded on demand"
 
 
 class ModelCatalogue:
-    """Describes the models of a server. `replica`: the name of this replica."""
+    """Describes the models of a server. `report` writes the statistics of this replica to the registry."""
 
     def __init__(
         self,
@@ -32,13 +32,13 @@ class ModelCatalogue:
         versions: VersionCache,
         inference: Inference,
         settings: ServeSettings,
-        replica: str,
+        report: Callable[[], Awaitable[None]],
     ) -> None:
         self._models = models
         self._versions = versions
         self._inference = inference
         self._settings = settings
-        self._replica = replica
+        self._report = report
 
     def server(self) -> Document:
         """Name, version and supported extensions of the server."""
@@ -79,12 +79,12 @@ class ModelCatalogue:
     async def statistics(self, model: str = "", version: str = "") -> Document:
         """Statistics of all models, all versions of a model, or one version. The version that answers is always listed.
 
-        Sums over all replicas. Those of other replicas are from their last reports, which they write every few seconds;
-        without a database, they are missing.
+        Sums over all replicas. Those of other replicas are from their last reports, which they write every few seconds,
+        and whenever they are asked. Without a database, there are only those of this replica.
 
         Raises the errors of `ModelResolver.find`.
         """
-        found = sum_documents([*self._inference.statistics.documents(), *await self._of_other_replicas()])
+        found = sum_documents(await self._of_all_replicas())
         if not model:
             return {"model_stats": found}
         served = await self._inference.find(model, version)
@@ -96,14 +96,14 @@ class ModelCatalogue:
             own.append(ModelStatistics().document(served.name, number))
         return {"model_stats": own}
 
-    async def _of_other_replicas(self) -> list[Document]:
+    async def _of_all_replicas(self) -> list[Document]:
+        """What the replicas wrote last. This one writes first, so that no later answer, by any replica, has less."""
         try:
+            await self._report()
             reports = await self._models.query(lambda registry: registry.replicas.reports())
         except StorageError:
-            return []
-        return [
-            each for replica, report in reports.items() if replica != self._replica for each in report.get(REPORT, ())
-        ]
+            return self._inference.statistics.documents()
+        return [each for report in reports.values() for each in report.get(REPORT, ())]
 
     async def index(self, only_ready: bool = False) -> list[Document]:
         """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises

@@ -19,7 +19,7 @@ from serve_app.inference_protocol.inference import Inference, InferRequest, Infe
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
 from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
-from serve_app.models.alias_watcher import AliasWatcher
+from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.models.traffic_split import Headers
 from serve_app.settings import ServeSettings
 
@@ -115,7 +115,7 @@ class InferenceService:
         self,
         inference: Inference,
         catalogue: ModelCatalogue,
-        watcher: AliasWatcher,
+        watcher: RegistryWatcher,
         access: AccessControl,
         settings: ServeSettings,
         machine: str,

@@ -25,7 +25,7 @@ from serve_app.inference.action_request import REPLICA
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
 from serve_app.inference_protocol.rest_codec import compressed, decompressed, read_request, write_response
-from serve_app.models.alias_watcher import AliasWatcher
+from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.settings import ServeSettings
 
 JSON, BINARY = b"application/json", b"application/octet-stream"
@@ -41,7 +41,7 @@ class RestRoutes:
         self,
         inference: Inference,
         catalogue: ModelCatalogue,
-        watcher: AliasWatcher,
+        watcher: RegistryWatcher,
         access: AccessControl,
         settings: ServeSettings,
         replica: str,

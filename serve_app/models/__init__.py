@@ -1,1 +1,1 @@
-"""Served versions: alias watcher, version cache, hot swap, canary and shadow."""
+"""Served versions: registry watcher, version cache, hot swap, canary and shadow."""

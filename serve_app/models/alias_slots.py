@@ -54,18 +54,27 @@ class AliasSlots:
         """The version that answers if a request names none."""
         return self.get(league, CHAMPION)
 
-    def numbers(self, league: str) -> dict[str, int]:
-        """alias → the version that answers for it."""
-        return {alias: version.number for (of, alias), version in self._slots.items() if of == league}
+    def numbers(self) -> dict[str, dict[str, int]]:
+        """league → alias → the version that answers for it."""
+        numbers: dict[str, dict[str, int]] = {}
+        for (league, alias), version in self._slots.items():
+            numbers.setdefault(league, {})[alias] = version.number
+        return numbers
+
+    def differing(self) -> set[str]:
+        """The leagues that have an alias which does not answer with the version that it names."""
+        return {alias[0] for alias, number in self._wanted.items() if not self._serves(alias, number)}
 
     def is_served(self, alias: Alias) -> bool:
         """Whether an alias answers with the version that it names now."""
         return alias in self._wanted and self._serves(alias, self._wanted[alias])
 
-    def fault(self, league: str) -> str | None:
-        """Why aliases of the league are not served as the registry requires."""
-        faults = {alias: fault for (of, alias), fault in self._faults.items() if of == league}
-        return "; ".join(f"{alias}: {fault}" for alias, fault in sorted(faults.items())) or None
+    def faults(self) -> dict[str, str]:
+        """league → why aliases of it are not served as the registry requires."""
+        found: dict[str, list[str]] = {}
+        for (league, alias), fault in sorted(self._faults.items()):
+            found.setdefault(league, []).append(f"{alias}: {fault}")
+        return {league: "; ".join(faults) for league, faults in found.items()}
 
     def update(self, wanted: dict[Alias, int]) -> None:
         """Start to load the version that each alias names now, unless it is served. Each alias has its own load, which

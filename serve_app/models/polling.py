@@ -17,10 +17,21 @@ OVERDUE = 5.0
 
 
 class Polling:
-    """Calls `poll` in a task on the event loop. `subject` names the polled data in log lines: `aliases`."""
+    """Calls `poll` in a task on the event loop.
 
-    def __init__(self, poll: Callable[[], Awaitable[None]], subject: str, settings: ServeSettings) -> None:
+    subject: names the polled data in log lines: `aliases`. pause: waits for a number of seconds, or until there is a
+    reason to poll again.
+    """
+
+    def __init__(
+        self,
+        poll: Callable[[], Awaitable[None]],
+        subject: str,
+        settings: ServeSettings,
+        pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
+    ) -> None:
         self._poll = poll
+        self._wait = pause
         self._subject = subject
         self._settings = settings
         self._random = random.Random()
@@ -62,7 +73,7 @@ class Polling:
                 self._recover()
             finally:
                 overdue.cancel()
-            await asyncio.sleep(self._pause * self._random.uniform(1 - JITTER, 1 + JITTER))
+            await self._wait(self._pause * self._random.uniform(1 - JITTER, 1 + JITTER))
 
     def _report_overdue(self) -> None:
         """Log that a poll does not return: until the database answers or a timeout ends it, nothing is followed."""

@@ -11,7 +11,7 @@ from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
 from league.registry.registry import Registry
 from league.registry.storage.database import before
 from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.traffic_split import Headers, TrafficSplit
+from serve_app.models.traffic_split import Headers, TrafficSplit, acting
 from serve_app.models.version_cache import LoadedPolicy, LoadedVersion, VersionCache
 
 T = TypeVar("T")
@@ -37,7 +37,8 @@ class ModelResolver:
     ) -> tuple[LoadedVersion, LoadedPolicy]:
         """The version and policy of `model` (`{league}` or `{league}.{policy}`) at `version`, a number or an alias.
 
-        headers: those of the request; the caller's key may route a request for the champion to the canary. Raises
+        headers: those of the request; the caller's key may route a request for the champion to the canary, and selects
+        the member of a mixture. Raises
         InvalidReference, UnknownLeague, UnknownVersion, VersionRetired, UnknownAlias, UnknownPolicy, ArtifactCorrupt or
         StorageError; NotReady for a league without a champion.
         """
@@ -48,6 +49,8 @@ class ModelResolver:
             loaded = self._slots.get(ref.league, requested) or await self._resolve(ref.league, requested)
             if requested == CHAMPION and self._traffic.canaries:
                 loaded = self._traffic.route(loaded, headers)
+        if loaded.mixture is not None:
+            loaded = acting(loaded, headers)
         return loaded, loaded.policy(ref.policy)
 
     async def query(self, function: Callable[[Registry], T]) -> T:

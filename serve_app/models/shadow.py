@@ -27,7 +27,7 @@ from league.registry.storage.rows import ShadowCounts
 from league.seeds import generators
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.resolver import policy_ref
-from serve_app.models.traffic_split import TrafficSplit
+from serve_app.models.traffic_split import TrafficSplit, acting
 from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
@@ -101,8 +101,12 @@ class Shadow:
         target = self._traffic.shadows.get(version.league)
         if target is None or (target.share < 1 and random() >= target.share):
             return None
-        candidate = self._slots.get(version.league, target.slot)
-        if candidate is None or candidate is version or version is not self._slots.champion(version.league):
+        candidate, champion = self._slots.get(version.league, target.slot), self._slots.champion(version.league)
+        if candidate is None or champion is None or candidate is champion:
+            return None
+        if version is not champion and version not in champion.members:
+            return None
+        if (candidate := acting(candidate, ())) is version:
             return None
         policy = policy_ref(model).policy
 

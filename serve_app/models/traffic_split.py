@@ -1,15 +1,17 @@
-"""Splits traffic of a league between champion and canary, and selects the shadow.
+"""Splits traffic of a league between champion and canary and between the members of mixtures, and selects the shadow.
 
-The alias watcher reads the settings from the registry. The version of a canary or shadow has a slot like any alias; a
-version that is named by number has a slot under that number, which is not a valid alias.
+The registry watcher reads the settings. The version of a canary or shadow has a slot like any alias; a version that is
+named by number has a slot under that number, which is not a valid alias.
 """
 
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from random import random
 from typing import NamedTuple
 
 from league.refs import CHAMPION
+from league.registry.storage.mixture import episode_position
 from league.registry.storage.rows import Portion
 from league.registry.storage.rows import Traffic as Setting
 from serve_app.models.alias_slots import Alias, AliasSlots
@@ -53,6 +55,10 @@ class TrafficSplit:
             return None
         return setting.id
 
+    def differing(self) -> set[str]:
+        """The leagues whose setting names a version that is not loaded."""
+        return {league for league in self._settings if self.applied_setting(league) is None}
+
     def route(self, champion: LoadedVersion, headers: Headers) -> LoadedVersion:
         """The version that answers a request for a champion: the champion, or the canary if the caller's key is in its
         share.
@@ -61,7 +67,7 @@ class TrafficSplit:
         target = self.canaries.get(league)
         if target is None:
             return champion
-        key = next((value for name, value in headers if name == KEY), None)
+        key = key_of(headers)
         if key is None or key_position(league, key) >= target.share:
             return champion
         canary = self._slots.get(league, target.slot)
@@ -69,6 +75,20 @@ class TrafficSplit:
             return champion
         self.canary_requests[league, canary.number] += 1
         return canary
+
+
+def key_of(headers: Headers) -> bytes | None:
+    """The caller's key."""
+    return next((value for name, value in headers if name == KEY), None)
+
+
+def acting(version: LoadedVersion, headers: Headers) -> LoadedVersion:
+    """The version that acts: of a mixture, the member that the caller's key selects, and a random one without a key."""
+    if version.mixture is None:
+        return version
+    key = key_of(headers)
+    position = random() if key is None else episode_position(version.league, key)
+    return version.members[version.mixture.index_at(position)]
 
 
 def slots(setting: Setting) -> dict[Alias, int | None]:

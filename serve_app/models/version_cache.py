@@ -4,7 +4,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from league.policies.policy import Policy
 from league.policies.probes import Probes
 from league.registry.registry import Registry
 from league.registry.storage.manifest import PolicyManifest
+from league.registry.storage.mixture import Mixture
 from league.spaces import Box, Leaf
 from serve_app.codecs.observation_codec import ObservationReader
 from serve_app.codecs.request_limits import RequestLimits
@@ -48,6 +49,10 @@ class LoadedVersion:
     sha256: str
     """Digest of the version's manifest.json, which contains the digests of all its files."""
     policies: dict[str, LoadedPolicy]
+    mixture: Mixture | None = None
+    """The members of a mixture and their probabilities; None for other versions."""
+    members: tuple["LoadedVersion", ...] = ()
+    """Those of a mixture, in the same order. They act in its place."""
 
     def policy(self, name: str | None) -> LoadedPolicy:
         """A policy by name; None selects the only policy. Raises UnknownPolicy."""
@@ -64,7 +69,9 @@ class LoadedVersion:
 
 
 def load(registry: Registry, league: str, number: int, inline: float) -> LoadedVersion:
-    """Load a version. Blocks; `inline` is the time in seconds that inference may take on the event loop.
+    """Load a version, of a mixture without its members. Blocks.
+
+    inline: time in seconds that inference may take on the event loop.
 
     Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
     """
@@ -74,6 +81,8 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
             f"{version.ref} was retired and its files were removed: start a new episode with another version"
         )
     registry.artifacts.verify_names(league, number, version.sha256)
+    if version.mixture is not None:
+        return LoadedVersion(league, number, version.sha256, {}, version.mixture)
     is_sampled = registry.leagues.get(league).conditions.actions == "sampled"
     policies = {}
     for name, manifest in version.manifest.policies.items():
@@ -240,16 +249,30 @@ class VersionCache:
         if (version := self.cached(*key)) is not None:
             return version
         try:
-            version = await in_daemon_thread(self._load, *key)
+            version = await self._with_members(await in_daemon_thread(self._load, *key))
         except ArtifactCorrupt as error:
             self._corrupt[key] = (time.monotonic() + self._retry, error)
             raise
+        # Members that were evicted while the others were loaded are pinned from now on if their mixture is.
+        self._loaded |= {(member.league, member.number): member for member in version.members}
         self._loaded[key] = version
         self._evict()
         return version
 
+    async def _with_members(self, version: LoadedVersion) -> LoadedVersion:
+        """A mixture with its members, which are loaded one after the other to leave time for requests."""
+        if version.mixture is None:
+            return version
+        members = [await self._start((version.league, number)) for number in version.mixture.versions]
+        return replace(version, members=tuple(members))
+
     def _evict(self) -> None:
-        spare = [key for key in self._loaded if key not in self._pinned]
+        pinned = self._pinned | {
+            (member.league, member.number)
+            for key in self._pinned & self._loaded.keys()
+            for member in self._loaded[key].members
+        }
+        spare = [key for key in self._loaded if key not in pinned]
         for key in spare[: max(0, len(spare) - self._capacity)]:
             del self._loaded[key]
 

@@ -78,6 +78,14 @@ class Metrics:
         # Clients can name any league: only existing ones get a series of their own.
         self._errors[league if self._slots.knows(league) else "", code] += 1
 
+    def totals(self) -> dict[str, tuple[int, int]]:
+        """api → requests that were answered, and nanoseconds from their arrivals to their responses."""
+        totals: dict[str, tuple[int, int]] = {}
+        for (*_, api), served in self._served.items():
+            count, ns = totals.get(api, (0, 0))
+            totals[api] = count + served.latency.count, ns + served.latency.ns
+        return totals
+
     def report(self) -> Report:
         """All counts."""
         return self._requests() | self._state() | self._mirrored()
@@ -114,12 +122,19 @@ class Metrics:
         }
 
     def _state(self) -> Report:
-        leagues = self._slots.leagues()
+        leagues, numbers, faults = self._slots.leagues(), self._slots.numbers(), self._slots.faults()
         return {
             "league_live_version": [
-                [[league, alias], number] for league in leagues for alias, number in self._slots.numbers(league).items()
+                [[league, alias], number] for league in leagues for alias, number in numbers.get(league, {}).items()
             ],
-            "league_faults": [[[league], int(self._slots.fault(league) is not None)] for league in leagues],
+            "league_mixture_probability": [
+                [[league, alias, str(member.version)], member.probability]
+                for league in leagues
+                for alias in numbers.get(league, {})
+                if (version := self._slots.get(league, alias)) and version.mixture
+                for member in version.mixture.members
+            ],
+            "league_faults": [[[league], int(league in faults)] for league in leagues],
             "league_swaps_total": [[[league], self._slots.swaps[league]] for league in leagues],
             "league_requests_in_flight": [[[api], count] for api, count in self.in_flight.items()],
             "league_replica_start_time_seconds": [[[], self._started_at]],

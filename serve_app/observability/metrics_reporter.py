@@ -3,17 +3,14 @@
 import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from time import monotonic
 
 from league.errors import LeagueError
-from league.registry.registry import Registry
 from league.registry.storage.rows import ShadowCounts
-from serve_app.models.alias_watcher import SHUTDOWN_TIMEOUT
 from serve_app.models.polling import Polling
+from serve_app.models.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
 from serve_app.models.shadow import Shadow
 from serve_app.observability.disk_space import DiskSpace
 from serve_app.observability.metrics import Metrics, Report, Samples
@@ -77,7 +74,7 @@ class MetricsReporter:
 
     def __init__(
         self,
-        registry: Registry,
+        connection: RegistryConnection,
         metrics: Metrics,
         shadow: Shadow,
         in_flight: Callable[[], dict[str, int]],
@@ -85,7 +82,7 @@ class MetricsReporter:
         replica: str,
         settings: ServeSettings,
     ) -> None:
-        self._registry = registry
+        self._connection = connection
         self._metrics = metrics
         self._shadow = shadow
         self._in_flight = in_flight
@@ -93,10 +90,10 @@ class MetricsReporter:
         self._replica = replica
         slowest = max(settings.heartbeat, settings.poll_slowest)
         pace = settings.model_copy(update={"poll": settings.heartbeat, "poll_slowest": slowest})
-        self._polling = Polling(self.report, "reports", pace)
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="report")
+        self._polling = Polling(self._poll, "reports", pace)
         self._rates = RequestRates()
-        self._disks = DiskSpace(registry.storage)
+        self._last_rates: Samples = []
+        self._disks = DiskSpace(connection.storage)
         self._written: dict[tuple[str, int, int], ShadowCounts] = {}
 
     @asynccontextmanager
@@ -108,10 +105,14 @@ class MetricsReporter:
         finally:
             with suppress(LeagueError, TimeoutError):
                 await asyncio.wait_for(self.report(), SHUTDOWN_TIMEOUT)
-            self._thread.shutdown(wait=False, cancel_futures=True)
+
+    async def _poll(self) -> None:
+        self._last_rates = self._rates.since_last(self._metrics.report())
+        await self.report()
 
     async def report(self) -> None:
-        """Write all metrics, and the shadow counts that changed. Raises StorageError."""
+        """Write all metrics, the request rates of the last regular report, and the shadow counts that changed. Raises
+        StorageError."""
         self._polling.mark_ready()
         self._metrics.in_flight = self._in_flight()
         shadowings = [
@@ -120,7 +121,6 @@ class MetricsReporter:
             if self._written.get((one.league, one.candidate, one.champion)) != one
         ]
         report = self._metrics.report()
-        report |= {RATE: self._rates.since_last(report)} | self._disks.report() | self._further()
-        write = partial(self._registry.replicas.write_report, self._replica, report, shadowings)
-        await asyncio.get_running_loop().run_in_executor(self._thread, write)
+        report |= {RATE: self._last_rates} | self._disks.report() | self._further()
+        await self._connection.call(lambda registry: registry.replicas.write_report(self._replica, report, shadowings))
         self._written |= {(one.league, one.candidate, one.champion): one for one in shadowings}

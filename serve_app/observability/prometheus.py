@@ -42,6 +42,9 @@ METRICS = {
         ("code",),
     ),
     "league_live_version": MetricDefinition("gauge", "The version that answers for an alias.", ("league", "alias")),
+    "league_mixture_probability": MetricDefinition(
+        "gauge", "Probability of a member of the mixture that answers for an alias.", ("league", "alias", "version")
+    ),
     "league_faults": MetricDefinition("gauge", "1 while an alias is not served as the registry requires.", ("league",)),
     "league_swaps_total": MetricDefinition("counter", "Hot swaps of an alias to another version.", ("league",)),
     "league_requests_in_flight": MetricDefinition("gauge", "Requests in flight.", ("api",)),
@@ -53,6 +56,9 @@ METRICS = {
     ),
     "league_replica_start_time_seconds": MetricDefinition(
         "gauge", "Start time of the replica, in seconds since the epoch."
+    ),
+    "league_replica_load": MetricDefinition(
+        "gauge", "Load of the replica, by which the number of replicas is decided: 1 is a core."
     ),
     "league_replica_resident_bytes": MetricDefinition("gauge", "Resident memory of the replica process."),
     "league_disk_free_bytes": MetricDefinition(

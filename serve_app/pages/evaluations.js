@@ -64,16 +64,16 @@ export function NewEvaluation({ league, about }) {
         <label class="option"><input type="radio" name="kind" value="nightly" checked=${kind === "nightly"} onChange=${() => setKind("nightly")} />
           <span>Nightly run<small>Tests new versions, promotes the strongest and updates all ratings. Requires a key with the scope <code>promote</code>.</small></span></label>
       </fieldset>
-      ${kind === "tournament" && html`<${Tournament} league=${league} champion=${about.champion} />`}
+      ${kind === "tournament" && html`<${Tournament} league=${league} champion=${about.champion} baselines=${about.baselines} />`}
       <label class="field">Reason <input name="reason" maxlength="2000" placeholder="optional" /></label>
     <//>
   </section>`;
 }
 
-function Tournament({ league, champion }) {
+function Tournament({ league, champion, baselines }) {
   const [schedule, setSchedule] = useState("round_robin");
   const versions = useData(apiPath(league, "versions"));
-  const refs = versions.data && ["script:random", "script:one_ply", ...versions.data.versions.map((each) => `${league}@${each.version}`).reverse()];
+  const refs = versions.data && [...baselines, ...versions.data.versions.map((each) => `${league}@${each.version}`).reverse()];
   return html`
     <label class="field">Schedule <select name="schedule" value=${schedule} onChange=${(event) => setSchedule(event.target.value)}>
       ${SCHEDULES.map(([name, label]) => html`<option value=${name}>${label}</option>`)}</select></label>

@@ -17,13 +17,13 @@ export function signed(value, digits = 0) {
 /** Like `signed`, without a plus sign. */
 export const number = (value, digits = 2) => signed(value, digits).replace("+", "");
 
-/** Rounded to significant digits: `0.0123`, `1,234`, `4.8M`. */
+/** Rounded to significant digits, integers below 100,000 in full: `0.0123`, `61,440`, `4.8M`. */
 export function short(value) {
   if (value == null) return NONE;
   const size = Math.abs(value);
   if (size >= 1e15 || (size > 0 && size < 1e-3)) return value.toExponential(2).replaceAll("-", "−");
   if (size >= 1e5) return compact.format(value).replace("-", "−");
-  return counts.format(Number(value.toPrecision(4))).replace("-", "−");
+  return counts.format(Number.isInteger(value) ? value : Number(value.toPrecision(4))).replace("-", "−");
 }
 
 export const percent = (share, digits = 1) => {
@@ -31,6 +31,9 @@ export const percent = (share, digits = 1) => {
   const rounded = (100 * share).toFixed(digits);
   return `${share && Number(rounded) === 0 ? (100 * share).toPrecision(2) : rounded} %`;
 };
+
+/** The members of a mixture: `60 % @3, 40 % @5`. */
+export const mixture = (members) => members.map((each) => `${percent(each.probability, 0)} @${each.version}`).join(", ");
 
 /** An interval; a null bound is infinite. */
 export function interval(bounds) {
@@ -47,6 +50,9 @@ export function shortRef(ref) {
   const text = String(ref);
   return text.startsWith("script:") || text.includes("://") ? text : `@${text.slice(text.indexOf("@") + 1)}`;
 }
+
+/** The short id of a verdict, which the commands accept: "connect_four-verdict-0f3a62d1c8b45e97-1b2c3d4e" → "0f3a62d1". */
+export const shortVerdict = (verdict) => verdict.split("-verdict-").at(-1).slice(0, 8);
 
 const medium = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", year: "numeric", hour: "2-digit", minute: "2-digit" });
 const full = new Intl.DateTimeFormat("en-GB", { dateStyle: "full", timeStyle: "long" });

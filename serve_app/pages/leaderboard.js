@@ -4,21 +4,24 @@ import { html } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
 import { useChangeToken, useOffsetList } from "./data.js";
 import { Await, EmptyState, leaguePath, Ref, ShowMore, Table } from "./components.js";
+import { EarlierResults } from "./earlier.js";
 import { Term } from "./term.js";
 import { useAddress } from "./router.js";
 import { count, interval, number, percent, plural, signed } from "./format.js";
 
 export function Leaderboard({ league, about }) {
-  const side = useAddress().parameters.get("side");
-  const rows = useOffsetList(query(apiPath(league, "leaderboard"), { side }), "leaderboard", useChangeToken("computed_at", "aliases"));
+  const { parameters } = useAddress();
+  const [side, game] = [parameters.get("side"), parameters.get("game")];
+  const rows = useOffsetList(query(apiPath(league, "leaderboard"), { side, game }), "leaderboard", useChangeToken("computed_at", "aliases"));
   const sides = rows.page?.sides ?? [];
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Leaderboard</h2>
       ${sides.length > 1 && html`<nav class="choice" aria-label="Sides"><ul>
-        <li><a href=${leaguePath(league)} aria-current=${side ? null : "true"}>All sides</a></li>
-        ${sides.map((each) => html`<li><a href=${query(leaguePath(league), { side: each })} aria-current=${each === side ? "true" : null}>${each}</a></li>`)}
+        <li><a href=${query(leaguePath(league), { game })} aria-current=${side ? null : "true"}>All sides</a></li>
+        ${sides.map((each) => html`<li><a href=${query(leaguePath(league), { side: each, game })} aria-current=${each === side ? "true" : null}>${each}</a></li>`)}
       </ul></nav>`}
     </div>
+    <${EarlierResults} league=${league} summary=${about.summary} game=${game} />
     <${Await} result=${rows}>${rows.items && html`<${Rows} league=${league} rows=${rows.items} champion=${about.champion} computedAt=${rows.page.computed_at} />`}<//>
     <${ShowMore} list=${rows} />
     ${rows.items?.length > 0 && html`<p class="muted small">${plural(rows.page.total, "contestant")}. Ratings are Elo above <code>script:random</code>, with 95 % intervals.</p>`}

@@ -10,6 +10,7 @@ import { History } from "./history.js";
 import { Matches } from "./matches.js";
 import { Match } from "./match.js";
 import { Await, Badge, EmptyState, leaguePath, Properties, sentence, Time, useTitle } from "./components.js";
+import { Nights } from "./nights.js";
 import { Payoff } from "./payoff.js";
 import { Play } from "./play.js";
 import { Promotions } from "./promotion.js";
@@ -19,7 +20,7 @@ import { Leaderboard } from "./leaderboard.js";
 import { Traffic } from "./traffic.js";
 import { Verdict, Verdicts } from "./verdicts.js";
 import { Versions } from "./versions.js";
-import { count, rate } from "./format.js";
+import { count, mixture, rate } from "./format.js";
 
 const TABS = [
   ["Leaderboard", "", Leaderboard],
@@ -30,6 +31,7 @@ const TABS = [
   ["Traffic", "traffic", Traffic],
   ["Evaluations", "evaluations", Evaluations],
   ["Training", "runs", Runs],
+  ["Nights", "nights", Nights],
   ["Play", "play", Play],
 ];
 
@@ -105,12 +107,12 @@ function Summary({ about, isFirst }) {
   const faults = about.faults ?? [];
   return html`
     <${Properties} items=${[
-      ["Champion", about.champion == null ? "none" : html`<span class="ref">${league}@${about.champion}</span>`, "name"],
+      ["Champion", about.champion == null ? "none" : html`<span class="ref">${league}@${about.champion}</span>${about.mixtures?.champion && html` <span class="muted small">${mixture(about.mixtures.champion)}</span>`}`, "name"],
       ["Environment", html`<span class="path">${about.environment}</span>`, "name"],
       ["Games", count(summary?.games)],
       ["Unique games", count(summary?.unique_games)],
       about.requests_per_second != null && ["Requests/s", rate(about.requests_per_second)],
-      ["Last updated", html`<${Time} at=${about.computed_at} />${about.computed_at && !about.up_to_date && html`<small>updating</small>`}`],
+      ["Last updated", html`<span class="nowrap"><${Time} at=${about.computed_at} /></span>${about.computed_at && !about.up_to_date && html`<small>updating</small>`}`],
     ]} cls=${isFirst ? "" : "aside"} />
     ${faults.length > 0 && html`<div class="notice bad" role="alert"><p><strong>A replica does not serve the expected version.</strong></p>
       <ul>${faults.map((fault) => html`<li>${fault}</li>`)}</ul></div>`}`;

@@ -31,7 +31,7 @@ function List({ leagues }) {
 function Row({ row }) {
   const { league, last_verdict: verdict } = row;
   return html`<tr>
-    <th scope="row"><a href=${leaguePath(league)}>${league}</a></th>
+    <th scope="row"><a href=${leaguePath(league)}>${league}</a>${row.archived_at && html` <span class="muted small">archived</span>`}</th>
     <td data-label="Champion">${row.champion == null ? html`<span class="muted">none</span>` : html`<span class="ref">@${row.champion}</span>`}</td>
     <td class="number" data-label="Versions">${count(row.versions)}</td>
     <td data-label="Last verdict">${verdict ? html`<a class="plain-link" href=${leaguePath(league, "verdicts", verdict.verdict)}>

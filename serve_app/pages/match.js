@@ -29,7 +29,7 @@ function Games({ league, match, schedule, position }) {
   return html`<${Table} caption="Games" head=${[["Game"], ...sides.map((side) => [side]), ["Scores"], ["Returns"], ["Actions", "number"], ["Forfeits"]]} cls="full">
     ${match.games.map((game) => html`<tr key=${game.game}>
       <th scope="row"><a href=${leaguePath(league, "matches", schedule, position, game.game)}>Game ${game.game}</a></th>
-      ${sides.map((side) => html`<td><span class="ref">${shortRef(game.sides[side])}</span></td>`)}
+      ${sides.map((side) => html`<td><span class="ref">${shortRef(game.sides[side])}</span>${game.members[game.sides[side]] && html` <span class="muted">(${shortRef(game.members[game.sides[side]])})</span>`}</td>`)}
       <td class="nowrap">${numbers(game.scores)}</td><td class="nowrap">${numbers(game.returns)}</td><td class="number">${count(game.actions)}</td>
       <td class="wrap">${game.forfeits.map((each) => `${shortRef(each.ref)}: ${each.reason}`).join("; ") || html`<span class="muted">–</span>`}</td></tr>`)}
   <//>`;

@@ -4,23 +4,26 @@ import { html } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
 import { useChangeToken, useData } from "./data.js";
 import { Await, EmptyState, leaguePath } from "./components.js";
+import { EarlierResults } from "./earlier.js";
 import { useAddress } from "./router.js";
 import { plural, shortRef } from "./format.js";
 
 const SHADES = 11;
 
 export function Payoff({ league, about }) {
-  const payoff = useData(apiPath(league, "payoff"), useChangeToken("computed_at"));
-  const side = useAddress().parameters.get("side");
+  const { parameters } = useAddress();
+  const [side, game] = [parameters.get("side"), parameters.get("game")];
+  const payoff = useData(query(apiPath(league, "payoff"), { game }), useChangeToken("computed_at"));
   const table = payoff.data && (payoff.data.payoff ?? (payoff.data.contestants ? payoff.data : null));
   const sides = Object.keys(table?.by_side ?? {});
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Payoff matrix</h2>
       ${sides.length > 1 && html`<nav class="choice" aria-label="Sides"><ul>
-        <li><a href=${leaguePath(league, "payoff")} aria-current=${side ? null : "true"}>All games</a></li>
-        ${sides.map((each) => html`<li><a href=${query(leaguePath(league, "payoff"), { side: each })} aria-current=${each === side ? "true" : null}>as ${each}</a></li>`)}
+        <li><a href=${query(leaguePath(league, "payoff"), { game })} aria-current=${side ? null : "true"}>All games</a></li>
+        ${sides.map((each) => html`<li><a href=${query(leaguePath(league, "payoff"), { side: each, game })} aria-current=${each === side ? "true" : null}>as ${each}</a></li>`)}
       </ul></nav>`}
     </div>
+    <${EarlierResults} league=${league} summary=${about.summary} game=${game} page="payoff" />
     <${Await} result=${payoff}>${payoff.data && (table
       ? html`<${Heatmap} league=${league} payoff=${table} scores=${table.by_side?.[side] ?? table.score} champion=${about.champion} />`
       : html`<${EmptyState}>No games yet. <a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to compare the versions.<//>`)}<//>

@@ -6,7 +6,7 @@ import { Chart, DataTable } from "./chart.js";
 import { useChangeToken, useData, useList } from "./data.js";
 import { Await, EmptyState, leaguePath, Outcome, Properties, ShowMore, Table, Time, useTitle } from "./components.js";
 import { Term } from "./term.js";
-import { count, interval, number, percent, shortRef, signed } from "./format.js";
+import { count, interval, number, percent, shortRef, shortVerdict, signed } from "./format.js";
 
 export function Verdicts({ league }) {
   const verdicts = useList(apiPath(league, "verdicts"), "verdicts", useChangeToken("verdicts", "computed_at"));
@@ -48,6 +48,7 @@ export function Verdict({ league, verdict }) {
       <${Statistics} league=${league} verdict=${loaded} />
       ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
       ${loaded.exploiters?.length > 0 && html`<${Exploiters} exploiters=${loaded.exploiters} />`}
+      ${loaded.exploitability && html`<${Exploitability} test=${loaded.exploitability} candidate=${loaded.candidate} />`}
       ${loaded.confirmation && html`<${Confirmation} match=${loaded.confirmation} />`}`}
     <//>
   </section>`;
@@ -71,6 +72,7 @@ function Statistics({ league, verdict }) {
   const unit = verdict.model === "returns" ? "return" : "Elo";
   const difference = verdict.difference;
   return html`<${Properties} items=${[
+      ["Verdict", html`<code>${shortVerdict(verdict.verdict)}</code>`],
       ["Games", html`<a href=${query(leaguePath(league, "matches"), { first: verdict.candidate, second: verdict.opponent })}>${count(verdict.games)}</a>`],
       verdict.unique_games != null && ["Unique games", count(verdict.unique_games)],
       [html`<${Term} name="block">Blocks<//>`, count(verdict.blocks)],
@@ -110,6 +112,22 @@ function Exploiters({ exploiters }) {
         <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${percent(each.score)}</td><td class="number">${percent(each.champion_score)}</td>
         <td class="number">${each.difference && html`${signed(each.difference.mean, 3)} <small>${number(each.difference.low, 3)} to ${number(each.difference.high, 3)}</small>`}</td></tr>`)}
     <//>`;
+}
+
+function Exploitability({ test, candidate }) {
+  const bounds = [test.candidate, test.champion].filter(Boolean);
+  const rows = bounds.flatMap((side) => side.exploiters.map((each) => [side, each]));
+  const gap = (difference) => `${signed(difference.mean, 3)}${difference.low == null ? "" : ` (${signed(difference.low, 3)} to ${signed(difference.high, 3)})`}`;
+  const name = "Learned exploitability";
+  return html`<h3>${name}</h3>
+    <p><span class="ref">${candidate}</span> is ${test.outcome} than <span class="ref">${test.ref}</span> by ${test.margin} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
+      ${bounds.map((side) => html` A best response to <span class="ref">${side.ref}</span> scores at least ${percent(side.bound)}.`)}</p>
+    ${test.difference && html`<p>The exploiters of the candidate achieve ${gap(test.difference)} more than those of the champion.
+      The 95 % interval is for these exploiters; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}.</p>`}
+    ${rows.length > 0 && html`<${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"]]}>
+      ${rows.map(([side, each]) => html`<tr key=${each.ref}><th scope="row"><span class="ref">${side.ref}</span></th><td><span class="ref">${each.ref}</span></td>
+        <td class="number">${count(each.games)}</td><td class="number">${percent(each.score)}</td><td class="nowrap">${percent(each.low)} to ${percent(each.high)}</td></tr>`)}
+    <//>`}`;
 }
 
 function Confirmation({ match }) {

@@ -3,6 +3,7 @@
     GET   /v1/leagues/{league}/aliases/{alias}/history    newest first; ?limit= &before=
                                                           ?at=2026-03-03T14:00:00Z: the event in force at that time
     POST  /v1/leagues/{league}/aliases/{alias}   {"version": 3, "expected": 2, "reason": "…"}
+                                                          {"members": [{"version": 3, "probability": 0.6}, …]}
     POST  /v1/leagues/{league}/rollback          {"expected": 3, "reason": "…"}
 
 POST requires an API key of scope `promote`, whose name becomes the actor in the history, and an `Idempotency-Key`: a
@@ -12,9 +13,9 @@ condition.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
@@ -29,12 +30,41 @@ from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import parsing
 
+MAX_MEMBERS = 100
+"""Members of a mixture."""
 
-class PromotionBody(parsing.ChangeBody):
-    """The body of a promotion."""
+
+class MemberBody(BaseModel):
+    """A member of a mixture."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     version: int = Field(ge=1, le=MAX_VERSION)
+    probability: float = Field(gt=0, le=1)
+
+
+class PromotionBody(parsing.ChangeBody):
+    """The body of a promotion, of a version or of a mixture."""
+
+    version: int | None = Field(default=None, ge=1, le=MAX_VERSION)
+    members: list[MemberBody] | None = Field(default=None, max_length=MAX_MEMBERS)
     expected: int | None = Field(default=None, ge=1, le=MAX_VERSION)
+
+    @model_validator(mode="after")
+    def _has_one_target(self) -> Self:
+        if (self.version is None) == (self.members is None):
+            raise ValueError("expected either version, or members with their probabilities")
+        numbers = [member.version for member in self.members or ()]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError("members: a version is named twice")
+        return self
+
+    def target(self, registry: Registry, league: str) -> int:
+        """The version to promote; a mixture is published. Raises the errors of `publish_mixture`."""
+        if self.version is not None:
+            return self.version
+        shares = {member.version: member.probability for member in self.members or ()}
+        return registry.publisher.publish_mixture(league, shares).number
 
 
 class RollbackBody(parsing.ChangeBody):
@@ -66,9 +96,10 @@ class AliasRoutes:
         return await parsing.query_response(self._models, query)
 
     async def move(self, request: Request) -> JSONResponse:
-        """Point an alias at a version.
+        """Point an alias at a version or a mixture.
 
-        Raises UnknownLeague, UnknownVersion, NotPromotable, AliasMoved, KeyReused or InvalidInput.
+        Raises UnknownLeague, UnknownVersion, VersionRetired, NotPromotable, EnvironmentMismatch, AliasMoved,
+        KeyReused or InvalidInput.
         """
         league = check_slug("league", request.path_params["league"])
         alias = check_alias(request.path_params["alias"])
@@ -77,7 +108,13 @@ class AliasRoutes:
 
         def change(registry: Registry, actor: str, call: IdempotentCall) -> AliasEvent:
             return registry.aliases.set(
-                league, alias, body.version, expected=expected, actor=actor, reason=body.reason, call=call
+                league,
+                alias,
+                body.target(registry, league),
+                expected=expected,
+                actor=actor,
+                reason=body.reason,
+                call=call,
             )
 
         return await self._apply(request, body, change)

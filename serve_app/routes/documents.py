@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from league.registry.storage.mixture import Mixture
 from league.registry.storage.rows import EvaluationRow, Portion, Traffic, VerdictRow
 
 OPEN = "open"
@@ -40,6 +41,11 @@ def verdict_summary(row: VerdictRow) -> dict[str, Any]:
         "opened_at": row.opened_at.isoformat(),
         "closed_at": row.closed_at and row.closed_at.isoformat(),
     }
+
+
+def members_document(mixture: Mixture) -> list[dict[str, Any]]:
+    """The members of a mixture as JSON."""
+    return [{"version": member.version, "probability": member.probability} for member in mixture.members]
 
 
 def traffic_document(setting: Traffic) -> dict[str, Any]:

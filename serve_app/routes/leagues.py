@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from league.policies.loading import baselines
 from league.refs import CHAMPION, CheckpointRef, check_slug, parse_version
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
@@ -90,7 +91,8 @@ def _is_paged(request: Request) -> bool:
 
 def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[str, Any]:
     """At most `limit` leagues by name, after the cursor."""
-    names = sorted(row.slug for row in registry.leagues.all() if before is None or row.slug > before)
+    archived = registry.leagues.names()
+    names = sorted(name for name in archived if before is None or name > before)
     page, more = parsing.paginate(names, len(names) if limit is None else limit, lambda name: name)
     aliases: dict[str, dict[str, int]] = {league: {} for league in page}
     for (league, alias), target in registry.aliases.all().items():
@@ -113,6 +115,7 @@ def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[
             "last_verdict": documents.verdict_summary(verdicts[league]) if league in verdicts else None,
             "running_evaluations": sum(evaluations.get(league, {}).values()),
             "running_runs": runs.get(league, 0),
+            "archived_at": (at := archived[league]) and at.isoformat(),
         } | _requests(counts.get(league, NO_REQUESTS))
 
     return {"leagues": [document(league, found) for league, found in aliases.items()], "next": more}
@@ -121,6 +124,7 @@ def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[
 def _league(registry: Registry, league: str) -> dict[str, Any]:
     row = registry.leagues.get(league)
     aliases = registry.aliases.current(league)
+    mixtures = registry.versions.mixtures(league, set(aliases.values()))
     acknowledgements = registry.replicas.acknowledgements(league)
     counts = request_counts(registry.replicas.reports().values())
     summary = registry.snapshots.get(league, SUMMARY)
@@ -131,8 +135,14 @@ def _league(registry: Registry, league: str) -> dict[str, Any]:
         "actions": row.conditions.actions,
         "champion": aliases.get(CHAMPION),
         "aliases": aliases,
+        "mixtures": {
+            alias: documents.members_document(mixtures[number])
+            for alias, number in aliases.items()
+            if number in mixtures
+        },
         "policies": {policy: interface.of_policy(policy).model_dump(mode="json") for policy in interface.policy_ids},
         "agents": interface.policies,
+        "baselines": baselines(row.config, interface),
         "replicas": list(map(_replica, acknowledgements)),
         "faults": sorted({each.fault for each in acknowledgements if each.fault}),
         "traffic": documents.traffic_document(registry.traffic.current(league)),
@@ -172,6 +182,7 @@ def version_document(row: VersionRow) -> dict[str, Any]:
         "parent": row.parent,
         "role": row.role,
         "exploits": row.exploits,
+        "members": row.mixture and documents.members_document(row.mixture),
         "steps": row.steps,
         "algorithm": row.manifest.algorithm,
         "policies": list(row.manifest.policies),

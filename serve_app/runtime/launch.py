@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -24,11 +24,13 @@ from pydantic import ValidationError
 
 from league import errors
 from league.errors import AlreadyRunning, ConfigError, LeagueError, NotReady, last_line, one_line
-from league.ray_cluster import LocalRay, join, node_addresses, ray_session, start_local
+from league.ray_cluster import LocalRay, check_stacks, join, node_addresses, ray_session, start_local, usable_cpus
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.subprocesses import Subprocess, when_parent_ends
-from serve_app.runtime import haproxy, ray_serve
+from serve_app.runtime import haproxy, haproxy_script, ray_serve
+from serve_app.runtime.autoscaling import LoadPolicy
+from serve_app.runtime.starting_page import starting_page
 from serve_app.settings import ServeSettings, is_exposed
 
 DEPLOY_YAML = Path(__file__).parent.parent / "deploy.yaml"
@@ -47,10 +49,11 @@ def serve_forever(
     port: int | None = None,
     grpc_port: int | None = None,
     replicas: int | None = None,
+    max_replicas: int | None = None,
     insecure: bool = False,
     address: str | None = None,
     deploy: Path = DEPLOY_YAML,
-    on_ready: Callable[[str], None] | None = None,
+    on_ready: Callable[[str, Path], None] | None = None,
 ) -> None:
     """Serve the leagues of `storage` until SIGINT or SIGTERM, then shut down. Prints nothing.
 
@@ -61,12 +64,14 @@ def serve_forever(
         host: Address to listen on; None for that of `deploy`.
         port: HTTP port; None for that of `deploy`.
         grpc_port: gRPC port; None for that of `deploy`.
-        replicas: Number of replicas; None for that of `deploy`.
+        replicas: Number of replicas, or the minimum if `max_replicas` is larger; None for that of `deploy`.
+        max_replicas: Maximum number of replicas, which then follows the load; None for `replicas`, or that of `deploy`.
         insecure: Accept requests without an API key, even from other machines.
         address: A running Ray cluster to serve on, whose nodes have the environment that deploy.yaml lists, as has this
             process. None starts a Ray on the loopback interface.
         deploy: The deploy.yaml.
-        on_ready: Called once with the base URL (`http://127.0.0.1:8000`) when every replica answers.
+        on_ready: Called once when every replica answers, with the base URL (`http://127.0.0.1:8000`) and the directory
+            of Ray's logs on this machine.
 
     Raises:
         ConfigError: deploy.yaml is invalid, the cluster is unreachable or cannot reach the storage, or other machines
@@ -77,7 +82,7 @@ def serve_forever(
     """
     if "ray" in sys.modules:
         raise RuntimeError("serve_forever must set Ray's environment before ray is imported")
-    document = load_document(deploy, host, port, grpc_port, replicas, insecure)
+    document = load_document(deploy, host, port, grpc_port, replicas, max_replicas, insecure)
     _check_exposure(document, storage)
     storage.export()
     try:
@@ -98,6 +103,7 @@ def running(
     port: int = 0,
     grpc_port: int = 0,
     replicas: int | None = None,
+    max_replicas: int | None = None,
     insecure: bool = False,
     deploy: Path = DEPLOY_YAML,
     timeout: float = START_TIMEOUT,
@@ -109,7 +115,8 @@ def running(
         host: Address to listen on.
         port: HTTP port; 0 for a free one.
         grpc_port: gRPC port; 0 for a free one.
-        replicas: Number of replicas; None for that of `deploy`.
+        replicas: As for `serve_forever`.
+        max_replicas: As for `serve_forever`.
         insecure: Accept requests without an API key.
         deploy: The deploy.yaml.
         timeout: Seconds until every replica must answer.
@@ -129,6 +136,7 @@ def running(
         "port": port or free[0],
         "grpc_port": grpc_port or free[1],
         "replicas": replicas,
+        "max_replicas": max_replicas,
         "insecure": insecure,
     }
     order = json.dumps({"deploy": str(deploy), "arguments": arguments})
@@ -141,7 +149,13 @@ def running(
 
 
 def load_document(
-    deploy: Path, host: str | None, port: int | None, grpc_port: int | None, replicas: int | None, insecure: bool
+    deploy: Path,
+    host: str | None,
+    port: int | None,
+    grpc_port: int | None,
+    replicas: int | None,
+    max_replicas: int | None,
+    insecure: bool,
 ) -> dict[str, Any]:
     """deploy.yaml with the caller's overrides. Raises ConfigError."""
     try:
@@ -150,8 +164,7 @@ def load_document(
         http |= {"host": host or http["host"], "port": port or http["port"]}
         if grpc_port is not None and "grpc_options" in document:
             document["grpc_options"]["port"] = grpc_port
-        if replicas is not None:
-            application["deployments"][0]["num_replicas"] = replicas
+        _set_replicas(application["deployments"][0], replicas, max_replicas)
         if insecure:
             application["args"] = application.get("args", {}) | {"require_keys": "never"}
     except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
@@ -160,6 +173,32 @@ def load_document(
             f"{deploy}: expected http_options with host and port, and one application: {reason}"
         ) from error
     return document
+
+
+def _set_replicas(deployment: dict[str, Any], replicas: int | None, max_replicas: int | None) -> None:
+    """Set the bounds of the number of replicas, or a fixed number. Raises ConfigError and LookupError."""
+    bounds = deployment.get("autoscaling_config")
+    if bounds is None:
+        if max_replicas is not None:
+            raise ConfigError("--max-replicas: deploy.yaml has num_replicas; replace it by autoscaling_config")
+        if replicas is not None:
+            deployment["num_replicas"] = replicas
+        return
+    if replicas is not None:
+        bounds |= {"min_replicas": replicas, "max_replicas": replicas}
+    if max_replicas is not None:
+        bounds["max_replicas"] = max_replicas
+    lowest, highest = (int(bounds.get(name, 1)) for name in ("min_replicas", "max_replicas"))
+    if lowest < 1:
+        raise ConfigError(f"deploy.yaml: min_replicas must be at least 1, got {lowest}")
+    if highest < lowest:
+        raise ConfigError(f"--max-replicas must be at least {lowest}, as --replicas or min_replicas, got {highest}")
+    policy = bounds.get("policy", {})
+    if policy.get("policy_function") == f"{LoadPolicy.__module__}:{LoadPolicy.__name__}":
+        try:
+            LoadPolicy(**policy.get("policy_kwargs", {}))  # Ray's controller would fail with a traceback
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"deploy.yaml: policy_kwargs: {one_line(error)}") from error
 
 
 def _settings(document: dict[str, Any]) -> ServeSettings:
@@ -186,33 +225,34 @@ def _check_exposure(document: dict[str, Any], storage: Storage) -> None:
         )
 
 
-def _serve_locally(document: dict[str, Any], on_ready: Callable[[str], None] | None) -> None:
+def _serve_locally(document: dict[str, Any], on_ready: Callable[[str, Path], None] | None) -> None:
     """Serve on a local Ray."""
     host, port = document["http_options"]["host"], document["http_options"]["port"]
     grpc = document.get("grpc_options", {})
-    with haproxy.private_directory() as directory:
-        for wanted in (port, grpc["port"]) if grpc else (port,):
+    with haproxy.private_directory() as directory, ExitStack() as until_stopped:
+        for option, wanted in [("--port", port), *([("--grpc-port", grpc["port"])] if grpc else [])]:
             if not haproxy.is_free(host, wanted):
-                raise AlreadyRunning(f"port {wanted} of {host} is in use: is another server running?")
+                raise AlreadyRunning(
+                    f"port {wanted} of {host} is in use: stop the other server, or choose another with {option}"
+                )
+        binary = haproxy_script.find_haproxy()
+        if binary is not None:  # otherwise `check_haproxy` raises
+            until_stopped.enter_context(starting_page(directory, binary, host, port, grpc.get("port")))
         largest = {"RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(_settings(document).max_body)}
         for name, value in (haproxy.environment(directory) | largest).items():
             os.environ.setdefault(name, value)
         ray_serve.check_haproxy()
-        import ray
-
-        with ray_session():
+        with ray_session(), _errors_of_ray():
             try:
-                resources = LocalRay(cpus=max(2, os.cpu_count() or 2), object_store=OBJECT_STORE)
+                resources = LocalRay(cpus=max(2, usable_cpus()), object_store=OBJECT_STORE)
                 start_local(resources, namespace="serve", _node_ip_address="127.0.0.1")
                 _deploy(document, on_ready)
-            except ray.exceptions.RayError as error:
-                raise NotReady(f"Ray Serve did not start: {last_line(str(error))}") from error
             finally:
                 haproxy.stop(directory)  # before Ray: it stops accepting requests and finishes those in progress
 
 
 def _serve_on_cluster(
-    address: str, storage: Storage, document: dict[str, Any], on_ready: Callable[[str], None] | None
+    address: str, storage: Storage, document: dict[str, Any], on_ready: Callable[[str, Path], None] | None
 ) -> None:
     """Serve on a running cluster."""
     from ray import serve
@@ -220,10 +260,11 @@ def _serve_on_cluster(
     storage.check_no_password("Ray's dashboard")
     (application,) = document["applications"]
     application["runtime_env"] = {"env_vars": storage.environment}
-    with ray_session():
+    with ray_session(), _errors_of_ray():
         join(address, namespace="serve")
         nodes = node_addresses()
         storage.check_reach(nodes)
+        check_stacks()
         if len(nodes) > 1:  # HAProxy of each node calls all replicas
             application["args"] = {"grpc_local_only": False} | application.get("args", {})
         try:
@@ -232,7 +273,7 @@ def _serve_on_cluster(
             serve.delete(application["name"])
 
 
-def _deploy(document: dict[str, Any], on_ready: Callable[[str], None] | None) -> NoReturn:
+def _deploy(document: dict[str, Any], on_ready: Callable[[str, Path], None] | None) -> NoReturn:
     """Deploy, and wait for a signal, which raises KeyboardInterrupt."""
     from ray.serve.schema import ServeDeploySchema
 
@@ -247,7 +288,7 @@ def _deploy(document: dict[str, Any], on_ready: Callable[[str], None] | None) ->
     (application,) = schema.applications
     _await_replicas(application.name, application.deployments[0].name, url.replace("0.0.0.0", "127.0.0.1"))
     if on_ready is not None:
-        on_ready(url)
+        on_ready(url, ray_serve.log_directory())
     while True:
         signal.pause()
 
@@ -283,6 +324,17 @@ def _reason(status: Any) -> str:
     """The last line of the status messages of an application and its deployments."""
     messages = [status.message, *(deployment.message for deployment in status.deployments.values())]
     return last_line("\n".join(messages)) or str(status.status)
+
+
+@contextmanager
+def _errors_of_ray() -> Iterator[None]:
+    """Make an error of Ray a NotReady."""
+    import ray
+
+    try:
+        yield
+    except (ray.exceptions.RayError, TimeoutError) as error:
+        raise NotReady(f"Ray Serve did not start: {last_line(str(error))}") from error
 
 
 @contextmanager
@@ -328,7 +380,7 @@ def main() -> None:
         serve_forever(
             Storage.from_environment(),
             deploy=Path(order["deploy"]),
-            on_ready=lambda url: print(json.dumps({"url": url}), file=announce),
+            on_ready=lambda url, _: print(json.dumps({"url": url}), file=announce),
             **order["arguments"],
         )
     except LeagueError as error:

@@ -6,7 +6,8 @@ checks that the upstream code is still as it is used here.
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from league.errors import NotReady
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 # A child of Ray Serve's logger, so that its lines reach the replica's log file regardless of Serve's own log level.
 logger = logging.getLogger("ray.serve.policy_league")
 logger.setLevel(logging.INFO)
+
+
+RUNNING_REQUESTS = "running_requests"
+"""Ray Serve's statistic of requests in progress in a replica. One that the replica records takes its place."""
 
 
 class AsgiReplica(ABC):
@@ -38,6 +43,18 @@ def replica_id() -> str:
     from ray import serve
 
     return serve.get_replica_context().replica_id.unique_id
+
+
+def request_counter() -> Callable[[str, int], None]:
+    """Adds requests of a route to Ray Serve's count of the requests of this replica, which Ray's dashboard shows.
+
+    Requests that bypass Serve are not in it otherwise.
+    """
+    from ray.serve.metrics import Counter
+
+    # The name and the labels are those of Serve's own counter.
+    counter = Counter("serve_deployment_request_counter", tag_keys=("route",))
+    return lambda route, count: counter.inc(count, {"route": route}) if count else None
 
 
 def replica_process() -> ReplicaProcess:
@@ -78,6 +95,13 @@ def listening_host() -> str:
     from ray.serve.context import _get_global_client
 
     return str(_get_global_client().http_config.host)
+
+
+def log_directory() -> Path:
+    """The directory on this machine to which the Ray of this process and its workers write their logs."""
+    from ray._private.worker import global_worker
+
+    return Path(global_worker.node.get_logs_dir_path())
 
 
 def deploy(schema: "ServeDeploySchema") -> None:

@@ -8,7 +8,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
 from tests.support.clients.browsers import Served, Tab
-from tests.support.leagues.browser_leagues import CONNECT_FOUR, EMPTY, RUN, verdict_between_versions
+from tests.support.leagues.browser_leagues import CONNECT_FOUR, EMPTY, NAMED, RUN, verdict_between_versions
 from tests.support.leagues.tictactoe import LEAGUE
 
 pytestmark = pytest.mark.slow  # a browser and a server take all cores
@@ -31,7 +31,16 @@ PAGES = {
     f"{L}/evaluations": (r"No evaluations yet|#\d",),
     f"{L}/evaluations/new": (r"Contestants: all versions", r"Maximum minutes"),
     f"{L}/runs": (RUN, r"7\d %"),
-    f"{L}/runs/{RUN}": (r"2\d,000 of 40,000", r"entropy", r"Show all metrics"),
+    f"{L}/runs/{RUN}": (
+        r"2\d,000 of 40,000",
+        r"Strength.*against script:random",
+        r"Opponents.*@1\s*30\.0 %",
+        r"entropy",
+        r"Show all metrics",
+    ),
+    f"{L}/nights": (r"Strength", r"Learned exploitability", r"60\.0 %\s*50\.0 % to 90\.0 %"),
+    f"/leagues/{NAMED}": (r"The game of this league has changed", r"2 matches", r"play\.opening_plies: 4 → 0"),
+    f"/leagues/{NAMED}/payoff": (r"The game of this league has changed", r"No games yet"),
     f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your agent"),
     f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
     f"{L}/nothing": (r"Page not found",),
@@ -90,6 +99,18 @@ def test_the_note_dialog(tab: Tab) -> None:
     page.get_by_role("button", name=f"Edit the note of {LEAGUE}@2").click()
     expect(page.get_by_role("dialog", name=f"Note of {LEAGUE}@2")).to_contain_text("Save an empty note to delete it")
     assert serious(tab) == []
+
+
+def test_results_of_an_earlier_game(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{NAMED}")
+    expect(page.get_by_text("No games yet")).to_be_visible()
+    page.get_by_text("The game of this league has changed").click()
+    page.get_by_role("link", name="2 matches").click()
+    expect(page.get_by_role("row", name=re.compile("script:one_ply"))).to_be_visible()
+    expect(page.get_by_text("These are results of an earlier game")).to_be_visible()
+    assert serious(tab) == []
+    page.get_by_role("link", name="Show current results").click()
+    expect(page.get_by_text("No games yet")).to_be_visible()
 
 
 def test_an_unknown_league(tab: Tab) -> None:

@@ -6,6 +6,7 @@ import pytest
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.command import League, in_process, in_subprocess
+from tests.support.databases import StorageAt
 from tests.support.leagues import tictactoe
 from tests.support.templates import copy_of
 
@@ -16,9 +17,11 @@ def home(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def registry(home: Path) -> Registry:
+def registry(home: Path, storage_at: StorageAt, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """Three versions of tic-tac-toe: one that ignores threats, one that blocks, and one that wins and blocks."""
-    return copy_of(_with_three_versions, Storage.at(home))
+    registry = copy_of(_with_three_versions, storage_at(home))
+    monkeypatch.setenv("LEAGUE_DATABASE_URL", registry.storage.database_url)
+    return registry
 
 
 def _with_three_versions(storage: Storage) -> Registry:

@@ -1,7 +1,9 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
+from pettingzoo.classic.tictactoe import tictactoe as tictactoe_v3
 
 from league.registry.registry import Registry
 from league.registry.storage.tables import VerdictTable
@@ -77,3 +79,19 @@ def test_a_verdict_is_verified_and_a_modified_one_fails(league: League, registry
     refuted = league("verify", verdict)
     assert (refuted.code, refuted.err.count("\n")) == (1, 1)
     assert "llr is 99.0, but the games give" in refuted.err
+
+
+def test_a_verdict_whose_games_cannot_be_replayed_is_refuted(
+    league: League, registry: Registry, config: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verdict = league("nightly", config, "--workers", "0", "--json").json["leagues"][0]["verdicts"][0]["verdict"]
+    step = tictactoe_v3.raw_env.step
+
+    def step_without_rewards(self: Any, action: int | None) -> None:
+        step(self, action)
+        self.rewards = dict.fromkeys(self.rewards, float("nan"))
+
+    monkeypatch.setattr(tictactoe_v3.raw_env, "step", step_without_rewards)
+    refuted = league("verify", verdict, "--replays", "1")
+    assert (refuted.code, refuted.err.count("\n")) == (1, 1)
+    assert "cannot be replayed: agent player_1 got a reward of nan" in refuted.err

@@ -4,6 +4,9 @@ import pytest
 
 from league.registry.registry import Registry
 from tests.support.command import League
+from tests.support.databases import on_both_databases
+
+pytestmark = on_both_databases
 
 
 def test_a_key_is_shown_once_listed_and_revoked(league: League, registry: Registry) -> None:

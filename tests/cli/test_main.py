@@ -19,7 +19,8 @@ def test_the_commands_are_complete() -> None:
     assert set(COMMANDS) == {
         "doctor", "check-env", "train", "sweep", "versions", "note", "evaluate", "promote", "rollback", "history",
         "nightly", "replay", "serve", "act", "demo", "replicas", "keys", "traffic", "verify", "void", "report",
-        "retire", "import", "export", "exploitability",
+        "retire", "import", "export", "exploitability", "list", "archive", "remove", "compare", "init", "runs",
+        "mixture",
     }  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from league.config.gate import GateConfig
 from league.registry.registry import Registry
 from tests.support.command import League
 from tests.support.leagues import tictactoe
@@ -53,6 +54,14 @@ def test_without_an_argument_all_registered_leagues_are_run(league: League, regi
     assert f"tictactoe@{champion}" in (home / "reports" / "tictactoe.html").read_text()
     by_name = league("nightly", "tictactoe", "--workers", "0")
     assert (by_name.code, "no new versions to test" in by_name.out) == (0, True)
+
+
+def test_a_league_whose_versions_all_fail_the_gate_has_no_champion(league: League, registry: Registry) -> None:
+    row = registry.leagues.get("tictactoe")
+    strict = row.config.model_copy(update={"gate": GateConfig.model_validate({"anchors": ["script:solver"]})})
+    registry.leagues.register(strict, row.interface)
+    result = league("nightly", "tictactoe", "--workers", "0")
+    assert "3 tested, there is no champion, as no version has passed the gate yet." in result.out
 
 
 def test_without_any_league_this_is_reported(league: League) -> None:
@@ -100,7 +109,7 @@ def test_a_failing_league_does_not_affect_the_others(league: League, registry: R
         broken.model_copy(update={"environment": missing}), registry.leagues.get("tictactoe").interface
     )
     failed = league("nightly", "--workers", "0")
-    assert failed.code == 1
+    assert failed.code == 2, "the configuration of a league is invalid"
     assert "broken: " in failed.err
     assert "nowhere.to_be_found" in failed.err
     assert "tictactoe: 3 tested" in failed.out
@@ -116,9 +125,14 @@ def test_a_version_that_cannot_be_tested_gives_exit_code_1(league: League, regis
 
 def test_a_verdict_is_voided_with_a_reason(league: League, registry: Registry) -> None:
     verdict = league("nightly", "--workers", "0", "--json").json["leagues"][0]["verdicts"][0]["verdict"]
-    result = league("void", verdict, "--reason", "a broken machine", "--actor", "ann")
-    assert (result.code, result.out) == (0, f"{verdict} on tictactoe@1 is now void.\n")
+    short = registry.verdicts.get(verdict).short_id
+    assert verdict.startswith(f"tictactoe-verdict-{short}")
+    assert league("verify", short, "--json").json["verdict"] == verdict
+    result = league("void", short, "--reason", "a broken machine", "--actor", "ann")
+    assert (result.code, result.out) == (0, f"Verdict {short} on tictactoe@1 is now void.\n")
     row = registry.verdicts.get(verdict)
     assert row.evidence is not None
     assert (row.outcome, row.evidence["note"]) == ("void", "voided by ann: a broken machine")
+    ambiguous = league("void", "tictactoe-verdict", "--reason", "x")
+    assert (ambiguous.code, short in ambiguous.err) == (2, True)
     assert league("void", "nothing", "--reason", "x").code == 2

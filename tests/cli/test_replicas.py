@@ -7,6 +7,9 @@ from league.registry.registry import Registry
 from league.registry.storage.database import clock
 from league.registry.storage.tables import ReplicaTable
 from tests.support.command import League
+from tests.support.databases import on_both_databases
+
+pytestmark = on_both_databases
 
 
 @pytest.fixture

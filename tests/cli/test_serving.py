@@ -2,10 +2,11 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from cli.serving import first_call
+from cli.serving import hints
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.command import League
+from tests.support.leagues import tictactoe
 
 EMPTY = {"observation": [[[0, 0]] * 3] * 3, "action_mask": [1] * 9}
 
@@ -30,12 +31,30 @@ def test_exploration_with_a_seed_is_reproducible(league: League, registry: Regis
     assert first == league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out
 
 
-def test_the_first_call_names_a_league_of_the_user(registry: Registry) -> None:
+def test_the_hints_name_a_league_of_the_user(registry: Registry) -> None:
     registry.aliases.set("tictactoe", "champion", 3, expected=None, actor="ann", reason="best")
-    assert first_call(registry, "http://127.0.0.1:8000") == "Try: league act tictactoe@champion"
-    assert first_call(registry, "http://10.0.0.1:9").endswith("tictactoe@champion --url http://10.0.0.1:9")
+    shown = hints(registry, "http://127.0.0.1:8000").splitlines()
+    assert shown[-1] == "Try: league act tictactoe@champion"
+    assert any(line.split()[0] == "http://127.0.0.1:8000/v1/policies/tictactoe/action" for line in shown)
+    assert hints(registry, "http://10.0.0.1:9").endswith("tictactoe@champion --url http://10.0.0.1:9")
+
+
+def test_the_hints_of_a_server_on_all_interfaces_can_be_used_here(registry: Registry) -> None:
+    registry.aliases.set("tictactoe", "champion", 3, expected=None, actor="ann", reason="best")
+    shown = hints(registry, "http://0.0.0.0:9")
+    assert "0.0.0.0" not in shown
+    assert shown.endswith("--url http://127.0.0.1:9")
+
+
+def test_the_hints_name_the_league_that_was_promoted_last(registry: Registry, home: Path) -> None:
+    row = registry.leagues.get("tictactoe")
+    registry.leagues.register(row.config.model_copy(update={"league": "a_newer_one"}), row.interface)
+    tictactoe.publish(registry, tictactoe.graph(), league="a_newer_one")
+    for league in ("a_newer_one", "tictactoe"):
+        registry.aliases.set(league, "champion", 1, expected=None, actor="ann", reason="best")
+    assert hints(registry, "http://127.0.0.1:8000").endswith("league act tictactoe@champion")
 
 
 def test_without_a_champion_the_first_step_is_training(tmp_path: Path) -> None:
     with closing(Registry.open(Storage.at(tmp_path))) as empty:
-        assert "league train CONFIG, then league nightly" in first_call(empty, "http://127.0.0.1:8000")
+        assert "league train CONFIG, then league nightly" in hints(empty, "http://127.0.0.1:8000")

@@ -1,6 +1,9 @@
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from tests.support.command import League
+from tests.support.databases import on_both_databases
+
+pytestmark = on_both_databases
 
 
 def test_canary_and_shadow_are_set_shown_and_ended(league: League, registry: Registry) -> None:

@@ -12,10 +12,12 @@ import httpx
 import pytest
 import yaml
 
+from cli.training import next_step
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.runtime.haproxy import free_ports
 from tests.support.command import League
+from tests.support.leagues import tictactoe
 from tests.support.waiting import until
 
 DEADLINE = 180
@@ -127,7 +129,7 @@ def test_a_sweep_prints_its_trials_and_the_best_settings(league: League, config:
         (("--job", "--address", "http://192.0.2.77:8265"), "192.0.2.77 is another machine: set LEAGUE_DATABASE_URL"),
         (("--address", "127.0.0.1:9", "--cpus", "1"), "for a local Ray"),
         (("--object-store", "5"), "at least 80 MB, got 5"),
-        (("--gpus", "64"), "64 GPUs requested"),
+        pytest.param(("--gpus", "64"), "64 GPUs requested", marks=pytest.mark.slow),  # starts Ray
         (("--resume",), "nothing to resume"),
     ],
 )
@@ -189,3 +191,10 @@ def test_training_as_a_job_of_a_cluster(league_process: League, config: Path, ho
     assert result.code == 1
     assert "has no version 7" in result.out
     assert result.err.startswith("league: job raysubmit_")
+
+
+def test_the_next_step_depends_on_the_role(registry: Registry) -> None:
+    main = registry.versions.get("tictactoe", 3)
+    exploiter = tictactoe.publish(registry, tictactoe.graph(wins=True), exploits=main.ref)
+    assert next_step("tictactoe.yaml", main).startswith("league nightly tictactoe.yaml ")
+    assert next_step("tictactoe.yaml", exploiter).startswith("league exploitability tictactoe@3 ")

@@ -1,7 +1,11 @@
 from concurrent.futures import ThreadPoolExecutor
 
+from evaluation.service.snapshots import refresh
 from league.registry.registry import Registry
 from tests.support.command import League
+from tests.support.databases import on_both_databases
+
+pytestmark = on_both_databases
 
 
 def test_versions_as_json(league: League, registry: Registry) -> None:
@@ -15,8 +19,21 @@ def test_versions_as_json(league: League, registry: Registry) -> None:
 
 def test_versions_as_a_table(league: League, registry: Registry) -> None:
     lines = league("versions", "tictactoe").out.splitlines()
-    assert lines[0].split()[:4] == ["version", "aliases", "role", "rating"]
+    assert lines[0].split()[:3] == ["version", "aliases", "rating"]
     assert len(lines) == 4
+
+
+def test_ratings_that_a_server_has_computed_are_the_same(league: League, registry: Registry) -> None:
+    league("evaluate", "tictactoe", "--blocks", "4", "--workers", "0")
+    computed = league("versions", "tictactoe", "--json").json
+    assert all(version["rating"] is not None for version in computed["versions"])
+    refresh(registry, "tictactoe")
+    assert registry.snapshots.current("tictactoe", "leaderboard") is not None
+    assert league("versions", "tictactoe", "--json").json == computed
+    league("evaluate", "tictactoe", "--blocks", "8", "--workers", "0")
+    assert registry.snapshots.current("tictactoe", "leaderboard") is None
+    newer = league("versions", "tictactoe", "--json").json["versions"]
+    assert all(new["games"] > old["games"] for new, old in zip(newer, computed["versions"], strict=True))
 
 
 def test_notes_are_added_shown_and_removed(league: League, registry: Registry) -> None:

@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -6,6 +7,7 @@ from pathlib import Path
 import pytest
 import ray
 
+from league import ray_cluster
 from league.errors import ConfigError
 from league.ray_cluster import LocalRay, connected, join
 from league.settings import Storage
@@ -15,7 +17,9 @@ SHARED = Storage(Path("/home/x"), "postgresql://db/league", Path("/mnt/artifacts
 
 
 def nodes(*addresses: str, alive: bool = True) -> list[dict[str, object]]:
-    return [{"NodeManagerAddress": address, "Alive": alive} for address in addresses]
+    """Nodes with these addresses. Their id is that of this node, the only one that can answer."""
+    here = ray.get_runtime_context().get_node_id()
+    return [{"NodeManagerAddress": address, "NodeID": here, "Alive": alive} for address in addresses]
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -93,3 +97,44 @@ def test_only_one_module_initializes_ray() -> None:
     packages = ("cli", "evaluation", "examples", "league", "serve_app", "training")
     callers = [path for name in packages for path in (root / name).rglob("*.py") if "ray.init(" in path.read_text()]
     assert callers == [root / "league/ray_cluster.py"]
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({"cpu.max": "250000 100000\n"}, 3),
+        ({"cpu.max": "max 100000\n"}, 8),
+        ({"cpu.max": "50000 100000\n"}, 1),
+        ({"cpu/cpu.cfs_quota_us": "200000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 2),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
+        ({}, 8),
+    ],
+    ids=["2.5 CPUs", "no limit", "half a CPU", "version 1", "version 1, no limit", "no control groups"],
+)
+def test_a_container_uses_no_more_cpus_than_its_limit(
+    files: dict[str, str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_cluster, "CGROUP", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert ray_cluster.usable_cpus() == expected
+
+
+def test_a_machine_with_another_version_is_refused() -> None:
+    ours = ray_cluster.installed_with_this()
+    ray_cluster.check_stack(ours, "10.0.0.2")
+    ray_cluster.check_stack({**ours, "torch": ours["torch"].partition("+")[0] + "+cu130"}, "10.0.0.2")
+    ray_cluster.check_stack({"ray": ours["ray"]}, "10.0.0.2")
+    for package in ("onnxruntime", "policy-league"):
+        with pytest.raises(ConfigError, match=rf"10\.0\.0\.2 has {package} 0\.0\.7, this one has {ours[package]}:"):
+            ray_cluster.check_stack({**ours, package: "0.0.7"}, "10.0.0.2")
+
+
+def test_a_replica_on_a_machine_with_another_version_is_refused() -> None:
+    ours = ray_cluster.installed_with_this()
+    ray_cluster.check_deployed_stack(ours, "10.0.0.2")
+    message = rf"10\.0\.0\.2 has ray {ours['ray']}, the application was deployed with 2\.59\.0: install the same"
+    with pytest.raises(ConfigError, match=message):
+        ray_cluster.check_deployed_stack({**ours, "ray": "2.59.0"}, "10.0.0.2")

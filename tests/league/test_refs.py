@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from league.errors import InvalidReference
-from league.refs import CheckpointRef, PolicyRef, ScriptRef, check_alias, parse_ref
+from league.refs import CheckpointRef, PolicyRef, ScriptRef, check_alias, check_slug, parse_ref
 
 slugs = st.from_regex(r"[a-z0-9_-]{1,100}", fullmatch=True)
 aliases = slugs.filter(lambda slug: not slug.isdigit())
@@ -45,6 +45,22 @@ def test_a_model_name_survives_parsing_its_text(ref: PolicyRef) -> None:
 def test_an_invalid_reference_is_rejected(text: str) -> None:
     with pytest.raises(InvalidReference):
         parse_ref(text)
+
+
+@pytest.mark.parametrize("text", ["games/my_game.yaml", "my_game@3", "My_Game"])
+def test_the_name_of_a_league_is_guessed(text: str) -> None:
+    with pytest.raises(InvalidReference, match=r"'_' and '-', did you mean 'my_game'\?$"):
+        check_slug("league", text)
+
+
+def test_nothing_is_guessed_from_other_texts() -> None:
+    with pytest.raises(InvalidReference, match=r"'_' and '-'$"):
+        check_slug("league", "a b.yaml")
+
+
+def test_the_version_of_a_model_is_a_separate_parameter() -> None:
+    with pytest.raises(InvalidReference, match="model 'board@2' contains a version: send it as `version` instead"):
+        PolicyRef.parse("board@2")
 
 
 @given(st.text())

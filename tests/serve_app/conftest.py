@@ -8,6 +8,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import running
+from tests.support.databases import StorageAt
 from tests.support.leagues import tictactoe
 from tests.support.leagues.protocol_leagues import every_kind
 from tests.support.leagues.served_leagues import everything
@@ -22,9 +23,9 @@ def anyio_backend() -> str:
 
 
 @pytest.fixture
-def registry(tmp_path: Path) -> Iterator[Registry]:
+def registry(tmp_path: Path, storage_at: StorageAt) -> Iterator[Registry]:
     """Leagues of each kind, for a test that changes them."""
-    registry = everything(Storage.at(tmp_path / "home"))
+    registry = everything(storage_at(tmp_path / "home"))
     yield registry
     registry.close()
 

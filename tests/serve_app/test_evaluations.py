@@ -7,9 +7,12 @@ from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
 from serve_app.app import Replica
+from tests.support.databases import on_both_databases
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import QUICK, local_client, replica
 from tests.support.waiting import until
+
+pytestmark = on_both_databases
 
 BOARD = "/v1/leagues/board/evaluations"
 

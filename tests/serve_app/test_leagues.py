@@ -19,6 +19,7 @@ def test_a_league(read_only_client: TestClient) -> None:
     assert (league["league"], league["champion"], league["faults"]) == ("duo", 1, [])
     assert league["agents"] == {"agent_left": "left", "agent_right": "right"}
     assert league["policies"]["left"]["action"]["n"] == 7
+    assert league["baselines"] == ["script:random", "script:one_ply"]
     (row,) = read_only_client.get("/v1/leagues/empty").json()["replicas"]
     assert (row["replica"], row["version"], row["aliases"], row["event"]) == ("replica-1", None, {}, None)
     assert row["silent_seconds"] < 60

@@ -12,8 +12,11 @@ from sqlalchemy import text
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
+from tests.support.databases import on_both_databases
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import replica
+
+pytestmark = on_both_databases
 
 CHAMPION = "/v1/leagues/board/aliases/champion"
 ROLLBACK = "/v1/leagues/board/rollback"
@@ -99,6 +102,15 @@ def test_the_expected_version_is_checked(promoter: TestClient, registry: Registr
     change(promoter, ROLLBACK, "d", status=409)
 
 
+def test_a_mixture_is_published_once_and_promoted(promoter: TestClient, registry: Registry) -> None:
+    members = [{"version": 3, "probability": 0.4}, {"version": 1, "probability": 0.6}]
+    event = change(promoter, CHAMPION, "a", {"members": members, "expected": 1})
+    assert (event["version"], event["previous"]) == (4, 1)
+    assert change(promoter, CHAMPION, "a", {"members": members, "expected": 1}) == event
+    assert change(promoter, "/v1/leagues/board/aliases/candidate", "b", {"members": members})["version"] == 4
+    assert change(promoter, ROLLBACK, "c", {"expected": 4})["version"] == 1
+
+
 @pytest.mark.parametrize(
     ("path", "body", "status", "message"),
     [
@@ -113,6 +125,12 @@ def test_the_expected_version_is_checked(promoter: TestClient, registry: Registr
         (CHAMPION, b"[" * 100_00, 400, ""),
         (CHAMPION, b" " * 70_000, 413, "larger"),
         (CHAMPION, {"version": 99}, 404, "99"),
+        (CHAMPION, {"version": 2, "members": [{"version": 2, "probability": 1.0}]}, 400, "either version, or members"),
+        (CHAMPION, {"members": [{"version": 2, "probability": 1.0}]}, 400, "expected at least two"),
+        (CHAMPION, {"members": [{"version": 2, "probability": 0.5}] * 2}, 400, "named twice"),
+        (CHAMPION, {"members": [{"version": n, "probability": 0.3} for n in (1, 2)]}, 400, "sum to 0.6"),
+        (CHAMPION, {"members": [{"version": n, "probability": 0.5} for n in (1, 99)]}, 404, "99"),
+        (CHAMPION, {"members": [{"version": 2}]}, 400, "probability"),
         (ROLLBACK, {"version": 1}, 400, "version"),
         ("/v1/leagues/chess/rollback", {}, 404, "chess"),
         ("/v1/leagues/board/aliases/12", {"version": 2}, 400, "12"),

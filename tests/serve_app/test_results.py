@@ -15,7 +15,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.openapi.document import document
 from tests.support.leagues import reported_league, tictactoe
-from tests.support.leagues.match_results import LOST, PENDING, RANKED, SCHEDULE, WON, record
+from tests.support.leagues.match_results import EARLIER, LOST, PENDING, RANKED, SCHEDULE, WON, record
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.replicas import QUICK, replica
 
@@ -64,6 +64,7 @@ def test_leagues_have_a_summary_of_their_activity(reader: TestClient) -> None:
     verdict = {name: board["last_verdict"][name] for name in ("verdict", "outcome", "promoted", "candidate")}
     assert verdict == {"verdict": WON, "outcome": "promote", "promoted": True, "candidate": "board@2"}
     assert (board["running_evaluations"], board["running_runs"], board["requests"]) == (0, 1, 0)
+    assert board["archived_at"] is None
     empty = reported_league["empty"]
     assert (empty["champion"], empty["versions"], empty["games"], empty["last_verdict"]) == (None, 0, None, None)
 
@@ -199,8 +200,9 @@ def test_a_match_has_its_games(reader: TestClient) -> None:
 
 def test_runs_are_listed_newest_first(reader: TestClient) -> None:
     pages_of_runs = pages(reader, f"{BOARD}/runs", "Runs", "runs", limit=1)
-    assert [[each["run"] for each in page] for page in pages_of_runs] == [["second"], ["first"]]
-    first = pages_of_runs[1][0]
+    assert [[each["run"] for each in page] for page in pages_of_runs] == [["exploiter"], ["second"], ["first"]]
+    exploiter, _, first = (page[0] for page in pages_of_runs)
+    assert [(run["role"], run["exploits"]) for run in (exploiter, first)] == [("exploiter", "board@2"), ("main", None)]
     assert (first["state"], first["error"], first["steps"]) == ("failed", "the environment raised", 200)
     assert first["curves"] == {"return": 0.2, "shared/entropy": 1.5}
 
@@ -209,6 +211,39 @@ def test_a_run_has_its_curves(reader: TestClient) -> None:
     run = get(reader, f"{BOARD}/runs/first", "Run")
     assert [(point["steps"], point["curves"]["return"]) for point in run["points"]] == [(100, 0.1), (200, 0.2)]
     assert (run["settings"], run["seconds"], run["target"], run["minutes"]) == ({"lr": 0.001}, 20.0, 1000, None)
+
+
+def test_a_run_has_the_strength_of_its_versions(reader: TestClient) -> None:
+    (strength,) = get(reader, f"{BOARD}/runs/first", "Run")["strength"]
+    assert (strength["version"], strength["opponent"], strength["games"]) == (2, "board@1", 40)
+    assert (strength["score"], strength["low"], strength["high"]) == (0.625, 0.5, 0.75)
+    assert get(reader, f"{BOARD}/runs/second", "Run")["strength"] == []
+
+
+def test_nights_have_the_strength_and_the_exploitability_of_their_champions(reader: TestClient) -> None:
+    (open_night,), (night,) = pages(reader, f"{BOARD}/nights", "Nights", "nights", limit=1)
+    assert (night["versions"], night["champion_before"], night["champion"]) == (["board@2"], "board@1", "board@2")
+    assert (night["rating"], night["errors"]) == (200.0, ["exploiter: the disk is full"])
+    expected = {"bound": 0.625, "exploiter": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875}
+    assert night["exploitability"] == expected
+    unknown = {name: open_night[name] for name in ("champion", "rating", "exploitability", "ended_at")}
+    assert unknown == dict.fromkeys(unknown), "its steps are not complete"
+    assert open_night["versions"] == []
+    assert get(reader, "/v1/leagues/memory/nights", "Nights")["nights"] == []
+
+
+def test_results_of_an_earlier_game_stay_viewable(reader: TestClient) -> None:
+    (earlier,) = get(reader, BOARD, "League")["summary"]["earlier"]
+    assert (earlier["name"], earlier["matches"]) == (EARLIER, 3)
+    page = get(reader, f"{BOARD}/leaderboard", "Leaderboard", game=EARLIER)
+    assert [each["ref"] for each in page["leaderboard"]] == [RANKED[1]]
+    assert get(reader, f"{BOARD}/payoff", "PayoffTable", game=EARLIER)["payoff"] is None
+    for path, message in (
+        (f"{BOARD}/payoff", f"game must be one of {EARLIER}, got 'x'"),
+        ("/v1/leagues/memory/leaderboard", "memory has no results of an earlier game, got 'x'"),
+    ):
+        rejected = reader.get(path, params={"game": "x"})
+        assert (rejected.status_code, rejected.json()["message"]) == (400, message)
 
 
 def test_the_history_has_the_champion_at_each_time(reader: TestClient, storage: Storage) -> None:

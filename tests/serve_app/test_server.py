@@ -104,6 +104,37 @@ def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
     until(lambda: [(one.candidate, one.failed) for one in served.traffic.shadow_counts("board")] == [(3, 0)])
 
 
+def test_mixtures_are_swapped_under_load_and_pinned_in_every_replica(url: str, served: Registry) -> None:
+    def caller() -> Callable[[], int]:
+        client = httpx.Client(base_url=url, headers={"x-league-key": f"caller-{threading.get_ident()}"})
+
+        def call() -> int:
+            reply = client.post(ACTION, json={"observation": BOARD})
+            assert reply.status_code == 200, reply.text
+            return int(reply.json()["version"])
+
+        return call
+
+    promote(served, "board", 1)
+    mixtures = [served.publisher.publish_mixture("board", shares) for shares in ({1: 0.3, 3: 0.7}, {2: 0.5, 3: 0.5})]
+    with load(caller, callers=4) as seen:
+        for row in mixtures * 2:
+            promote(served, "board", row.number)
+            served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
+            assert row.mixture is not None
+            for number in range(20):
+                member = row.mixture.version_of("board", f"episode-{number}".encode())
+                # A new connection reaches any replica.
+                reply = httpx.post(
+                    url + ACTION, json={"observation": BOARD}, headers={"x-league-key": f"episode-{number}"}
+                )
+                assert reply.json()["version"] == member
+        promote(served, "board", 1)
+        served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
+    assert seen.failures == []
+    assert seen.versions.keys() <= {1, 2, 3}
+
+
 def test_the_client_gets_the_actions_of_the_graph(url: str) -> None:
     random = np.random.default_rng(0)
     mask = random.integers(0, 2, (50, 7), dtype=np.int8)

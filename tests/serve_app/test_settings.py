@@ -30,6 +30,7 @@ def test_two_heartbeats_may_be_lost() -> None:
 
 
 def test_deploy_yaml_updates_without_lost_requests() -> None:
+    from ray.serve.config import AutoscalingConfig
     from ray.serve.schema import ServeDeploySchema
 
     schema = ServeDeploySchema.model_validate(yaml.safe_load(DEPLOY_YAML.read_text()))
@@ -38,9 +39,11 @@ def test_deploy_yaml_updates_without_lost_requests() -> None:
     assert application.import_path == "serve_app.app:build_app"
     ServeSettings.model_validate(application.args)
     assert schema.http_options.host == "127.0.0.1"
-    assert deployment.num_replicas >= 2, "one replica may fail"
+    replicas = AutoscalingConfig.model_validate(deployment.autoscaling_config)
+    assert replicas.min_replicas >= 2, "one replica may fail"
+    assert replicas.min_replicas == replicas.max_replicas, "evaluations share the cores"
     assert deployment.max_surge_percent == 100, "new replicas start before old ones stop"
     assert deployment.graceful_shutdown_timeout_s >= 40, "draining takes 30 s"
     assert deployment.backpressure_config.status_code == 429
-    both = 2 * deployment.num_replicas * deployment.ray_actor_options.num_cpus
+    both = 2 * replicas.max_replicas * deployment.ray_actor_options.num_cpus
     assert both <= 2, "old and new replicas must fit on two cores"

@@ -8,12 +8,20 @@ from pathlib import Path
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from tests.support.databases import copy_rows
 
 
 def copy_of(build: Callable[[Storage], Registry], storage: Storage) -> Registry:
-    """The registry that `build` creates in an empty home, copied to `storage`, an empty home with SQLite."""
-    shutil.copytree(_build_once(build), storage.home, dirs_exist_ok=True)
-    return Registry.open(storage)
+    """The registry that `build` creates in an empty home, copied to `storage`, an empty home with any database."""
+    template = Storage.at(_build_once(build))
+    if storage.database_url == Storage.at(storage.home).database_url:
+        shutil.copytree(template.home, storage.home, dirs_exist_ok=True)
+        return Registry.open(storage)
+    shutil.copytree(template.home, storage.home, dirs_exist_ok=True, ignore=shutil.ignore_patterns("league.db*"))
+    copied, source = Registry.open(storage), Registry.open(template)
+    copy_rows(source, copied)
+    source.close()
+    return copied
 
 
 @cache

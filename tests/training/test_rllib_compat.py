@@ -43,6 +43,7 @@ DOCUMENTED = {
     *("ray.rllib.core.rl_module.torch", "ray.rllib.core.rl_module.apis.value_function_api"),
     *("ray.rllib.env.env_runner", "ray.rllib.env.multi_agent_env", "ray.rllib.env.single_agent_episode"),
     *("ray.rllib.utils.metrics", "ray.rllib.utils.metrics.metrics_logger", "ray.rllib.utils.checkpoints"),
+    "ray.util.scheduling_strategies",
 }
 """Modules of Ray's API reference and of its documented examples."""
 OVERRIDES = {"_forward", "_forward_exploration", "_forward_inference", "_forward_train"}

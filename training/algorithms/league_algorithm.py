@@ -11,6 +11,7 @@ from ray.rllib.utils.metrics import NUM_EPISODES
 
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
+from league.config.schedules import ScheduleProgress
 from league.interface import Interface
 from league.seeds import derive
 from training.algorithms.league_opponents import LeagueOpponents
@@ -24,6 +25,9 @@ SHARE = "share"
 
 class LeagueAlgorithm(NoResultsDirectory, Algorithm):
     """An RLlib Algorithm whose runners play opponents from the league."""
+
+    progress = ScheduleProgress(steps=0, budget=0.0)
+    """Where the schedules are in the next iteration. Set before each iteration."""
 
     def setup(self, config: AlgorithmConfig) -> None:
         super().setup(config)

@@ -5,7 +5,7 @@ prior: ½, or the parent version's score in the league's matches. A version that
 the learner's scores at its checkpoint become its row of the payoff matrix.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from math import isnan
 from typing import Any
@@ -18,19 +18,14 @@ from league.config.opponents import OpponentConfig
 from league.interface import Interface
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
-from league.results.records import BlockResult
+from league.results.payoffs import UNKNOWN, Scores, payoff_matrix, shrunk
 from league.seeds import generator
 from league.settings import Storage
-from training.algorithms.opponent_distribution import UNKNOWN, opponent_distribution, systematic_counts
+from training.algorithms.opponent_distribution import opponent_distribution, systematic_counts
 from training.sampling.self_play import GAMES, OPPONENTS, SCORE
 
 HALF_LIFE = 200_000
 """Actions of all agents after which a training game counts half."""
-PRIOR_GAMES = 10.0
-"""Weight of the prior, in games."""
-
-Scores = dict[str, tuple[float, float]]
-"""Opponent → number of games, and the sum of the scores in them."""
 
 
 class LeagueOpponents:
@@ -73,7 +68,7 @@ class LeagueOpponents:
     def score(self, ref: str) -> float:
         """Return the estimated probability that the learner beats an opponent."""
         games, score = self._scores.get(ref, (0.0, 0.0))
-        return _shrunk(games, score, self._priors.get(ref, UNKNOWN))
+        return shrunk(games, score, self._priors.get(ref, UNKNOWN))
 
     def add(self, results: Sequence[Mapping[str, Any]], actions: int) -> dict[str, float]:
         """Add the games in the metrics of all runners, and return their number by opponent.
@@ -151,43 +146,16 @@ class LeagueOpponents:
         assert self._settings is not None
         league = self._league.league
         numbers = registry.versions.numbers(league).get(league, [])
+        mixtures = registry.versions.mixtures(league, numbers)
+        numbers = [number for number in numbers if number not in mixtures]
         chosen = set(numbers[-self._settings.window :])
         if self._settings.champions:
-            chosen |= {event.version for event in registry.aliases.history(league)}
+            for event in registry.aliases.history(league):
+                mixture = mixtures.get(event.version)
+                chosen |= {event.version} if mixture is None else set(mixture.versions)
         rows = [registry.versions.get(league, number) for number in numbers if number in chosen]
         fixed = {opponent.ref for opponent in self._league.training.opponents.fixed}
         digest = self._interface.digest()
         return {
             row.ref: row.source for row in rows if row.manifest.interface.digest() == digest and row.ref not in fixed
         }
-
-
-def payoff_matrix(
-    contestants: Sequence[str], results: Iterable[BlockResult], rows: Mapping[str, Scores]
-) -> NDArray[np.float64]:
-    """Return the mean score of each contestant against each other, shrunk towards ½, (n, n).
-
-    results: of the league's matches. rows: contestant → its scores in training games.
-    """
-    number = {ref: i for i, ref in enumerate(contestants)}
-    games, scores = np.zeros((2, len(number), len(number)))
-
-    def add(first: str, second: str, count: float, score: float) -> None:
-        if first in number and second in number:
-            i, j = number[first], number[second]
-            games[i, j] += count
-            games[j, i] += count
-            scores[i, j] += score
-            scores[j, i] += count - score
-
-    for result in results:
-        if len(result.contestants) == 2:
-            add(*result.contestants, result.games, result.scores[0])
-    for ref, row in rows.items():
-        for other, (count, score) in row.items():
-            add(ref, other, count, score)
-    return np.asarray(_shrunk(games, scores, UNKNOWN))
-
-
-def _shrunk(games: Any, score: Any, prior: float) -> Any:
-    return (score + PRIOR_GAMES * prior) / (games + PRIOR_GAMES)

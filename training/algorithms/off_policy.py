@@ -189,7 +189,9 @@ class OffPolicy(LeagueAlgorithm):
         priorities = self.settings.priorities
         if priorities is None:
             return 1.0
-        return priorities.beta + (1 - priorities.beta) * min(self.steps / self.settings.steps, 1.0)
+        limit = self.settings.max_steps
+        done = self.progress.budget if limit is None else min(self.steps / limit, 1.0)
+        return priorities.beta + (1 - priorities.beta) * done
 
 
 def off_policy_config(

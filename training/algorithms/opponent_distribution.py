@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from league.config.opponents import LeagueOpponentsConfig, Sampling, Weighting
 from league.results.equilibria import alpha_rank, nash_averaging
+from league.results.payoffs import UNKNOWN
 
 Floats = NDArray[np.float64]
 
-UNKNOWN = 0.5
-"""Score of a pair without games."""
 FORGOTTEN_BELOW = 0.7
 """An opponent that the learner beats with a lower probability counts as forgotten."""
 

@@ -27,7 +27,6 @@ from ray.rllib.utils.metrics import (
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
-from league.config.schedules import ScheduleProgress
 from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
@@ -45,9 +44,6 @@ from training.sampling.episode_chunks import EpisodeChunks
 
 class PPO(LeagueAlgorithm, ppo.PPO):
     """RLlib's PPO with updates restricted to the policies that currently learn."""
-
-    progress = ScheduleProgress(steps=0, budget=0.0)
-    """Where the schedules are in the next iteration. Set before each iteration."""
 
     def training_step(self) -> None:
         """Sample a batch, update the learning policies, and send changed weights to the runners."""

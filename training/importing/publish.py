@@ -34,11 +34,13 @@ def publish(
         seed: Seed of the play that yields the observations of the checks.
 
     Raises:
+        LeagueArchived: The league is archived.
         UnknownPolicy: A policy of the league has no source.
         EnvironmentMismatch: A source does not fit the league.
         ParityError: A check failed. No version exists then.
     """
     row = registry.leagues.get(league)
+    row.require_active()
     interface = row.interface
     if missing := [policy for policy in interface.policy_ids if policy not in sources]:
         raise UnknownPolicy(f"there is no model for policy {missing[0]} of {league}")

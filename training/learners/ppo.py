@@ -125,11 +125,11 @@ def ppo_loss(
     value = (values - minibatch.targets).square().mean()
     mean_entropy = entropies.mean()
     total = policy + value_loss * value - entropy * mean_entropy
-    magnet_kl = torch.zeros(())
+    magnet_kl = torch.zeros_like(total)
     if minibatch.magnet is not None:
         magnet_kl = distribution.divergence(dist_inputs, minibatch.magnet).mean()
         total = total + magnet * magnet_kl
-    cross_entropy = torch.zeros(())
+    cross_entropy = torch.zeros_like(total)
     if minibatch.taught is not None:
         cross_entropy = -distribution.evaluate(dist_inputs, minibatch.taught)[0].mean()
         total = total + teacher * cross_entropy

@@ -4,7 +4,7 @@ import re
 import traceback
 from pathlib import Path
 
-from ray.exceptions import RayTaskError
+from ray.exceptions import RayActorError, RayTaskError
 
 import training
 from league.errors import LeagueError, one_line
@@ -19,8 +19,8 @@ LIBRARY_PATHS = ("-packages/", "/lib/python")
 def training_error(error: BaseException, league: str, trace: Path) -> LeagueError:
     """Return the cause of an error from Ray as one LeagueError.
 
-    A LeagueError is returned as it is; for others the message contains the type, the text, and the last line of the
-    user's code in the traceback. trace: the file with the complete traceback.
+    A LeagueError is returned as it is; for others the message contains the type, the text, the last line of the user's
+    code in the traceback, and the notes of the exception. trace: the file with the complete traceback.
     """
     causes = _causes(error)
     for cause in causes:
@@ -28,8 +28,13 @@ def training_error(error: BaseException, league: str, trace: Path) -> LeagueErro
             return cause
     place = _user_frame(_full_traceback(error))
     fault = one_line(causes[-1], with_type=True, first_line=True)
-    where = f" at {place}" if place else ""
+    where = " ".join(["", *(["at " + place] if place else []), *getattr(causes[-1], "__notes__", [])])
     return LeagueError(f"league {league}: training failed with {fault}{where}; see the traceback in {trace}")
+
+
+def is_process_lost(error: BaseException) -> bool:
+    """Return whether the cause of an error is that a process of Ray ended or cannot be reached."""
+    return any(isinstance(cause, RayActorError) for cause in _causes(error))
 
 
 def _causes(error: BaseException) -> list[BaseException]:

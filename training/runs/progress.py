@@ -2,7 +2,7 @@
 plain lines elsewhere."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from rich.console import Console
@@ -10,7 +10,7 @@ from rich.progress import BarColumn, ProgressColumn, TaskProgressColumn, TextCol
 from rich.progress import Progress as Bars
 
 from league.config.training import TrainingSettings
-from league.registry.storage.rows import VersionRow
+from league.registry.storage.rows import StrengthRow, VersionRow
 from training.algorithms.metrics import OTHER_TIME, PHASES
 from training.sampling.self_play import OPPONENTS
 
@@ -19,6 +19,8 @@ MAX_POLICIES = 3
 """Policies shown individually; TensorBoard has all."""
 MAX_OPPONENTS = 3
 """Opponents shown, the most frequent ones."""
+ZERO_RETURN = 0.005
+"""Smaller returns are displayed as 0.00."""
 OPPONENT_PREFIX = f"{OPPONENTS}/"
 SHOWN_PHASES = ("time/sampling", "time/learning")
 
@@ -47,9 +49,10 @@ class ProgressDisplay:
 
 
 class TrainingProgress(ProgressDisplay):
-    """The progress of a run. `published` may be called from another thread."""
+    """The progress of a run. `published` and `measured` may be called from other threads."""
 
-    def __init__(self, console: Console, settings: TrainingSettings, policies: tuple[str, ...]) -> None:
+    def __init__(self, console: Console, settings: TrainingSettings, policies: Mapping[str, str]) -> None:
+        """policies: agent → policy id."""
         super().__init__(console, TextColumn("{task.fields[pace]}"), TextColumn("{task.fields[doing]}"))
         self._settings = settings
         self._policies = policies
@@ -76,11 +79,21 @@ class TrainingProgress(ProgressDisplay):
             f"{observations:,} observations."
         )
 
+    def measured(self, version: VersionRow, rows: Sequence[StrengthRow]) -> None:
+        """Print the scores of a version, each with its 95 % interval."""
+        scores = ", ".join(
+            f"{row.score:.1%} [{row.low:.1%}, {row.high:.1%}] against {row.opponent} ({row.games} games)"
+            for row in rows
+        )
+        self.say(f"Strength of {version.ref} after {version.steps:,} steps: {scores}.")
 
-def policy_summaries(metrics: Mapping[str, Any], policies: tuple[str, ...]) -> str:
-    """Return a summary of the first few policies' metrics."""
-    shown = "; ".join(_policy_summary(policy, metrics) for policy in policies[:MAX_POLICIES])
-    more = len(policies) - MAX_POLICIES
+
+def policy_summaries(metrics: Mapping[str, Any], policies: Mapping[str, str]) -> str:
+    """Return a summary of the first few policies' metrics. policies: agent → policy id."""
+    agents_of = {policy: [agent for agent in policies if policies[agent] == policy] for policy in policies.values()}
+    first = list(agents_of.items())[:MAX_POLICIES]
+    shown = "; ".join(_policy_summary(policy, agents, metrics) for policy, agents in first)
+    more = len(agents_of) - MAX_POLICIES
     return f"{shown}; {more} more" if more > 0 else shown
 
 
@@ -88,18 +101,30 @@ def opponent_summary(metrics: Mapping[str, Any]) -> str:
     """Return the scores against the most frequent opponents; empty without opponents."""
     shares = {name.rpartition("/")[0]: value for name, value in metrics.items() if _is_opponent_share(name)}
     frequent = sorted(shares, key=lambda opponent: shares[opponent], reverse=True)[:MAX_OPPONENTS]
-    shown = [f"{name.removeprefix(OPPONENT_PREFIX)} {metrics[f'{name}/score']:.0%}" for name in frequent]
-    return f"; opponents: {', '.join(shown)}" if shown else ""
+    shown = [f"{metrics[f'{name}/score']:.0%} against {name.removeprefix(OPPONENT_PREFIX)}" for name in frequent]
+    return f"; score {', '.join(shown)}" if shown else ""
 
 
 def _is_opponent_share(name: str) -> bool:
     return name.startswith(OPPONENT_PREFIX) and name.endswith("/share")
 
 
-def _policy_summary(policy: str, metrics: Mapping[str, Any]) -> str:
-    shown = (("return", "+.2f"), ("length", ".1f"), ("entropy", ".2f"))
+def _policy_summary(policy: str, agents: Sequence[str], metrics: Mapping[str, Any]) -> str:
+    shown = (("length", ".1f"), ("entropy", ".2f"))
     values = [f"{name} {metrics[key]:{form}}" for name, form in shown if (key := f"{policy}/{name}") in metrics]
+    if f"{policy}/return" in metrics:
+        values.insert(0, _return(metrics[f"{policy}/return"], agents, metrics))
     return f"{policy}: " + (", ".join(values) or "no finished episode yet")
+
+
+def _return(mean: float, agents: Sequence[str], metrics: Mapping[str, Any]) -> str:
+    """Return the mean return of a policy. If its agents win what the others lose, the mean is 0, but the first agent's
+    return shows the advantage of its side.
+    """
+    first = metrics.get(f"agents/{agents[0]}/return", 0.0) if agents else 0.0
+    if abs(mean) < ZERO_RETURN <= abs(first):
+        return f"return {first:+.2f} as {agents[0]}"
+    return f"return {mean:+.2f}"
 
 
 def _pace(metrics: Mapping[str, Any], done: float) -> str:

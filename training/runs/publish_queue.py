@@ -3,6 +3,7 @@
 import queue
 import shutil
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -12,7 +13,6 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from training.export.publish import Checkpoint, publish
 from training.runs.checkpoint_digests import private_copy
-from training.runs.progress import TrainingProgress
 from training.runs.run_directory import RunDirectory
 
 
@@ -22,11 +22,14 @@ class PublishQueue:
     The first version of a run has the run's parent, each further one the version before it.
     """
 
-    def __init__(self, run: RunDirectory, registry: Registry, interface: Interface, progress: TrainingProgress) -> None:
+    def __init__(
+        self, run: RunDirectory, registry: Registry, interface: Interface, announce: Callable[[VersionRow], None]
+    ) -> None:
+        """announce: called with each version, in this thread."""
         self._run = run
         self._registry = registry
         self._interface = interface
-        self._progress = progress
+        self._announce = announce
         self._queue: queue.Queue[Path] = queue.Queue()
         self._thread = threading.Thread(target=self._work, name="publisher", daemon=True)
         self._thread.start()
@@ -69,7 +72,7 @@ class PublishQueue:
         )
         for directory in (path, copy):
             shutil.rmtree(directory)
-        self._progress.published(row)
+        self._announce(row)
 
 
 def published_versions(registry: Registry, run: RunDirectory) -> list[VersionRow]:

@@ -29,7 +29,7 @@ from league.config.training import TrainingSettings
 from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.files import disk_errors, replacing
 from league.interface import Interface
-from league.policies.loading import contestant
+from league.policies.loading import contestant, players
 from league.policies.open_inference import fixed_version
 from league.refs import CheckpointRef, RemoteRef, of_league, parse_ref
 from league.registry.registry import Registry
@@ -69,7 +69,9 @@ def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface
         if isinstance(ref, RemoteRef):
             ref = fixed_version(ref, interface)
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
-        contestant(pinned, registry, interface)
+        is_opponent = any(opponent.ref == written for opponent in config.training.opponents.fixed)
+        for player in players(pinned, registry) if is_opponent else [pinned]:
+            contestant(player, registry, interface)
         pins[written] = pinned
     return pins
 
@@ -120,6 +122,7 @@ RESUMABLE_SETTINGS = {
     "gpus",
     "runner_gpus",
     "crashes",
+    "strength",
 }
 """Training settings that may change when a run is resumed: duration and resources, not what is learned."""
 
@@ -275,5 +278,7 @@ def changed_setting(old: LeagueConfig, new: LeagueConfig) -> str | None:
 
 def _has_larger_budget(old: TrainingSettings, new: TrainingSettings) -> bool:
     """Return whether one limit is larger; the trial checks the other one."""
-    before, now = (settings.minutes or math.inf for settings in (old, new))
-    return new.steps > old.steps or now > before
+    (old_steps, old_minutes), (steps, minutes) = (
+        (settings.max_steps or math.inf, settings.minutes or math.inf) for settings in (old, new)
+    )
+    return steps > old_steps or minutes > old_minutes

@@ -57,8 +57,10 @@ RETRY_SECONDS = 0.5
 """Seconds between attempts to send the final report."""
 DIGITS = 6
 """Significant digits of stored values."""
-AGENT_PREFIX = "agents/"
-"""Metrics of single agents are not reported, as there may be many."""
+AGENT_PREFIX, AGENT_RETURN = "agents/", "/return"
+"""Of the metrics of single agents only the returns are reported: in self-play between rivals, the mean is always 0."""
+MAX_AGENTS = 8
+"""With more agents, their returns are not reported."""
 POINT_FIELDS = {"steps", "seconds"}
 """Fields of a point besides its metrics."""
 
@@ -96,7 +98,7 @@ class RunReporter:
 
     def report(self, metrics: Mapping[str, Any]) -> None:
         """Report a trial's latest metrics. Reports that arrive faster than the registry accepts them are merged."""
-        curves = {name: _rounded(value) for name, value in metrics.items() if _is_reported(name, value)}
+        curves = {name: _rounded(metrics[name]) for name in _reported(metrics)}
         with self._lock:
             if self._newest is not None and self._newest is not self._reported:
                 curves = self._newest.curves | curves
@@ -139,8 +141,9 @@ class RunReporter:
             algorithm=training.algorithm,
             settings=training.model_dump(mode="json", by_alias=True),
             seed=training.seed,
-            target=training.steps,
+            target=training.max_steps,
             parent=self._run.record.parent,
+            exploits=self._run.record.exploits,
             steps=self._start_steps,
         )
         self._is_registered = True
@@ -157,8 +160,11 @@ def _ending(error: BaseException | None) -> tuple[RunState, str | None]:
     return "stopped", None
 
 
-def _is_reported(name: str, value: Any) -> bool:
-    return is_metric(name, value) and not name.startswith(AGENT_PREFIX) and name not in POINT_FIELDS
+def _reported(metrics: Mapping[str, Any]) -> list[str]:
+    names = [name for name, value in metrics.items() if is_metric(name, value) and name not in POINT_FIELDS]
+    returns = [name for name in names if name.startswith(AGENT_PREFIX) and name.endswith(AGENT_RETURN)]
+    common = [name for name in names if not name.startswith(AGENT_PREFIX)]
+    return common + returns if len(returns) <= MAX_AGENTS else common
 
 
 def _rounded(value: float) -> float:

@@ -1,6 +1,7 @@
 """Runs one training run: Ray Tune trains, and the driver publishes each checkpoint as a version."""
 
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from league.config.league import LeagueConfig
 from league.environments.building import describe_policies
 from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
-from league.errors import ConfigError, InterfaceChanged
+from league.errors import ConfigError, InterfaceChanged, LeagueError, UnknownRun, one_line
 from league.interface import Interface
-from league.policies.loading import check_eligible, check_scripts
-from league.ray_cluster import UNLIMITED, LocalRay, connected
+from league.policies.loading import check_contestants, check_eligible
+from league.ray_cluster import UNLIMITED, LocalRay, connected, lost_nodes, node_ids
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, TRAINING, Role
@@ -26,14 +27,18 @@ from training.algorithms.off_policy import starts_with_empty_replay
 from training.algorithms.setup import algorithm_config, module_spec, num_envs
 from training.export.publish import git_commit
 from training.rllib_compat import NotPickled, silence_tune
-from training.runs.error_messages import training_error
+from training.runs.driver_files import driver_machine
+from training.runs.error_messages import is_process_lost, training_error
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
 from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, against, pin_opponents
 from training.runs.run_reporter import RunReporter
+from training.runs.strength_queue import Measure, StrengthQueue
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
 from training.runs.tune import Interrupted, cpu_share, fit, placement, run_config
 
+NODE_LOSS_TIMEOUT = 45.0
+"""Seconds until Ray declares a node dead that no longer answers: five health checks, with some time to spare."""
 NETWORK_SETTINGS = (
     *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
     *("dueling", "noisy", "distributional"),
@@ -55,11 +60,14 @@ def train(
     local: LocalRay = UNLIMITED,
     config_path: Path | None = None,
     console: Console | None = None,
+    measure: Measure | None = None,
 ) -> list[VersionRow]:
     """Train `config` until its budget (`training.steps`, `training.minutes`) is spent.
 
     Registers the league, runs one Ray Tune trial, shows its progress, records it in the registry, writes TensorBoard
     files to `<home>/runs/<league>/<run>`, and publishes a version at each checkpoint.
+
+    If a node of the cluster is lost, the run continues on the others from its newest version.
 
     The first SIGINT or SIGTERM saves and publishes the current state, and raises Interrupted. A second one raises
     KeyboardInterrupt immediately. The run can be resumed in both cases.
@@ -80,6 +88,7 @@ def train(
         local: Limits of a Ray that is started; it ends with the run.
         config_path: The file of `config`; its git commit is recorded in the manifests.
         console: Where progress is shown: a bar in a terminal, plain lines elsewhere.
+        measure: Measures the strength of each version (`training.strength`).
 
     Returns:
         All versions of this run, ascending, including those from before an interruption.
@@ -99,7 +108,7 @@ def train(
     silence_tune()
     interface = interface_of(config)
     check(config, interface)
-    check_scripts(config, interface)
+    check_contestants(config, interface, registry)
     registry.leagues.register(config, interface)
     exploits = None if target is None else _target(registry, target, config, interface)
     if exploits is not None:
@@ -110,16 +119,22 @@ def train(
     else:
         interrupted = None if name is None else RunDirectory.find(registry.storage, config.league, name)
     if interrupted is not None and interrupted.record.complete:
+        # Its driver may have died between the end of training and its last report.
+        with suppress(UnknownRun):
+            registry.runs.end(config.league, interrupted.id, "ended")
         return published_versions(registry, interrupted)
     pins = {} if interrupted else pin_opponents(config, registry, interface)
     with connected(address, registry.storage, local) as dashboard:
         run = interrupted or RunDirectory.begin(
             registry.storage, config, number, git_commit(config_path), pins, exploits, name
         )
-        progress = TrainingProgress(console or Console(), run.record.config.training, interface.policy_ids)
-        with run.locked(), progress, RunReporter(registry, run) as reporter:
-            _describe(config, interface, run, dashboard, progress)
-            _train_and_publish(run, registry, interface, progress, reporter)
+        progress = TrainingProgress(console or Console(), run.record.config.training, interface.policies)
+        strength = StrengthQueue(run, registry, progress, measure)
+        with run.locked(), progress, strength:
+            with RunReporter(registry, run) as reporter:
+                _describe(config, interface, run, dashboard, progress)
+                _train_and_publish(run, registry, interface, progress, reporter, strength)
+            strength.join()
     return published_versions(registry, run)
 
 
@@ -150,12 +165,21 @@ def check(config: LeagueConfig, interface: Interface) -> None:
 
 
 def _train_and_publish(
-    run: RunDirectory, registry: Registry, interface: Interface, progress: TrainingProgress, reporter: RunReporter
+    run: RunDirectory,
+    registry: Registry,
+    interface: Interface,
+    progress: TrainingProgress,
+    reporter: RunReporter,
+    strength: StrengthQueue,
 ) -> None:
-    publisher = PublishQueue(run, registry, interface, progress)
+    def announce(version: VersionRow) -> None:
+        progress.published(version)
+        strength.add(version)
+
+    publisher = PublishQueue(run, registry, interface, announce)
     try:
         _publish_remaining(run, publisher)
-        spent = _tune(run, interface, registry, publisher, progress, reporter)
+        spent = _attempt(run, interface, registry, publisher, progress, reporter)
     except Exception:
         publisher.join()
         raise
@@ -171,6 +195,8 @@ def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
     if ref.league != config.league:
         raise ConfigError(f"--from: {ref} belongs to another league than {config.league}")
     version = registry.versions.resolve(ref)
+    if version.mixture is not None:
+        raise ConfigError(f"--from: {version.ref} is a mixture ({version.mixture}): start from one of its members")
     if version.manifest.interface.digest() != interface.digest():
         raise InterfaceChanged(f"{version.ref} has other spaces or policies than the environment now")
     check_network(version, config)
@@ -183,6 +209,19 @@ def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
         raise ConfigError(f"--against: league {config.league} has one side only, so a version has no opponent")
     check_eligible(str(ref), registry, config)
     return registry.versions.resolve(ref).ref
+
+
+def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueConfig) -> CheckpointRef | None:
+    """Return the version that an exploiter starts from: `ref`, or None if that cannot be trained further.
+
+    It was imported, has another network than `config` defines, or its training state was removed.
+    """
+    version = registry.versions.resolve(ref)
+    try:
+        check_network(version, config)
+    except ConfigError:
+        return None
+    return ref if registry.versions.has_training(version) else None
 
 
 def check_network(version: VersionRow, config: LeagueConfig) -> None:
@@ -222,6 +261,27 @@ def _start(run: RunDirectory, registry: Registry, private: Path) -> StartState:
     return FROM_SCRATCH
 
 
+def _attempt(
+    run: RunDirectory,
+    interface: Interface,
+    registry: Registry,
+    publisher: PublishQueue,
+    progress: TrainingProgress,
+    reporter: RunReporter,
+) -> bool:
+    """Train until the budget is spent or a stop is requested; returns which. Continues after the loss of a node."""
+    while True:
+        nodes = node_ids()
+        try:
+            return _tune(run, interface, registry, publisher, progress, reporter)
+        except LeagueError as error:
+            lost = lost_nodes(nodes, NODE_LOSS_TIMEOUT if is_process_lost(error) and len(nodes) > 1 else 0)
+            if not lost:
+                raise
+            progress.say(f"{len(lost)} of {len(nodes)} nodes were lost ({one_line(error)}). Training continues.")
+            _publish_remaining(run, publisher)
+
+
 def _tune(
     run: RunDirectory,
     interface: Interface,
@@ -245,6 +305,7 @@ def _tune(
         cpus=share,
         run=run.id,
         parent=run.record.parent,
+        driver=driver_machine(),
     )
     reporter.begin(start.steps - start.steps_before_run, start.seconds)
 

@@ -8,8 +8,6 @@ on the machine's speed.
 
 import json
 import math
-import os
-import shutil
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -23,8 +21,8 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 
 from league.config.league import LeagueConfig
 from league.config.schedules import ScheduleProgress
-from league.files import move_durably
 from league.interface import Interface
+from league.ray_cluster import usable_cpus
 from league.settings import Storage
 from training.algorithms.metrics import (
     CHECKPOINT_TIME,
@@ -38,6 +36,7 @@ from training.algorithms.metrics import (
 from training.algorithms.setup import algorithm_config
 from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
+from training.runs.driver_files import DriverFiles, DriverMachine
 
 REPORT_SECONDS = 2.0
 """Interval between a trial's reports, in seconds."""
@@ -72,6 +71,7 @@ class TrialPlan:
     start: the initial state. checkpoints: the directory for checkpoints. stop_file: a file whose existence requests
     that the trial saves and ends. cpus: of the learner and of each runner. threads: of the learner, at most.
     run: the id of the run, which versions are named after. parent: the version that the run started from.
+    driver: the machine of these files; None if there is only one.
     """
 
     start: StartState
@@ -82,6 +82,7 @@ class TrialPlan:
     threads: int = MAX_THREADS
     run: str | None = None
     parent: int | None = None
+    driver: DriverMachine | None = None
 
 
 class Trial(tune.Trainable):
@@ -95,11 +96,11 @@ class Trial(tune.Trainable):
         self.interface = Interface.model_validate(config["interface"])
         self.plan: TrialPlan = config["plan"]
         # Runners are idle while the learner works: it may use all cores.
-        torch.set_num_threads(min(os.cpu_count() or 1, self.plan.threads))
+        torch.set_num_threads(min(usable_cpus(), self.plan.threads))
+        self.files = DriverFiles() if self.plan.driver is None else self.plan.driver.files()
         start = self.plan.start
-        self.algorithm = build_algorithm(
-            self.league, self.interface, start.checkpoint, self.plan.cpus, self.plan.storage
-        )
+        checkpoint = None if start.checkpoint is None else self.files.fetch(start.checkpoint)
+        self.algorithm = build_algorithm(self.league, self.interface, checkpoint, self.plan.cpus, self.plan.storage)
         if start.steps == start.steps_before_run:
             self.algorithm.opponents.refresh(parent=self.plan.parent)
         else:
@@ -141,6 +142,7 @@ class Trial(tune.Trainable):
 
     def cleanup(self) -> None:
         self.algorithm.stop()
+        self.files.close()
 
     def _due(self) -> bool:
         reached = self.steps >= self.next_steps or self.seconds >= self.next_seconds
@@ -153,27 +155,26 @@ class Trial(tune.Trainable):
         return self.league.training.budget_spent(self.steps - self.plan.start.steps_before_run, self.seconds)
 
     def _stop_requested(self) -> bool:
-        return self.plan.stop_file.exists()
+        return self.files.exists(self.plan.stop_file)
 
     def _plan_checkpoint(self) -> None:
         """Schedule the next multiple of the interval since the run began, which an interruption does not shift."""
         settings, before = self.league.training, self.plan.start.steps_before_run
-        self.next_steps = before + _next_multiple(self.steps - before, settings.checkpoint_every)
+        self.next_steps = before + _next_multiple(self.steps - before, settings.checkpoint_steps)
         minutes = settings.checkpoint_minutes
         self.next_seconds = _next_multiple(self.seconds, None if minutes is None else 60 * minutes)
 
     def _save(self) -> Path:
         """Save a checkpoint and rename it once complete, so that a named directory is always complete."""
         target = self.plan.checkpoints / str(self.steps)
-        draft = target.with_name(f"{target.name}.part")
-        shutil.rmtree(draft, ignore_errors=True)
+        draft = self.files.draft(target)
         source = None if self.plan.run is None else f"{self.plan.run}/{self.steps}"
         self.algorithm.opponents.refresh(checkpoint=source, parent=self.plan.parent)
         self.algorithm.save_to_path(str(draft))
         progress = {"steps": self.steps, "seconds": self.seconds}
         (draft / PROGRESS_FILE).write_text(json.dumps(progress))
         write_digests(draft)
-        move_durably(draft, target)
+        self.files.commit(draft, target)
         self.saved_steps = self.steps
         self._plan_checkpoint()
         self.algorithm.reset_episodes(self.steps)

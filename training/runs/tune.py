@@ -1,17 +1,18 @@
 """Runs trials with Ray Tune: resources, experiment configuration, and graceful interrupts."""
 
+import math
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import ray
 from ray import tune
 
 from league.config.training import TrainingSettings
 from league.errors import ConfigError
+from league.ray_cluster import node_resources
 from training.rllib_compat import restored_sigusr1
 from training.runs.run_reporter import TensorBoard
 
@@ -25,33 +26,60 @@ def cpu_share(runners: int, at_once: int = 1) -> float:
     They take turns, so that a few more of them than CPUs do not overload a machine. at_once: number of concurrent
     trials. Raises ConfigError if there are far too many.
     """
-    cpus = ray.cluster_resources().get("CPU", 0.0)
-    share = min(1.0, int(100 * cpus / (at_once * (1 + runners))) / 100)
-    if share < MIN_CPU_SHARE:
-        raise ConfigError(f"training.runners: {at_once * runners} runners are too many for {cpus:g} CPUs")
+    nodes, count = [node.get("CPU", 0.0) for node in node_resources()], at_once * (1 + runners)
+    # The largest share of which the nodes have enough is a whole part of one of them.
+    shares = {math.floor(100 * min(1.0, cpus / parts)) for cpus in nodes for parts in range(1, count + 1)}
+    fitting = [share for share in shares if share and sum(100 * cpus // share for cpus in nodes) >= count]
+    if (share := max(fitting, default=0) / 100) < MIN_CPU_SHARE:
+        raise ConfigError(f"training.runners: {at_once * runners} runners are too many for {sum(nodes):g} CPUs")
     return share
 
 
 def placement(settings: TrainingSettings, cpus: float) -> tune.PlacementGroupFactory:
-    """Place the learner on the driver's machine, where checkpoints are read, and each runner anywhere.
+    """Place the learner and each runner on any node that has what they need.
 
-    cpus: of each. Raises ConfigError for more GPUs than exist, which Ray would wait for forever.
+    cpus: of each. Raises ConfigError if no nodes have it, which Ray would wait for forever.
     """
     learner = settings.gpus + (settings.runner_gpus if settings.runners == 0 else 0)
-    requested, available = learner + settings.runners * settings.runner_gpus, ray.cluster_resources().get("GPU", 0.0)
+    requested = learner + settings.runners * settings.runner_gpus
+    available = sum(node.get("GPU", 0.0) for node in node_resources())
     if requested > available:
         raise ConfigError(
             f"training.gpus, training.runner_gpus: {requested:g} GPUs requested in total, but Ray has {available:g}"
         )
-    here = f"node:{ray.util.get_node_ip_address()}"
-    runner = {"CPU": cpus} | _gpus(settings.runner_gpus)
-    return tune.PlacementGroupFactory([{"CPU": cpus, here: 0.001} | _gpus(learner)] + [runner] * settings.runners)
+    first, runner = ({"CPU": cpus} | _gpus(gpus) for gpus in (learner, settings.runner_gpus))
+    _check_nodes(first, runner, settings.runners)
+    return tune.PlacementGroupFactory([first] + [runner] * settings.runners)
+
+
+def _check_nodes(learner: Mapping[str, float], runner: Mapping[str, float], runners: int) -> None:
+    """Raise ConfigError unless the learner fits on one node, and the runners beside it and on the others."""
+    nodes = node_resources()
+    most = -1
+    for place, node in enumerate(nodes):
+        if all(node.get(name, 0.0) >= amount for name, amount in learner.items()):
+            rest = {name: node.get(name, 0.0) - learner.get(name, 0.0) for name in node}
+            most = max(most, sum(_fitting(runner, each) for each in [*nodes[:place], rest, *nodes[place + 1 :]]))
+    if most < runners:
+        what = f"the learner needs {_listed(learner)}" if most < 0 else f"{runners} runners need {_listed(runner)} each"
+        have = "; ".join(_listed({name: node.get(name, 0.0) for name in ("CPU", "GPU")}) for node in nodes)
+        raise ConfigError(f"training: {what}, but the nodes of the Ray cluster have {have}")
+
+
+def _fitting(runner: Mapping[str, float], node: Mapping[str, float]) -> int:
+    return min(math.floor(node.get(name, 0.0) / amount + ROUNDING) for name, amount in runner.items())
+
+
+def _listed(resources: Mapping[str, float]) -> str:
+    return " and ".join(f"{amount:g} {name}s" for name, amount in resources.items())
 
 
 def _gpus(count: float) -> dict[str, float]:
     return {"GPU": count} if count else {}
 
 
+ROUNDING = 1e-9
+"""Of a quotient of resources, which Ray counts in units of 0.0001."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

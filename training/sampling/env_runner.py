@@ -93,6 +93,7 @@ class BatchedEnvRunner(RaisingEnvRunner):
                 initial,
                 storage,
                 scoring(self.league, self.interface),
+                opening_plies=self.league.training_openings,
             )
         self._has_begun = False
 

@@ -12,7 +12,7 @@ from league.environments.stepping import Batch, Indices
 from league.errors import ConfigError, GameCrashed, one_line
 from league.interface import Interface
 from league.policies.bots import Bot
-from league.policies.loading import contestant
+from league.policies.loading import contestant, players
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.refs import CheckpointRef, parse_ref
@@ -213,6 +213,18 @@ class Opponents:
         """The episodes in `envs` are over."""
         for states in self._recurrent_states.values():
             states.forget(envs)
+
+
+def without_mixtures(opponents: Sequence[OpponentConfig], storage: Storage | None) -> tuple[OpponentConfig, ...]:
+    """Return opponents in which each mixture is replaced by its members: an episode has one of them."""
+    if storage is None or not any(isinstance(parse_ref(opponent.ref), CheckpointRef) for opponent in opponents):
+        return tuple(opponents)
+    with closing(Registry.open(storage)) as registry:
+        return tuple(
+            OpponentConfig(ref=ref, share=opponent.share * probability)
+            for opponent in opponents
+            for ref, probability in players(opponent.ref, registry).items()
+        )
 
 
 def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:

@@ -19,7 +19,15 @@ from league.spaces import ACTION_MASK
 from training.modules.policy_module import PREVIOUS_ACTION
 from training.sampling.distributions import OrnsteinUhlenbeck, distribution
 from training.sampling.opponent_scores import OpponentScores
-from training.sampling.opponents import Controllers, Matchups, Openings, OpponentPolicy, Opponents, RandomMoves
+from training.sampling.opponents import (
+    Controllers,
+    Matchups,
+    Openings,
+    OpponentPolicy,
+    Opponents,
+    RandomMoves,
+    without_mixtures,
+)
 from training.sampling.play_metrics import PlayMetrics
 from training.sampling.recorder import Recorder
 from training.sampling.recurrent_state import RecurrentStates, State
@@ -61,9 +69,12 @@ class SelfPlay:
         initial_states: Mapping[str, Mapping[str, NDArray]],
         storage: Storage | None = None,
         scoring: Scoring = "game",
+        *,
+        opening_plies: int,
     ) -> None:
         """recorder: receives the play of the league's own policies. initial_states: policy id → initial recurrent
-        state, empty if not recurrent. scoring: how games against opponents are scored.
+        state, empty if not recurrent. scoring: how games against opponents are scored. opening_plies: maximum number
+        of random moves at the start of an episode.
 
         Raises ConfigError for invalid opponents, and what loading them raises.
         """
@@ -74,13 +85,14 @@ class SelfPlay:
         self._initial_states = {policy: state for policy, state in initial_states.items() if state}
         if settings.opponents.any and len(interface.sides) < 2:
             raise ConfigError("training.opponents: the league has one side only: divide the agents into sides")
-        self._interface, self._scoring, self._fixed = interface, scoring, settings.opponents.fixed
+        self._interface, self._scoring = interface, scoring
+        self._fixed = without_mixtures(settings.opponents.fixed, storage)
         self._opponents = Opponents(self._fixed, interface, storage, stepping.num_envs)
         self._arrange(())
         self.noises: dict[str, OrnsteinUhlenbeck] = {}
         """policy id → temporally correlated exploration noise, instead of independent draws."""
         movers = self._controllers.groups([RandomMoves(policy) for policy in self._policies])
-        self._openings = Openings(settings.opening_plies, movers, stepping.num_envs)
+        self._openings = Openings(opening_plies, movers, stepping.num_envs)
         self.metrics = PlayMetrics(stepping.agents, self._policies, self._distributions, stepping.num_envs)
 
     def begin(self, seeds: ResetSeeds, rng: np.random.Generator, opponents: Sequence[OpponentConfig] = ()) -> None:

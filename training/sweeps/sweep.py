@@ -6,8 +6,8 @@ experiment's driver. After resuming, successive halving compares running trials 
 weak trial run longer; it never reverts a decision.
 """
 
-import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,15 @@ from league.config.sweep import SweepConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface
-from league.policies.loading import check_scripts
-from league.ray_cluster import UNLIMITED, LocalRay, connected
+from league.policies.loading import check_contestants
+from league.ray_cluster import UNLIMITED, LocalRay, connected, usable_cpus
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from training.algorithms import metrics
 from training.export.publish import Checkpoint, git_commit, publish
 from training.rllib_compat import silence_tune
 from training.runs.checkpoint_digests import private_copy
+from training.runs.driver_files import DriverMachine, driver_machine
 from training.runs.error_messages import training_error
 from training.runs.run_directory import CHECKPOINTS, START, pin_opponents
 from training.runs.train import check
@@ -110,7 +111,7 @@ def sweep(
     interface = interface_of(config)
     trials = plan(config, config.sweep)
     _check(config, config.sweep, trials, interface)
-    check_scripts(config, interface)
+    check_contestants(config, interface, registry)
     registry.leagues.register(config, interface)
     interrupted = SweepDirectory.resume(registry.storage, config, trials) if resume else None
     pins = {} if interrupted else pin_opponents(config, registry, interface)
@@ -154,7 +155,7 @@ def _check(config: LeagueConfig, sweep: SweepConfig, trials: list[Settings], int
             check(applied(config, settings), interface)
         except ConfigError as error:
             raise ConfigError(f"sweep.parameters: {format_settings(settings)}: {error}") from error
-    budget = max(applied(config, settings).training.steps for settings in trials)
+    budget = _max_steps(applied(config, settings) for settings in trials)
     if sweep.asha is not None and sweep.asha.grace_steps > budget:
         raise ConfigError(f"sweep.asha.grace_steps: {sweep.asha.grace_steps} exceeds a trial's steps, {budget}")
 
@@ -171,12 +172,13 @@ def _run(
     at_once = min(settings.concurrent, len(numbers))
     leagues = {number: sweep.league(number) for number in numbers}
     share = cpu_share(max(league.training.runners for league in leagues.values()), at_once)
-    threads = min(MAX_THREADS, max(1, (os.cpu_count() or 1) // at_once))
+    threads = min(MAX_THREADS, max(1, usable_cpus() // at_once))
+    driver = driver_machine()
     plans = {
         number: {
             "league": league.model_dump(mode="json", by_alias=True),
             "interface": interface.model_dump(mode="json"),
-            "plan": _plan(sweep, number, registry, share, threads),
+            "plan": _plan(sweep, number, registry, share, threads, driver),
         }
         for number, league in leagues.items()
     }
@@ -204,7 +206,9 @@ def _run(
     }
 
 
-def _plan(sweep: SweepDirectory, number: int, registry: Registry, share: float, threads: int) -> TrialPlan:
+def _plan(
+    sweep: SweepDirectory, number: int, registry: Registry, share: float, threads: int, driver: DriverMachine | None
+) -> TrialPlan:
     """Plan a trial from its newest checkpoint."""
     checkpoints = sweep.trial(number) / CHECKPOINTS
     checkpoints.mkdir(parents=True, exist_ok=True)
@@ -213,7 +217,7 @@ def _plan(sweep: SweepDirectory, number: int, registry: Registry, share: float, 
         state = private_copy(newest, checkpoints / START)
         steps, seconds = read_progress(state)
         start = StartState(state, steps, 0, seconds)
-    return TrialPlan(start, checkpoints, sweep.stop_file, registry.storage, cpus=share, threads=threads)
+    return TrialPlan(start, checkpoints, sweep.stop_file, registry.storage, cpus=share, threads=threads, driver=driver)
 
 
 def _scheduler(settings: SweepConfig, leagues: Mapping[int, LeagueConfig]) -> TrialScheduler:
@@ -226,8 +230,13 @@ def _scheduler(settings: SweepConfig, leagues: Mapping[int, LeagueConfig]) -> Tr
         grace_period=settings.asha.grace_steps,
         reduction_factor=settings.asha.reduction_factor,
         # A trial that has spent its budget ends by itself.
-        max_t=max(league.training.steps for league in leagues.values()) + 1,
+        max_t=_max_steps(leagues.values()) + 1,
     )
+
+
+def _max_steps(leagues: Iterable[LeagueConfig]) -> int:
+    """Return the largest number of steps of a trial; a trial with a time limit only has no other."""
+    return max(league.training.max_steps or sys.maxsize for league in leagues)
 
 
 def _shown(sweep: SweepDirectory, number: int) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """A trial of a sweep, the driver's callback, and the display of progress."""
 
-import shutil
 from collections import defaultdict, deque
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,9 +92,7 @@ class SweepTrial(Trial):
 
     def _save(self) -> Path:
         newest = super()._save()
-        for other in newest.parent.iterdir():
-            if other != newest:
-                shutil.rmtree(other)
+        self.files.keep_only(newest)
         return newest
 
 

@@ -31,7 +31,9 @@ class Client:
         url: Base URL of the server.
         key: API key. Defaults to the environment variable `LEAGUE_API_KEY`; without either, no key is sent.
         caller: Identifies a player or an episode. During a canary release, requests of one caller are always answered
-            by the same version; requests without a caller are answered by the champion.
+            by the same version; requests without a caller are answered by the champion. Of a mixture, requests of one
+            caller are answered by the same member; those without a caller by a random one, with which an episode
+            continues.
         timeout: Seconds allowed for one attempt. The server stops working on a request after the same time.
         retry_deadline: Seconds after the first attempt within which a failed request is retried if the server was
             unreachable or busy; 0 disables retries. Every request is safe to repeat: requests that change something
@@ -153,10 +155,11 @@ class Client:
         idempotency_key: str | None = None,
         wait: float = 0.0,
     ) -> Promotion:
-        """Point an alias at a version. Requires the scope `promote`.
+        """Point an alias at a version or a mixture. Requires the scope `promote`.
 
         Args:
-            ref: The version, `connect_four@3`.
+            ref: The version, `connect_four@3`, or the versions of a mixture with their probabilities,
+                `connect_four@3:0.6,@5:0.4`.
             alias: The alias to move.
             expected: The version that the alias must point to beforehand, None if it must not exist. By default the
                 alias is moved unconditionally.

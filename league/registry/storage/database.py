@@ -44,6 +44,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 
 from league.errors import ConfigError, DeadlineExceeded, InvalidInput, StorageError, one_line
 from league.files import disk_errors
+from league.registry.storage.listener import Listener
 from league.registry.storage.migrations import HEAD, KNOWN
 from league.registry.storage.tables import Base
 
@@ -146,10 +147,17 @@ class Deadlock(StorageError):
 class Database:
     """Sessions on the registry's database. Opening it upgrades the schema."""
 
-    def __init__(self, url: str, create: bool = True) -> None:
-        """Open the database. create: create an SQLite file that does not exist. Raises StorageError or ConfigError."""
-        self.engine = _engine(url, create)
+    def __init__(self, url: str, create: bool = True, listens: bool = False) -> None:
+        """Open the database. Raises StorageError or ConfigError.
+
+        create: create an SQLite file that does not exist. listens: use one connection, which PostgreSQL notifies of
+        changes; for one thread.
+        """
+        self.engine = _engine(url, create, listens)
+        self.listener = Listener(self.engine) if listens else None
+        self._reading = _autocommit(self.engine)
         self._writing = self.engine.execution_options(writes=True)
+        self._checkouts = _Checkouts(self.engine)
         self._of_thread = threading.local()
         try:
             with translate_errors(self.engine):
@@ -161,7 +169,7 @@ class Database:
     @contextmanager
     def read(self) -> Iterator[Session]:
         """A read-only transaction, which never waits for a lock."""
-        with translate_errors(self.engine), Session(self.engine, expire_on_commit=False) as session:
+        with translate_errors(self.engine), Session(self._reading, expire_on_commit=False) as session:
             yield session
 
     @contextmanager
@@ -199,9 +207,37 @@ class Database:
             raise StorageError("the connection to the database was lost, and with it a lock that this work requires")
         return connection or self._writing
 
+    def close_unused(self) -> None:
+        """Close pooled connections to PostgreSQL, each a process there, if none was used since the last call."""
+        if self.engine.dialect.name == "postgresql" and not self._checkouts.reset():
+            self.engine.dispose()
+
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()
+
+
+def _autocommit(engine: Engine) -> Engine:
+    """The engine for reads. Each statement of PostgreSQL has a snapshot of its own also in a transaction, so that one
+    would only add statements; SQLite has a snapshot per transaction.
+    """
+    return engine.execution_options(isolation_level="AUTOCOMMIT") if engine.dialect.name == "postgresql" else engine
+
+
+class _Checkouts:
+    """Counts how often a connection was taken from the pool of an engine."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._number = 0
+        event.listen(engine, "checkout", self._add)
+
+    def reset(self) -> int:
+        """Return the number since the last call."""
+        number, self._number = self._number, 0
+        return number
+
+    def _add(self, *_: object) -> None:
+        self._number += 1
 
 
 _deadline: ContextVar[float | None] = ContextVar("deadline", default=None)
@@ -252,6 +288,29 @@ def upsert(session: Session, table: type[Base], key: Mapping[str, Any], values: 
     session.execute(statement.on_conflict_do_update(index_elements=list(key), set_=dict(values)))
 
 
+def upsert_all(session: Session, table: type[Base], key: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Insert rows, or update those with the same primary key. key: the columns of the primary key."""
+    if not rows:
+        return
+    statement = _dialect(session).insert(table)
+    values = {name: statement.excluded[name] for name in rows[0] if name not in key}
+    session.execute(statement.on_conflict_do_update(index_elements=list(key), set_=values), rows)
+
+
+def increment(session: Session, table: type[Base], key: Mapping[str, Any], column: str) -> None:
+    """Add 1 to a column of the row with this primary key, which is inserted if it does not exist."""
+    statement = _dialect(session).insert(table).values(**key, **{column: 1})
+    later = {column: table.__table__.c[column] + 1}
+    session.execute(statement.on_conflict_do_update(index_elements=list(key), set_=later))
+
+
+def sql_clock(session: Session) -> Any:
+    """Return the time of `clock` for use in a statement: PostgreSQL evaluates it without a statement of its own."""
+    if session.get_bind().dialect.name == "sqlite":
+        return datetime.now(UTC)
+    return func.clock_timestamp()
+
+
 def clock(session: Session) -> datetime:
     """Return the time of the database's clock, which all its clients share."""
     if session.get_bind().dialect.name == "sqlite":
@@ -298,7 +357,7 @@ def repeat_after_deadlock(method: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def _engine(url: str, create: bool) -> Engine:
+def _engine(url: str, create: bool, listens: bool) -> Engine:
     try:
         parsed = make_url(url)
     except ArgumentError:
@@ -307,7 +366,7 @@ def _engine(url: str, create: bool) -> Engine:
     if name not in ("sqlite", "postgresql"):
         raise ConfigError(f"LEAGUE_DATABASE_URL names {name!r}: expected sqlite or postgresql")
     if name == "postgresql":
-        return _postgresql(url)
+        return _postgresql(url, listens)
     if not parsed.database or parsed.database == ":memory:":
         raise ConfigError(f"LEAGUE_DATABASE_URL {url!r} does not name a file: expected sqlite:////path/to/league.db")
     return _sqlite(url, Path(parsed.database), create)
@@ -357,13 +416,15 @@ def _identity(path: str) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _postgresql(url: str) -> Engine:
+def _postgresql(url: str, listens: bool) -> Engine:
     parsed = make_url(url)
     options = " ".join([SESSION_DEFAULTS, *_values(parsed.query.get("options", ()))])
     query = CONNECTION_DEFAULTS | parsed.query | {"options": options}
     psycopg = parsed.set(drivername="postgresql+psycopg", query=query)
+    # A connection that listens is used too often to be tested before each use.
+    pool = {"pool_size": 1, "max_overflow": 0} if listens else {"pool_pre_ping": True}
     try:
-        return create_engine(psycopg, json_serializer=_strict_json, pool_pre_ping=True)
+        return create_engine(psycopg, json_serializer=_strict_json, **pool)
     except ModuleNotFoundError:
         raise ConfigError("PostgreSQL needs a driver: pip install 'policy-league[postgres]'") from None
 

@@ -8,6 +8,7 @@ from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
 from league.errors import ArtifactCorrupt
 from league.interface import Interface
+from league.registry.storage.mixture import Mixture
 from league.spaces import Space
 
 MANIFEST = "manifest.json"
@@ -16,10 +17,12 @@ TRAINING = "training"
 PROBES = ".probes.npz"
 """Suffix of a policy's file of probes."""
 
-Role = Literal["main", "exploiter"]
+Role = Literal["main", "exploiter", "mixture"]
 MAIN: Role = "main"
 EXPLOITER: Role = "exploiter"
 """The role of a version that was trained against one version only. It cannot become champion."""
+MIXTURE: Role = "mixture"
+"""The role of a version that consists of other versions with probabilities. It has no policies of its own."""
 
 
 class _Record(BaseModel):
@@ -81,6 +84,8 @@ class Manifest(_Record):
     role: Role = MAIN
     exploits: str | None = None
     """The version that an exploiter was trained against: `connect_four@3`."""
+    mixture: Mixture | None = None
+    """The versions of a mixture."""
     git_commit: str | None = None
     stack: dict[str, str]
     """package → version"""
@@ -100,7 +105,9 @@ class Manifest(_Record):
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> Self:
-        if set(self.policies) != set(self.interface.policy_ids):
+        if (self.role == MIXTURE) != (self.mixture is not None):
+            raise ValueError(f"role {self.role} does not fit the members: exactly mixtures have some")
+        if self.mixture is None and set(self.policies) != set(self.interface.policy_ids):
             raise ValueError(f"policies must be {', '.join(self.interface.policy_ids)}, as the interface says")
         for name, policy in self.policies.items():
             spaces = self.interface.of_policy(name)
@@ -108,6 +115,8 @@ class Manifest(_Record):
                 raise ValueError(f"policy {name} has other spaces than its agents")
         if self.environment_digest != self.environment.digest():
             raise ValueError("environment_digest is not that of the environment")
+        if self.mixture is not None and self.policies:
+            raise ValueError("a mixture has no policies of its own")
         if (self.role == EXPLOITER) != (self.exploits is not None):
             raise ValueError(f"role {self.role} does not fit exploits {self.exploits}: exploiters name one version")
         return self

@@ -1,13 +1,17 @@
 """Immutable records that the registry returns, detached from database sessions."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from league.conditions import Conditions, action_selection
+from league.errors import LeagueArchived
 from league.histograms import Histogram
 from league.interface import Interface
-from league.registry.storage.manifest import Manifest, Role
+from league.refs import short_verdict
+from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Role
+from league.registry.storage.mixture import Mixture
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -23,6 +27,12 @@ def detached(kind: type[Record], row: object, **converted: Any) -> Record:
     return kind(**{name: getattr(row, name) for name in same}, **converted)
 
 
+def require_active(league: str, archived_at: datetime | None) -> None:
+    """Raise LeagueArchived if a league is archived."""
+    if archived_at is not None:
+        raise LeagueArchived(f"league {league} is archived: `league archive {league} --undo` makes it active again")
+
+
 @dataclass(frozen=True, slots=True)
 class LeagueRow:
     """A registered league."""
@@ -32,14 +42,32 @@ class LeagueRow:
     interface: Interface
     interface_digest: str
     environment_digest: str
+    game: dict[str, Any]
+    """What decides results, see `LeagueConfig.game`; empty if it was not recorded."""
     game_digest: str
     """Of what decides results. Only results with the same digest are combined."""
     registered_at: datetime
+    archived_at: datetime | None
+    """Since when nothing is trained, published or tested."""
+
+    def require_active(self) -> None:
+        """Raise LeagueArchived if the league is archived."""
+        require_active(self.slug, self.archived_at)
 
     @property
     def conditions(self) -> Conditions:
         """Those of the games that count."""
         return Conditions(self.game_digest, action_selection(self.config, self.interface))
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierGameRow:
+    """A game that a league had before its environment's code or its rules changed."""
+
+    digest: str
+    game: dict[str, Any]
+    """See `LeagueConfig.game`; empty if it was not recorded."""
+    replaced_at: datetime
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +100,11 @@ class VersionRow:
         return f"{self.league}@{self.number}"
 
     @property
+    def run(self) -> str:
+        """Id of the training run that published it."""
+        return self.source.partition("/")[0]
+
+    @property
     def parent(self) -> int | None:
         return self.manifest.parent
 
@@ -83,6 +116,11 @@ class VersionRow:
     def exploits(self) -> str | None:
         """The version that an exploiter was trained against."""
         return self.manifest.exploits
+
+    @property
+    def mixture(self) -> Mixture | None:
+        """The versions of a mixture; None for other versions."""
+        return self.manifest.mixture
 
     @property
     def steps(self) -> int:
@@ -130,6 +168,42 @@ class Acknowledgement:
     """Time of its last report, by the clock of the database."""
     silence: timedelta
     """Time since its last report, by the clock of the database."""
+
+
+class ChangeCounts(NamedTuple):
+    """How often what replicas follow has changed."""
+
+    aliases: int
+    traffic: int
+    keys: int
+
+    @property
+    def to_acknowledge(self) -> int:
+        """Changes that replicas acknowledge: those of aliases and traffic settings."""
+        return self.aliases + self.traffic
+
+
+class ReadPosition(NamedTuple):
+    """How far a replica has read."""
+
+    changes: int
+    """Changes of aliases and traffic settings."""
+    event: int
+    """Id of the newest alias event, 0 if there is none."""
+    traffic: int
+    """Id of the newest traffic setting, 0 if there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServedState:
+    """What a replica serves of a league. The fields are those of Acknowledgement."""
+
+    version: int | None = None
+    sha256: str | None = None
+    fault: str | None = None
+    aliases: Mapping[str, int] = field(default_factory=dict)
+    event: int | None = None
+    traffic: int | None = None
 
 
 class AliasTarget(NamedTuple):
@@ -252,6 +326,28 @@ class VerdictRow:
         return self.id
 
     @property
+    def tested_schedules(self) -> list[str]:
+        """Ids of the schedules whose results decide the verdict, in order."""
+        settings = self.settings
+        companions = [*settings.get("anchors", ()), *settings.get("exploiters", ()), settings.get("exploitability")]
+        return [self.schedule, *(each["schedule"] for each in companions if each is not None)]
+
+    @property
+    def schedules(self) -> list[str]:
+        """Ids of all schedules that belong to the verdict."""
+        confirmation = self.settings.get("confirmation")
+        return [*self.tested_schedules, *([confirmation] if confirmation else [])]
+
+    @property
+    def short_id(self) -> str:
+        """The id for people."""
+        return short_verdict(self.id)
+
+    @property
+    def candidate_ref(self) -> str:
+        return f"{self.league}@{self.candidate}"
+
+    @property
     def alpha(self) -> float:
         """The error probability that it spends of a year's alpha."""
         return float(self.settings["gate"]["alpha"])
@@ -346,10 +442,12 @@ class RunRow:
     algorithm: str
     settings: dict[str, Any]
     seed: int
-    target: int
-    """Steps at which it ends."""
+    target: int | None
+    """Steps at which it ends; None if only its time is limited."""
     parent: int | None
     """The version that training starts from."""
+    exploits: str | None
+    """The version that an exploiter is trained against."""
     state: RunState
     """`silent`: running without a recent heartbeat."""
     error: str | None
@@ -362,6 +460,11 @@ class RunRow:
     heartbeat_at: datetime
     ended_at: datetime | None
 
+    @property
+    def role(self) -> Role:
+        """The role of its versions."""
+        return MAIN if self.exploits is None else EXPLOITER
+
 
 @dataclass(frozen=True, slots=True)
 class RunPoint:
@@ -369,6 +472,21 @@ class RunPoint:
 
     steps: int
     curves: dict[str, float]
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class StrengthRow:
+    """The score of a version in the matches that its training run played against an opponent."""
+
+    version: int
+    steps: int
+    opponent: str
+    games: int
+    score: float
+    low: float
+    high: float
+    """Bounds of the 95 % interval."""
     at: datetime
 
 

@@ -75,6 +75,20 @@ class LeagueTable(Base):
     last_version: Mapped[int]
     """The highest number ever reserved. Numbers are never reused."""
     registered_at: Mapped[datetime] = mapped_column(Utc)
+    archived_at: Mapped[datetime | None] = mapped_column(Utc)
+
+
+class EarlierGameTable(Base):
+    """A game that a league had before its environment's code or its rules changed. Its results are kept apart."""
+
+    __tablename__ = "earlier_games"
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
+    game: Mapped[dict[str, Any]] = mapped_column(JSON)
+    """As in `leagues`."""
+    replaced_at: Mapped[datetime] = mapped_column(Utc)
+    """When the league had this game last."""
 
 
 class VersionTable(Base):
@@ -166,8 +180,22 @@ class AliasTable(Base):
     event: Mapped[int] = mapped_column(ForeignKey("alias_events.id"))
 
 
+class ChangeCounterTable(Base):
+    """One row: how often what replicas follow has changed, see change_counter.py."""
+
+    __tablename__ = "change_counter"
+
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    aliases: Mapped[int] = mapped_column(BigInteger, server_default="0")
+    traffic: Mapped[int] = mapped_column(BigInteger, server_default="0")
+    keys: Mapped[int] = mapped_column(BigInteger, server_default="0")
+
+
 class AcknowledgementTable(Base):
-    """What a replica reports to serve."""
+    """What a replica serves of a league, while it differs from what the replica has read.
+
+    Replicas of releases without the change counter have a row for each league.
+    """
 
     __tablename__ = "acknowledgements"
 
@@ -193,7 +221,13 @@ class ReplicaTable(Base):
     replica: Mapped[str] = mapped_column(String(255), primary_key=True)
     process: Mapped[dict[str, str]] = mapped_column(JSON)
     """Where it runs: from this, other replicas can tell that it has ended."""
-    seen_at: Mapped[datetime] = mapped_column(Utc)
+    changes: Mapped[int | None] = mapped_column(BigInteger)
+    """Changes that it has read, as in ReadPosition; null until it has read any."""
+    event: Mapped[int | None]
+    """Newest alias event that it has read, as in ReadPosition."""
+    traffic: Mapped[int | None]
+    """Newest traffic setting that it has read, as in ReadPosition."""
+    seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
     """Time of its last report, by the clock of the database."""
 
 
@@ -432,10 +466,12 @@ class RunTable(Base):
     algorithm: Mapped[str] = mapped_column(String(32))
     settings: Mapped[dict[str, Any]] = mapped_column(JSON)
     seed: Mapped[int] = mapped_column(BigInteger)
-    target: Mapped[int] = mapped_column(BigInteger)
-    """Steps at which it ends."""
+    target: Mapped[int | None] = mapped_column(BigInteger)
+    """Steps at which it ends, if they are limited."""
     parent: Mapped[int | None]
     """The version that training starts from."""
+    exploits: Mapped[str | None] = mapped_column(Text)
+    """The version that an exploiter is trained against."""
     state: Mapped[str] = mapped_column(String(16))
     error: Mapped[str | None] = mapped_column(Text)
     attempts: Mapped[int] = mapped_column("lives")
@@ -461,4 +497,28 @@ class RunPointTable(Base):
     run: Mapped[str] = mapped_column(String(64), primary_key=True)
     steps: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
     curves: Mapped[dict[str, float]] = mapped_column(JSON)
+    at: Mapped[datetime] = mapped_column(Utc)
+
+
+class StrengthTable(Base):
+    """The score of a version in the matches that its training run played against an opponent."""
+
+    __tablename__ = "strengths"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
+        Index("ix_strengths_league_run", "league", "run"),
+    )
+
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    version: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    opponent: Mapped[str] = mapped_column(String(512), primary_key=True)
+    """A fixed reference."""
+    run: Mapped[str] = mapped_column(String(64))
+    steps: Mapped[int] = mapped_column(BigInteger)
+    """Actions of the run before the version, with those of its parent versions."""
+    games: Mapped[int]
+    score: Mapped[float] = mapped_column(Double)
+    low: Mapped[float] = mapped_column(Double)
+    high: Mapped[float] = mapped_column(Double)
+    """Bounds of the 95 % interval."""
     at: Mapped[datetime] = mapped_column(Utc)

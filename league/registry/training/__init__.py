@@ -1,1 +1,1 @@
-"""What training records in the registry: runs, and nights of training."""
+"""What training records in the registry: runs, the strength of their versions, and nights of training."""

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import delete, func, select, tuple_
 from sqlalchemy.orm import Session
 
-from league.errors import InvalidInput, UnknownRun
+from league.errors import InvalidInput, InvalidReference, UnknownRun
 from league.registry import leagues
 from league.registry.storage.database import Repository
 from league.registry.storage.rows import RunPoint, RunRow, RunState, detached
@@ -22,6 +22,8 @@ from league.registry.storage.tables import RunPointTable, RunTable
 RUNNING = "running"
 HEARTBEAT_TIMEOUT = timedelta(minutes=1)
 """A run without a heartbeat for longer is reported as silent."""
+MAX_LISTED = 5
+"""Runs that a message about an unknown one lists."""
 MAX_POINTS = 601
 """At this number, every second point is deleted. Odd, so that the first and the last point are kept."""
 
@@ -37,13 +39,15 @@ class RunRepository(Repository):
         algorithm: str,
         settings: dict[str, Any],
         seed: int,
-        target: int,
+        target: int | None,
         parent: int | None = None,
+        exploits: str | None = None,
         steps: int = 0,
     ) -> RunRow:
         """Record that a training run starts, or resumes at `steps`; later points are deleted.
 
-        target: steps at which the run ends. parent: the version that training starts from. Raises UnknownLeague.
+        target: steps at which the run ends, None if only its time is limited. parent: the version that training
+        starts from. exploits: the version that an exploiter is trained against. Raises UnknownLeague.
         """
         now = datetime.now(UTC)
         with self._database.write() as session:
@@ -53,6 +57,7 @@ class RunRepository(Repository):
                 row = RunTable(league=league, id=run, attempts=0, seconds=0.0, curves={}, spacing=0, began_at=now)
                 session.add(row)
             row.algorithm, row.settings, row.seed, row.target, row.parent = algorithm, settings, seed, target, parent
+            row.exploits = exploits
             row.state, row.error, row.ended_at = RUNNING, None, None
             row.attempts += 1
             row.steps, row.heartbeat_at = steps, now
@@ -85,6 +90,26 @@ class RunRepository(Repository):
         """Return one training run. Raises UnknownLeague or UnknownRun."""
         with self._database.read() as session:
             return _get(session, league, run)
+
+    def find(self, text: str) -> RunRow:
+        """Return the run with this id, or the only one whose id begins with it; `LEAGUE/RUN` searches one league.
+
+        Raises UnknownRun, or InvalidReference with the candidates if there are several.
+        """
+        league, _, run = text.rpartition("/")
+        table = RunTable
+        query = select(table).order_by(table.began_at.desc(), table.league, table.id)
+        if league:
+            query = query.filter_by(league=league)
+        with self._database.read() as session:
+            found = list(session.scalars(query.where(table.id.startswith(run, autoescape=True)))) if run else []
+            exact = [row for row in found if row.id == run]
+            if len(found := exact or found) == 1:
+                return _row(found[0])
+            listed = ", ".join(f"{row.league}/{row.id}" for row in found or session.scalars(query.limit(MAX_LISTED)))
+        if found:
+            raise InvalidReference(f"training run {text!r} is ambiguous: {listed}")
+        raise UnknownRun(f"there is no training run {text!r}; newest: {listed or 'none yet'}")
 
     def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[RunRow]:
         """Return at most `limit` training runs of a league, newest first.

@@ -11,10 +11,13 @@ from sqlalchemy import delete
 from evaluation.gating.anchors import earlier_champions, resolve_anchors
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
+from evaluation.matches.tournament import evaluate
 from league.config.league import LeagueConfig
 from league.errors import ConfigError, UnknownPolicy, VerdictRefuted
+from league.policies.loading import check_anchors
 from league.registry.registry import Registry
 from league.registry.storage import tables
+from league.results.ledger import Ledger
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
@@ -75,9 +78,39 @@ def test_a_former_champion_of_another_environment_is_not_an_anchor(registry: Reg
 def test_an_unknown_anchor_is_reported_and_no_candidate_is_tested(registry: Registry) -> None:
     with pytest.raises(UnknownPolicy, match="stockfish"):
         refs(registry, config(anchors=["script:stockfish"]), 4, "tictactoe@1")
-    report = nightly(config(anchors=["@77"]), registry=registry)
-    assert report.verdicts == ()
-    assert all("77" in fault for fault in report.faults)
+    with pytest.raises(ConfigError, match=r"gate\.anchors: league tictactoe has no version 77; the newest is 4"):
+        nightly(config(anchors=["@77"]), registry=registry)
+
+
+@pytest.mark.parametrize(
+    ("ref", "message"),
+    [
+        ("@silver", "league tictactoe has no alias 'silver'; known: none yet"),
+        ("other@1", "other@1 is not a version of league tictactoe"),
+    ],
+)
+def test_anchors_are_checked_before_anything_is_played(registry: Registry, ref: str, message: str) -> None:
+    invalid = config(anchors=[ref])
+    for play in (
+        lambda: nightly(invalid, registry=registry),
+        lambda: evaluate(tictactoe.LEAGUE, registry=registry, blocks=1),
+    ):
+        registry.leagues.register(invalid, registry.leagues.get(tictactoe.LEAGUE).interface)
+        with pytest.raises(ConfigError, match=rf"gate\.anchors: {message}"):
+            play()
+    assert Ledger(registry).schedules(tictactoe.LEAGUE) == []
+
+
+def test_a_version_of_another_environment_is_no_anchor(registry: Registry) -> None:
+    changed = tictactoe.config(
+        environment={"entry_point": "pettingzoo.classic.connect_four_v3"}, gate={"anchors": ["@1"]}
+    )
+    with pytest.raises(ConfigError, match=r"gate\.anchors: tictactoe@1 was trained in another environment"):
+        check_anchors(changed, registry)
+
+
+def test_the_alias_of_the_champion_may_be_an_anchor_before_there_is_one(registry: Registry) -> None:
+    check_anchors(config(anchors=["@champion"]), registry)
 
 
 def test_a_candidate_that_beats_the_champion_but_not_an_anchor_is_not_promoted(tmp_path: Path) -> None:
@@ -156,3 +189,13 @@ def test_an_anchor_that_cannot_be_imported_ends_the_run_before_it_starts(registr
 def test_a_malformed_anchor_is_rejected_with_the_configuration() -> None:
     with pytest.raises(ConfigError, match=r"gate.anchors.*my_package.module:name"):
         config(anchors=["script:bots:"])
+
+
+def test_without_a_champion_the_note_names_the_script_that_was_beaten(tmp_path: Path) -> None:
+    registry = league_of(tmp_path / "first", STRONG)
+    league = config(anchors=["script:one_ply"], earlier_champions=0, elo1=60, margin=30)
+    report = nightly(league, registry=registry)
+    (rejected,) = report.verdicts
+    assert rejected.note == "it beat script:random, but is weaker than script:one_ply"
+    assert report.champion is None
+    assert verify(rejected.verdict, registry=registry).outcome == "reject"

@@ -51,6 +51,14 @@ def test_a_winning_streak_is_promoted_at_the_upper_bound() -> None:
     assert decision.estimate.elo > 400
 
 
+def test_a_monitor_waits_for_the_blocks_that_must_be_played() -> None:
+    matches = [match(position, (1.0, 1.0)) for position in range(60)]
+    decided = decide_matches(GATE, matches, "league@2").blocks
+    assert decided < 50
+    watch = SequentialMonitor(GATE, "league@2", at_least=50)
+    assert [watch.is_over(matches[:end]) for end in (decided - 1, decided, 49, 50)] == [False, False, False, True]
+
+
 def test_a_losing_streak_is_rejected_at_the_lower_bound() -> None:
     decision = decide(GATE, [0.0] * 400)
     assert decision.outcome == "reject"

@@ -143,7 +143,7 @@ def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path) -> Non
     assert state(local) == state(distributed)
 
 
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [15, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_run_that_died_after_any_transaction_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
 ) -> None:

@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 
 from evaluation.gating.training_night import training_night
-from league.config.league import LeagueConfig
 from league.errors import AlreadyRunning, ConfigError
+from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
+from tests.support.leagues.handwritten_training import HandwrittenTrainer
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
 GATE = {"elo1": 150, "max_blocks": 100, "confirmation_blocks": 4}
@@ -35,20 +36,9 @@ def _short_exploitability() -> Any:
     return partial(exploitability, blocks=4)
 
 
-class Trainer:
-    """Publishes the next graph for each new run, as training that resumes does: once for each name."""
-
-    def __init__(self, registry: Registry, *graphs: bytes) -> None:
-        self.registry, self.graphs = registry, graphs
-        self.calls: list[tuple[str, int | None, str | None]] = []
-
-    def __call__(self, config: LeagueConfig, *, name: str, parent: int | None, target: str | None) -> None:
-        self.calls.append((name, parent, target))
-        source, rows = f"{name}/100", self.registry.versions.all(LEAGUE)
-        if source not in {row.source for row in rows}:
-            graph = self.graphs[len(rows)]
-            build = tictactoe._builder(self.registry.leagues.get(LEAGUE), graph, target)
-            self.registry.publisher.publish(LEAGUE, build, source=source, parent=None)
+def trainer_of(registry: Registry, *graphs: bytes) -> HandwrittenTrainer:
+    """A trainer that publishes the next graph for each new run."""
+    return HandwrittenTrainer(registry, lambda number, _: graphs[number])
 
 
 def state(registry: Registry) -> dict[str, Any]:
@@ -78,7 +68,7 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
 
 
 def test_a_night_trains_gates_and_measures_the_champion(registry: Registry) -> None:
-    trainer = Trainer(registry, STRONG, STRONGEST)
+    trainer = trainer_of(registry, STRONG, STRONGEST)
     announced: list[str] = []
     night, report = training_night(CONFIG, registry=registry, train=trainer, announce=announced.append)
     assert trainer.calls == [(night.run, None, None), (night.exploiter_run, 1, "tictactoe@1")]
@@ -101,7 +91,7 @@ def test_a_night_trains_gates_and_measures_the_champion(registry: Registry) -> N
 
 
 def test_a_champion_that_stays_keeps_its_exploiter_and_its_measurement(registry: Registry) -> None:
-    trainer = Trainer(registry, STRONG, STRONGEST, WEAK)
+    trainer = trainer_of(registry, STRONG, STRONGEST, WEAK)
     first, _ = training_night(CONFIG, registry=registry, train=trainer)
     second, _ = training_night(CONFIG, registry=registry, train=trainer)
     assert trainer.calls[2:] == [(second.run, 1, None)]
@@ -124,6 +114,23 @@ def test_failed_training_is_recorded_and_the_night_goes_on(registry: Registry) -
     assert night.steps["measure"]["exploitability"] is None
 
 
+def test_a_night_continues_the_likeliest_member_and_tests_against_the_mixture(registry: Registry) -> None:
+    for graph in (STRONG, WEAK):
+        tictactoe.publish(registry, graph)
+    number = registry.publisher.publish_mixture(LEAGUE, {1: 0.8, 2: 0.2}).number
+    registry.aliases.set(LEAGUE, "champion", number, expected=ANY, actor="me", reason="test")
+    trainer = HandwrittenTrainer(registry, lambda *_: WEAK)
+    night, _ = training_night(CONFIG, registry=registry, train=trainer)
+    assert (night.parent, trainer.calls[0][1]) == (3, 1)
+    assert night.steps["gate"]["champion_before"] == "tictactoe@3"
+    assert night.steps["gate"]["verdicts"][0]["opponent"] == "tictactoe@3"
+    assert {verdict["candidate"] for verdict in night.steps["gate"]["verdicts"]} == {
+        f"tictactoe@{n}" for n in (1, 2, 4)
+    }
+    played = [match for match in Ledger(registry).matches(league=LEAGUE) if "tictactoe@3" in match.contestants]
+    assert {member for match in played for game in match.games for member in game.members} == {1, 2, None}
+
+
 def test_a_run_in_another_process_leaves_the_night_open(registry: Registry) -> None:
     def busy(*_: object, **__: object) -> None:
         raise AlreadyRunning("training run x is running in another process")
@@ -140,9 +147,16 @@ def test_the_budget_of_an_exploiter_is_a_fraction_of_the_nights() -> None:
         nightly={"minutes": 4, "exploiter": 0.25, "opponents": [{"ref": "script:random", "share": 0.5}]},
     )
     main, exploiter = config.of_night(7).training, config.of_night(8, config.nightly.exploiter).training
-    assert (main.seed, main.minutes, main.steps, main.checkpoint_every) == (7, 4, 1000, 200_000)
+    assert (main.seed, main.minutes, main.steps, main.checkpoint_every) == (7, 4, 1000, "auto")
     assert (exploiter.seed, exploiter.minutes, exploiter.steps, exploiter.checkpoint_every) == (8, 1, 250, None)
     assert [each.ref for each in main.opponents.fixed] == ["script:random"]
+
+
+def test_the_default_number_of_steps_limits_a_night_without_limits_only() -> None:
+    unlimited = tictactoe.config(training={}, nightly={"exploiter": 0.25})
+    assert [unlimited.of_night(7, share).training.max_steps for share in (None, 0.25)] == [1_000_000, 250_000]
+    in_minutes = tictactoe.config(training={}, nightly={"minutes": 4})
+    assert in_minutes.of_night(7).training.max_steps is None
 
 
 @pytest.mark.slow
@@ -150,7 +164,7 @@ def test_a_night_that_died_after_any_transaction_continues(tmp_path: Path, monke
     league_of(tmp_path / "fresh", MIDDLING, config=CONFIG).close()
 
     def run(registry: Registry) -> None:
-        training_night(CONFIG, registry=registry, train=Trainer(registry, MIDDLING, STRONG, STRONGEST))
+        training_night(CONFIG, registry=registry, train=trainer_of(registry, MIDDLING, STRONG, STRONGEST))
 
     quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
     with crash_after(0, monkeypatch) as count:

@@ -17,10 +17,13 @@ from league.registry.storage import tables
 from league.registry.storage.rows import VerdictRow
 from league.results.ledger import Ledger
 from league.settings import Storage
+from tests.support.databases import StorageAt, on_both_databases
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
 from tests.support.policies.illegal_action_graph import illegal_action_graph
 from tests.support.templates import copy_of
+
+pytestmark = on_both_databases
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +40,9 @@ def build_judged(storage: Storage) -> Registry:
 
 
 @pytest.fixture
-def registry(tmp_path: Path) -> Registry:
+def registry(tmp_path: Path, storage_at: StorageAt) -> Registry:
     """A registry that a test may modify."""
-    return copy_of(build_judged, Storage.at(tmp_path))
+    return copy_of(build_judged, storage_at(tmp_path))
 
 
 def verdicts(registry: Registry) -> list[VerdictRow]:

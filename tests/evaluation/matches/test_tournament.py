@@ -133,11 +133,11 @@ def test_chunks_that_finish_out_of_order_are_stored_in_order(
     schedule, reached = tournament_schedule(registry), tmp_path / "reached"
 
     @ray.remote(num_cpus=1)
-    def delay_first_chunk(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
+    def delay_first_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
         """The first chunk does not end before the second one."""
         from tests.support.waiting import until
 
-        schedule, storage, config = job
+        schedule, storage, config, _ = job
         matches = match_worker(storage, config).play(schedule, chunk)
         if chunk.start == 0:
             until(reached.exists)
@@ -165,8 +165,8 @@ def test_a_worker_killed_during_a_chunk_is_replaced(
     schedule, died = tournament_schedule(registry), tmp_path / "died"
 
     @ray.remote(num_cpus=1, max_retries=tournament.RETRIES)
-    def play_or_die(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
-        schedule, storage, config = job
+    def play_or_die(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
+        schedule, storage, config, _ = job
         here = match_worker(storage, config)
         for position in chunk:
             if chunk.start == 4 and position == 6 and not died.exists():
@@ -190,9 +190,9 @@ def test_the_number_of_open_chunks_is_limited(
     most_open: list[int] = []
 
     @ray.remote(num_cpus=1)
-    def play_and_record(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
+    def play_and_record(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
         (started / str(chunk.start)).touch()
-        schedule, storage, config = job
+        schedule, storage, config, _ = job
         return match_worker(storage, config).play(schedule, chunk)
 
     def count_open_chunks(matches: Sequence[Match]) -> bool:

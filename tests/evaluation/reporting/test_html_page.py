@@ -16,6 +16,7 @@ from evaluation.reporting.html_page import render_page, write
 from evaluation.reporting.league_report import MAX_UPSETS, MOST_VERDICTS, LeagueReport, league_report
 from evaluation.results import AnchorReport, Confirmation, Difference
 from league.errors import StorageError
+from league.refs import short_verdict
 from tests.support.leagues import reported_league
 from tests.support.leagues.tictactoe import LEAGUE
 
@@ -96,7 +97,7 @@ def test_the_page_has_the_data_of_the_report(report: LeagueReport, page: PagePar
     assert len([row for row in rows if "champion" in row and "tictactoe@3" in row]) >= 1
     for verdict, (_, text) in zip(report.verdicts, page.all("article", "verdict"), strict=True):
         assert verdict.reason in text
-        assert verdict.verdict in text
+        assert short_verdict(verdict.verdict) in text
     assert [text for _, text in page.all("h3")].count("tictactoe@3 against tictactoe@2 promoted") == 1
 
 

@@ -17,18 +17,29 @@ from evaluation.service.evaluation_supervisor import EvaluationSupervisor
 from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
 from league.results.ledger import Ledger
+from league.settings import Storage
+from tests.support.databases import StorageAt, on_both_databases
 from tests.support.leagues import tictactoe
+from tests.support.templates import copy_of
 from tests.support.waiting import until
 
 LONG = 20_000
 """A number of blocks that takes minutes."""
 
 
-@pytest.fixture
-def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Registry]:
-    opened = tictactoe.registry(tmp_path / "home", play={"opening_plies": 2, "num_envs": 2})
+pytestmark = on_both_databases
+
+
+def _with_two_versions(storage: Storage) -> Registry:
+    registry = tictactoe.registry(storage.home, play={"opening_plies": 2, "num_envs": 2})
     for strength in ({}, {"wins": True}):
-        tictactoe.publish(opened, tictactoe.graph(**strength))
+        tictactoe.publish(registry, tictactoe.graph(**strength))
+    return registry
+
+
+@pytest.fixture
+def registry(tmp_path: Path, storage_at: StorageAt, monkeypatch: pytest.MonkeyPatch) -> Iterator[Registry]:
+    opened = copy_of(_with_two_versions, storage_at(tmp_path / "home"))
     for name, value in (
         ("LEAGUE_HOME", opened.storage.home),
         ("LEAGUE_DATABASE_URL", opened.storage.database_url),

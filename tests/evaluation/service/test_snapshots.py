@@ -72,6 +72,7 @@ def test_snapshots_equal_the_report(registry: Registry, report: LeagueReport) ->
         "sides": ["player_1", "player_2"],
         "environment": "pettingzoo.classic.tictactoe_v3",
         "environment_digest": report.environment_digest,
+        "earlier": [],
     }
     assert snapshot(registry, "leaderboard").document == {
         "sides": ["player_1", "player_2"],

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
-from evaluation.statistics.payoff import paired_difference, student_interval
+from evaluation.statistics.payoff import crossed_interval, paired_difference, student_interval
 from league.results.records import Game, Match
 from tests.support.closeness import close
 
@@ -44,3 +44,27 @@ def test_intervals_have_their_coverage() -> None:
         low <= 3.0 <= high for low, high in ((s.low, s.high) for s in map(student_interval, values)) if low and high
     )
     assert covered / 5000 == pytest.approx(0.95, abs=3 * np.sqrt(0.05 * 0.95 / 5000))
+
+
+def test_without_an_effect_of_rows_the_crossed_interval_is_students() -> None:
+    values = np.tile(GAPS, (3, 1))
+    assert close(crossed_interval(values), student_interval(GAPS))
+    assert close(crossed_interval(values.T), student_interval(GAPS))
+
+
+def test_the_crossed_interval_counts_rows_and_columns() -> None:
+    """With rows that differ by 1, 2 and 3 points and equal columns, it is Student's over the rows."""
+    rows = np.array([1.0, 2.0, 3.0])
+    assert close(crossed_interval(np.tile(rows[:, np.newaxis], (1, 5))), student_interval(rows.tolist()))
+    both = crossed_interval(rows[:, np.newaxis] + np.array(GAPS))
+    alone = [student_interval(each) for each in (rows.tolist(), GAPS)]
+    assert both.low is not None
+    assert both.high is not None
+    assert both.mean == pytest.approx(sum(each.mean for each in alone))
+    assert both.high - both.low > student_interval(GAPS).high - student_interval(GAPS).low  # type: ignore[operator]
+
+
+def test_a_single_row_has_no_crossed_interval() -> None:
+    found = crossed_interval(np.array([GAPS]))
+    assert (found.mean, found.low, found.high) == (pytest.approx(np.mean(GAPS)), None, None)
+    assert crossed_interval(np.zeros((2, 3))).low == 0

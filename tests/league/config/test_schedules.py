@@ -77,6 +77,24 @@ def test_the_budget_is_of_steps_or_time_whichever_is_spent_first() -> None:
     assert PPOConfig(steps=1000, minutes=2).budget_spent(2000, seconds=0) == 1
 
 
+def test_a_run_of_minutes_is_not_ended_by_the_default_number_of_steps() -> None:
+    assert PPOConfig().budget_spent(500_000, seconds=9999) == 0.5
+    minutes = PPOConfig(minutes=3)
+    assert minutes.max_steps is None
+    assert minutes.budget_spent(10**9, seconds=90) == 0.5
+    given = league(steps=None).with_training(minutes=3).training
+    assert (given.max_steps, given.minutes) == (None, 3), "--minutes with a configuration without `steps`"
+
+
+def test_an_interval_of_minutes_replaces_the_default_interval_of_steps() -> None:
+    assert PPOConfig().checkpoint_steps == 200_000
+    assert PPOConfig(checkpoint_minutes=5).checkpoint_steps is None
+    assert PPOConfig(checkpoint_minutes=5, checkpoint_every=100).checkpoint_steps == 100
+    assert PPOConfig(checkpoint_every=None).checkpoint_steps is None
+    with pytest.raises(ConfigError, match=r"training\.checkpoint_every.*: .*greater than or equal to 1.*got 0"):
+        league(checkpoint_every=0)
+
+
 def league(**training: Any) -> LeagueConfig:
     return LeagueConfig.from_mapping(
         {"league": "mini", "environment": {"entry_point": "x"}, "training": training}, source="mini.yaml"

@@ -220,7 +220,7 @@ def test_agents_with_equal_spaces_share_a_policy() -> None:
     environment = {"entry_point": "pettingzoo.classic.rps_v2"}
     found = interface(LeagueConfig.from_mapping({"league": "x", "environment": environment}))
     assert found.policy_ids == ("shared",)
-    assert describe_policies(found) == "Policy: shared (player_0 and 1 more)."
+    assert describe_policies(found) == "Policy: shared (player_0, player_1)."
 
 
 @pytest.mark.parametrize(

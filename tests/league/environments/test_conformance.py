@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from examples.kuhn_poker_vector import KuhnPokerVector
 from league.config.league import LeagueConfig
-from league.environments import conformance
-from league.environments.conformance import Examination, examine
+from league.environments.conformance import examination
+from league.environments.conformance.examination import examine
+from league.environments.conformance.findings import Examination
 from league.environments.vector.vector_env import AgentRows
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
@@ -19,8 +20,8 @@ from tests.support.environments.simultaneous import Simultaneous
 
 @pytest.fixture(autouse=True)
 def short_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(conformance, "COMPARED_STEPS", 500)
-    monkeypatch.setattr(conformance, "MEASURED_SECONDS", 0.01)
+    monkeypatch.setattr(examination, "COMPARED_STEPS", 500)
+    monkeypatch.setattr(examination, "MEASURED_SECONDS", 0.01)
 
 
 HERE = "tests.league.environments"
@@ -102,7 +103,82 @@ def test_rewards_that_are_not_finite_are_faults() -> None:
 
 def test_an_exception_is_a_fault_with_its_message() -> None:
     found = examine(league(f"{SUPPORT}.simultaneous:meeting", crashes=[0]))
-    assert "RuntimeError: the simulator is gone" in findings(found, "fault")
+    expected = r"simultaneous.py, line \d+, step 2 of the episode with seed 0\): RuntimeError: the simulator is gone"
+    assert re.search(expected, findings(found, "fault"))
+
+
+class Endless(Simultaneous):
+    """Its episodes do not end within 10,000 steps."""
+
+    def __init__(self) -> None:
+        super().__init__(leaves=(10**9, 10**9))
+
+
+def endless() -> Endless:
+    return Endless()
+
+
+def test_an_endless_episode_is_a_fault_that_names_the_limit() -> None:
+    config = league(f"{__name__}:endless")
+    config = config.model_copy(update={"play": config.play.model_copy(update={"max_moves": 50})})
+    assert "did not end within 50 steps (play.max_moves)" in findings(examine(config), "fault")
+    assert "did not end within 20 steps" in findings(examine(config, steps=20), "note")
+
+
+class OutOfBounds(Simultaneous):
+    def observation_space(self, agent: str) -> spaces.Space:
+        return spaces.Box(0, 2, (3,), np.float32)
+
+
+def out_of_bounds() -> OutOfBounds:
+    return OutOfBounds()
+
+
+def test_a_value_out_of_bounds_is_named() -> None:
+    found = findings(examine(league(f"{__name__}:out_of_bounds")), "note")
+    assert re.search(
+        r"agent_0 and 1 more: observations are not in .* observation\[1\] is 3, outside of \[0, 2\]", found
+    )
+
+
+class Unrewarding(Simultaneous):
+    """All rewards are 0."""
+
+    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
+        observations, rewards, *rest = super().step(actions)
+        return observations, dict.fromkeys(rewards, 0.0), *rest
+
+
+class UnrewardingOfAnyLength(Unrewarding):
+    """The seed decides the length of an episode."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        self.leaves = (2 + (seed or 0) % 3,) * 2
+        return super().reset(seed, options)
+
+
+def unrewarding(truncated: Sequence[int], any_length: bool = False) -> Unrewarding:
+    return (UnrewardingOfAnyLength if any_length else Unrewarding)(truncated=truncated)
+
+
+def test_an_environment_without_rewards_gets_a_note() -> None:
+    assert "all rewards were 0" in findings(examine(league(f"{__name__}:unrewarding", truncated=[])), "note")
+
+
+def test_only_truncated_episodes_get_a_note() -> None:
+    found = examine(league(f"{SUPPORT}.simultaneous:meeting", truncated=[0, 1]))
+    assert "all episodes were truncated, none was terminated" in findings(found, "note")
+
+
+def test_only_truncated_episodes_without_rewards_are_a_fault() -> None:
+    found = examine(league(f"{__name__}:unrewarding", truncated=[0, 1], any_length=True))
+    assert "does not report how its games end" in findings(found, "fault")
+
+
+def test_a_limit_of_steps_without_rewards_gets_a_note() -> None:
+    found = examine(league(f"{__name__}:unrewarding", truncated=[0, 1]))
+    assert found.passed
+    assert "all rewards were 0" in findings(found, "note")
 
 
 def test_an_environment_that_cannot_be_imported_is_a_fault() -> None:
@@ -115,6 +191,32 @@ def test_a_reused_observation_buffer_gets_a_note() -> None:
 
 def test_a_deterministic_start_gets_a_note() -> None:
     assert "play.opening_plies" in findings(examine(league("pettingzoo.classic.connect_four_v3")), "note")
+
+
+def test_openings_are_recommended_where_seeds_repeat_one_game() -> None:
+    found = examine(league("pettingzoo.classic.connect_four_v3")).openings
+    assert found is not None
+    assert found.different_games == 1
+    assert 2 <= found.recommended <= 5
+    assert [length.ended for length in found.lengths[:6]] == [0.0] * 6
+    assert found.lengths[0].distinct == 7 / 200
+    assert f"play.opening_plies: {found.recommended} is recommended" in str(found)
+
+
+@pytest.mark.parametrize("entry_point", ["mpe2.simple_spread_v3", "pettingzoo.classic.leduc_holdem_v4"])
+def test_openings_are_not_recommended_where_seeds_differ(entry_point: str) -> None:
+    found = examine(league(entry_point)).openings
+    assert found is not None
+    assert found.recommended == 0
+    assert "random openings are not needed" in str(found)
+
+
+def test_openings_that_end_many_games_get_a_note() -> None:
+    config = league("pettingzoo.classic.tictactoe_v3")
+    config = config.model_copy(update={"play": config.play.model_copy(update={"opening_plies": 7})})
+    assert re.search(
+        r"random openings of 7 plies \(play.opening_plies\) end \d+% of the games", findings(examine(config), "note")
+    )
 
 
 class ConstantImages(Simultaneous):

@@ -6,7 +6,7 @@ pytest.importorskip("pyspiel")
 
 from league.config.league import LeagueConfig
 from league.environments.building import build, interface
-from league.environments.conformance import examine
+from league.environments.conformance.examination import examine
 from league.environments.openspiel import env
 from league.errors import ConfigError
 

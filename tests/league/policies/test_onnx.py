@@ -119,6 +119,14 @@ def test_recurrent_state_is_passed_in_and_returned() -> None:
     assert explored.dist_inputs is not None
 
 
+def test_an_observation_without_a_mask_may_be_passed_alone() -> None:
+    policy, batch = OnnxPolicy(continuous()), np.ones((3, 2), np.float32)
+    expected = policy.act({"observation": batch})
+    assert policy.act(batch).actions.tolist() == expected.actions.tolist()
+    with pytest.raises(ObservationError, match="action_mask is missing"):
+        POLICY.act(observations(3)["observation"])
+
+
 def test_exploring_vectors_requires_a_manifest() -> None:
     policy = OnnxPolicy(continuous())
     value = np.array([[0.25, -1.5]], np.float32)

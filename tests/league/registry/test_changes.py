@@ -10,6 +10,7 @@ from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint
+from tests.support.leagues.acknowledgements import acknowledge
 from tests.support.leagues.registries import LEAGUE, publish, registered
 
 
@@ -23,8 +24,8 @@ CHANGES: list[Callable[[Registry], object]] = [
     lambda registry: registry.aliases.set(LEAGUE, "candidate", 1, expected=ANY, actor="test", reason="test"),
     lambda registry: registry.versions.set_note(CheckpointRef(LEAGUE, 1), "a try", actor="test"),
     lambda registry: registry.traffic.set(LEAGUE, shadow=Portion(1, 0.5), actor="test", reason="test"),
-    lambda registry: registry.replicas.acknowledge("replica-1", LEAGUE, 1, "0" * 64),
-    lambda registry: registry.replicas.acknowledge("replica-2", LEAGUE, 1, "0" * 64),
+    lambda registry: acknowledge(registry, "replica-1", LEAGUE, 1, "0" * 64),
+    lambda registry: acknowledge(registry, "replica-2", LEAGUE, 1, "0" * 64),
     lambda registry: registry.verdicts.open(LEAGUE, 1, "script:random", "s1", {}),
     lambda registry: registry.verdicts.close("s1", "reject", {}),
     lambda registry: registry.verdicts.void("s1", "by mistake"),

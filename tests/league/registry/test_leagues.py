@@ -3,7 +3,7 @@ import logging
 import pytest
 
 from league.config.league import LeagueConfig
-from league.errors import InterfaceChanged, UnknownLeague
+from league.errors import InterfaceChanged, LeagueArchived, UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
@@ -83,3 +83,17 @@ def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkey
     after = registry.leagues.follow_code(LEAGUE)
     assert after.game_digest == config().game_digest() != before.game_digest
     assert after.config == before.config
+
+
+def test_nothing_is_registered_or_published_in_an_archived_league(registry: Registry) -> None:
+    publish(registry, "run/1")
+    archived = registry.leagues.archive(LEAGUE)
+    assert registry.leagues.archive(LEAGUE).archived_at == archived.archived_at
+    assert registry.leagues.names() == {LEAGUE: archived.archived_at}
+    for change in (lambda: registry.leagues.register(config(), interface()), lambda: publish(registry, "run/2")):
+        with pytest.raises(LeagueArchived, match="tictactoe is archived: `league archive tictactoe --undo`"):
+            change()
+    assert [version.number for version in registry.versions.all(LEAGUE)] == [1]
+    assert registry.leagues.archive(LEAGUE, undo=True).archived_at is None
+    registry.leagues.register(config(), interface())
+    assert publish(registry, "run/2").number == 2

@@ -153,6 +153,13 @@ def test_a_live_publisher_is_not_disturbed(registry: Registry) -> None:
     assert [version.number for version in registry.versions.all(LEAGUE)] == [1, 2]
 
 
+def test_nothing_is_known_of_a_machine_with_the_same_name() -> None:
+    machine, pid, start = this_process().split(":")
+    now, name = datetime.now(UTC), machine.partition("/")[0]
+    assert is_dead(f"{machine}:{pid}:{int(start) - 1}", now)
+    assert not is_dead(f"{name}/another-start/1:{pid}:{int(start) - 1}", now)
+
+
 def test_a_publisher_whose_process_id_was_reused_is_dead() -> None:
     host, pid, start = this_process().split(":")
     now = datetime.now(UTC)

@@ -10,7 +10,9 @@ from league.registry.registry import Registry
 from league.registry.replicas import LIVENESS_TIMEOUT
 from league.registry.storage import database
 from league.registry.storage.database import clock
+from league.registry.storage.rows import ReadPosition
 from league.registry.storage.tables import ReplicaTable
+from tests.support.leagues.acknowledgements import acknowledge
 from tests.support.leagues.registries import LEAGUE, registered
 
 
@@ -20,9 +22,9 @@ def backdate(registry: Registry, replica: str, by: timedelta) -> None:
 
 
 def test_a_replica_reports_its_version_repeatedly(registry: Registry) -> None:
-    registry.replicas.acknowledge("replica-1", LEAGUE, None, None, fault="tictactoe@1: manifest.json is missing")
-    registry.replicas.acknowledge("replica-2", LEAGUE, 1, "abc")
-    registry.replicas.acknowledge("replica-1", LEAGUE, 2, "def")
+    acknowledge(registry, "replica-1", LEAGUE, None, None, fault="tictactoe@1: manifest.json is missing")
+    acknowledge(registry, "replica-2", LEAGUE, 1, "abc")
+    acknowledge(registry, "replica-1", LEAGUE, 2, "def")
     found = registry.replicas.acknowledgements(LEAGUE)
     assert [(row.replica, row.version, row.sha256, row.fault) for row in found] == [
         ("replica-1", 2, "def", None),
@@ -32,20 +34,19 @@ def test_a_replica_reports_its_version_repeatedly(registry: Registry) -> None:
 
 
 def test_faults_are_stored(registry: Registry) -> None:
-    registry.replicas.acknowledge("replica-1", LEAGUE, 1, "abc", fault="tictactoe@2: shared.onnx was changed")
+    acknowledge(registry, "replica-1", LEAGUE, 1, "abc", fault="tictactoe@2: shared.onnx was changed")
     (row,) = registry.replicas.acknowledgements(LEAGUE)
     assert (row.version, row.fault) == (1, "tictactoe@2: shared.onnx was changed")
 
 
-def test_a_silent_replica_is_listed_and_removed_after_a_day(registry: Registry) -> None:
-    registry.replicas.acknowledge("silent", LEAGUE, 1, "abc")
+def test_a_silent_replica_is_listed(registry: Registry) -> None:
+    acknowledge(registry, "silent", LEAGUE, 1, "abc")
     backdate(registry, "silent", timedelta(hours=23))
     registry.replicas.register("alive", {})
     silent = {row.replica: row.silence for row in registry.replicas.acknowledgements(LEAGUE)}
     assert silent["alive"] < timedelta(minutes=1) < timedelta(hours=22) < silent["silent"]
-    backdate(registry, "silent", timedelta(hours=25))
-    registry.replicas.register("alive", {})
-    assert [row.replica for row in registry.replicas.registered()] == ["alive"]
+    assert [row.replica for row in registry.replicas.silent()] == ["silent"]
+    assert [row.replica for row in registry.replicas.registered()] == ["alive", "silent"]
 
 
 def test_a_registered_replica_is_listed_before_it_serves_a_league(registry: Registry) -> None:
@@ -56,13 +57,29 @@ def test_a_registered_replica_is_listed_before_it_serves_a_league(registry: Regi
     assert (replica.process, replica.seen_at) == ({"machine": "here"}, row.seen_at)
 
 
-def test_an_acknowledgement_registers_again(registry: Registry) -> None:
-    """Another replica may take one for dead that is not."""
-    registry.replicas.register("replica-1", {"machine": "here"})
+def test_a_replica_that_is_not_registered_cannot_acknowledge(registry: Registry) -> None:
+    """Another replica may take one for dead that is not: it registers again, and acknowledges everything."""
+    assert not registry.replicas.register("replica-1", {"machine": "here"})
+    assert registry.replicas.register("replica-1", {"machine": "here"})
+    acknowledge(registry, "replica-1", LEAGUE, 1, "abc", event=7)
     registry.replicas.remove("replica-1")
-    registry.replicas.acknowledge("replica-1", LEAGUE, 1, "abc", event=7)
+    assert not registry.replicas.acknowledge("replica-1", ReadPosition(7, 7, 0), {})
+    assert registry.replicas.acknowledgements(LEAGUE) == []
+    assert not registry.replicas.register("replica-1", {"machine": "here"})
     (row,) = registry.replicas.acknowledgements(LEAGUE)
-    assert (row.replica, row.version, row.event) == ("replica-1", 1, 7)
+    assert (row.replica, row.version, row.event) == ("replica-1", None, None)
+
+
+def test_leagues_that_differ_have_a_row_until_they_are_settled(registry: Registry) -> None:
+    registered(registry, "another")
+    for league in (LEAGUE, "another"):
+        acknowledge(registry, "replica-1", league, 1, "abc", "it is broken")
+    faults = {league: registry.replicas.acknowledgements(league)[0].fault for league in (LEAGUE, "another")}
+    assert faults == {LEAGUE: "it is broken", "another": "it is broken"}
+    registry.replicas.acknowledge("replica-1", ReadPosition(0, 0, 0), {}, [LEAGUE])
+    assert [registry.replicas.acknowledgements(league)[0].fault for league in faults] == [None, "it is broken"]
+    registry.replicas.acknowledge("replica-1", ReadPosition(0, 0, 0), {})
+    assert [registry.replicas.acknowledgements(league)[0].fault for league in faults] == [None, None]
 
 
 @pytest.mark.parametrize("hours", [-1, 1, 25])
@@ -74,7 +91,7 @@ def test_times_are_those_of_the_database(registry: Registry, monkeypatch: pytest
     clock_of_replica = SimpleNamespace(now=lambda zone: datetime.now(zone) + timedelta(hours=hours))
     for module in (database, replicas):
         monkeypatch.setattr(module, "datetime", clock_of_replica, raising=False)
-    registry.replicas.acknowledge("replica-2", LEAGUE, 1, "abc")
+    acknowledge(registry, "replica-2", LEAGUE, 1, "abc")
     registry.replicas.register("replica-2", {})
     monkeypatch.undo()
     found = registry.replicas.acknowledgements(LEAGUE)
@@ -84,9 +101,9 @@ def test_times_are_those_of_the_database(registry: Registry, monkeypatch: pytest
 
 def test_a_stopped_replica_is_deleted(registry: Registry) -> None:
     registered(registry, "another")
-    registry.replicas.acknowledge("replica-1", LEAGUE, 1, "abc")
-    registry.replicas.acknowledge("replica-1", "another", 1, "abc")
-    registry.replicas.acknowledge("replica-2", LEAGUE, 1, "abc")
+    acknowledge(registry, "replica-1", LEAGUE, 1, "abc")
+    acknowledge(registry, "replica-1", "another", 1, "abc")
+    acknowledge(registry, "replica-2", LEAGUE, 1, "abc")
     registry.replicas.remove("replica-1")
     assert [row.replica for row in registry.replicas.acknowledgements(LEAGUE)] == ["replica-2"]
     assert [row.replica for row in registry.replicas.acknowledgements("another")] == ["replica-2"]
@@ -94,13 +111,11 @@ def test_a_stopped_replica_is_deleted(registry: Registry) -> None:
 
 def test_an_unknown_league_is_rejected(registry: Registry) -> None:
     with pytest.raises(UnknownLeague):
-        registry.replicas.acknowledge("replica-1", "chess", 1, "abc")
-    with pytest.raises(UnknownLeague):
         registry.replicas.acknowledgements("chess")
 
 
 def test_a_replica_reports_the_version_of_each_alias(registry: Registry) -> None:
-    registry.replicas.acknowledge("replica-1", LEAGUE, 2, "abc", None, {"champion": 2, "candidate": 3})
+    acknowledge(registry, "replica-1", LEAGUE, 2, "abc", None, {"champion": 2, "candidate": 3})
     (row,) = registry.replicas.acknowledgements(LEAGUE)
     assert row.aliases == {"champion": 2, "candidate": 3}
 
@@ -108,8 +123,8 @@ def test_a_replica_reports_the_version_of_each_alias(registry: Registry) -> None
 def test_any_acknowledgement_is_a_sign_of_life(registry: Registry) -> None:
     registered(registry, "another")
     for replica in ("replica-1", "replica-2"):
-        registry.replicas.acknowledge(replica, LEAGUE, 1, "abc")
+        acknowledge(registry, replica, LEAGUE, 1, "abc")
         backdate(registry, replica, timedelta(seconds=20))
-    registry.replicas.acknowledge("replica-1", "another", 1, "abc")
+    acknowledge(registry, "replica-1", "another", 1, "abc")
     silences = {row.replica: row.silence for row in registry.replicas.acknowledgements(LEAGUE)}
     assert silences["replica-1"] < LIVENESS_TIMEOUT < silences["replica-2"]

@@ -13,6 +13,7 @@ from league.registry.registry import Registry
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ReplicaReportTable
+from tests.support.leagues.acknowledgements import acknowledge
 from tests.support.leagues.registries import LEAGUE, registered
 
 EMPTY = (0,) * (len(BOUNDS) + 1)
@@ -127,12 +128,10 @@ def test_waiting_for_replicas_to_follow(versioned: Registry) -> None:
     setting = set_traffic(versioned, canary=Portion(2, 0.05))
     with pytest.raises(NotReady, match="is a server running"):
         versioned.changes.wait_for_traffic(setting, 0)
-    versioned.replicas.acknowledge(
-        "replica-1", LEAGUE, 1, "0" * 64, "2: shared.onnx was changed", {"champion": 1}, None
-    )
+    acknowledge(versioned, "replica-1", LEAGUE, 1, "0" * 64, "2: shared.onnx was changed", {"champion": 1}, None)
     with pytest.raises(NotReady, match=r"replica-1 2: shared\.onnx was changed"):
         versioned.changes.wait_for_traffic(setting, 0)
-    versioned.replicas.acknowledge("replica-1", LEAGUE, 1, "0" * 64, None, {"champion": 1, "2": 2}, setting.id)
+    acknowledge(versioned, "replica-1", LEAGUE, 1, "0" * 64, None, {"champion": 1, "2": 2}, setting.id)
     assert versioned.changes.wait_for_traffic(setting, 0) == ["replica-1"]
     set_traffic(versioned, canary=None)
     with pytest.raises(Conflict, match="was changed in the meantime"):

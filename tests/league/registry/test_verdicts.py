@@ -3,7 +3,15 @@ import math
 import pytest
 from sqlalchemy.exc import StatementError
 
-from league.errors import Conflict, InvalidInput, NotFound, UnknownLeague, UnknownVersion
+from league.errors import (
+    Conflict,
+    InvalidInput,
+    InvalidReference,
+    NotFound,
+    UnknownLeague,
+    UnknownVerdict,
+    UnknownVersion,
+)
 from league.registry.registry import Registry
 from tests.support.leagues.registries import LEAGUE, registered
 
@@ -52,6 +60,37 @@ def test_unknown_versions_verdicts_and_leagues_are_rejected(registry: Registry) 
         registry.verdicts.close("schedule-9", "promote", EVIDENCE)
     with pytest.raises(UnknownLeague):
         registry.verdicts.all("chess")
+
+
+@pytest.fixture
+def alike(registry: Registry) -> tuple[str, str]:
+    """Two verdicts with equal beginnings of their digests."""
+    ids = f"{LEAGUE}-verdict-0f3a62d1aa-1b", f"{LEAGUE}-verdict-0f3a62d1bb-1b"
+    for number, verdict in enumerate(ids, start=1):
+        registry.verdicts.open(LEAGUE, number, "script:random", verdict, SETTINGS)
+    return ids
+
+
+def test_a_verdict_is_found_by_a_unique_beginning(registry: Registry, alike: tuple[str, str]) -> None:
+    first, second = alike
+    for text in (first, "0f3a62d1a", f"{LEAGUE}-verdict-0f3a62d1a"):
+        assert registry.verdicts.find(text).id == first
+        assert registry.verdicts.find(text, LEAGUE).id == first
+    assert registry.verdicts.find("0f3a62d1bb-1b").id == second
+    assert registry.verdicts.get(first).short_id == "0f3a62d1"
+    for text in ("", "%", "_", "62d1", "1b", f"{first}0"):
+        with pytest.raises(UnknownVerdict):
+            registry.verdicts.find(text)
+    with pytest.raises(UnknownLeague):
+        registry.verdicts.find(first, "chess")
+
+
+def test_an_ambiguous_beginning_lists_the_candidates(registry: Registry, alike: tuple[str, str]) -> None:
+    for text in ("0f3a", "0f3a62d1", LEAGUE):
+        with pytest.raises(InvalidReference) as ambiguous:
+            registry.verdicts.find(text)
+        assert "0f3a62d1a (tictactoe@1 against script:random)" in str(ambiguous.value)
+        assert "0f3a62d1b (tictactoe@2 against script:random)" in str(ambiguous.value)
 
 
 def test_evidence_must_be_finite(registry: Registry) -> None:

@@ -78,11 +78,11 @@ async def test_a_tampered_version_does_not_go_live(slots: AliasSlots, registry: 
     for _ in range(3):
         await follow(slots, {CHAMPION: 2})
     assert number(slots) == 1
-    assert "shared.onnx was changed" in (slots.fault("board") or "")
+    assert "shared.onnx was changed" in (slots.faults().get("board") or "")
     assert ["version 1 stays" in line for line in log] == [True], "logged once"
     graph(registry, 2).write_bytes(content)
     await follow(slots, {CHAMPION: 2})
-    assert (number(slots), slots.fault("board")) == (2, None)
+    assert (number(slots), slots.faults().get("board")) == (2, None)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "removed", "empty", "other", "manifest", "extra"])
@@ -105,7 +105,7 @@ async def test_a_damaged_version_does_not_go_live(slots: AliasSlots, registry: R
             path.with_name("extra.bin").write_bytes(b"code")
     await follow(slots, {CHAMPION: 2})
     assert number(slots) == 1
-    assert slots.fault("board")
+    assert slots.faults().get("board")
 
 
 async def test_only_the_files_that_are_served_are_read(slots: AliasSlots, registry: Registry) -> None:
@@ -114,7 +114,7 @@ async def test_only_the_files_that_are_served_are_read(slots: AliasSlots, regist
     state.unlink()
     os.mkfifo(state)  # reading it would not end
     await follow(slots, {CHAMPION: 2})
-    assert (number(slots), slots.fault("board")) == (2, None)
+    assert (number(slots), slots.faults().get("board")) == (2, None)
 
 
 @pytest.mark.parametrize(("recorded_of", "answers"), [(3, True), (4, False)], ids=["matching", "other"])
@@ -126,17 +126,17 @@ async def test_a_version_goes_live_only_if_its_probes_match(
     new = publish(registry, "board", {"shared": masked_mlp(seed=3)}, "run/probed", recorded).number
     await follow(slots, {CHAMPION: new})
     assert number(slots) == (new if answers else 1)
-    assert (slots.fault("board") is None) == answers
-    assert answers or "probe observations" in str(slots.fault("board"))
+    assert (slots.faults().get("board") is None) == answers
+    assert answers or "probe observations" in str(slots.faults().get("board"))
 
 
 async def test_going_back_clears_the_fault(slots: AliasSlots, registry: Registry) -> None:
     await follow(slots, {CHAMPION: 1})
     graph(registry, 2).unlink()
     await follow(slots, {CHAMPION: 2})
-    assert slots.fault("board")
+    assert slots.faults().get("board")
     await follow(slots, {CHAMPION: 1})
-    assert (number(slots), slots.fault("board")) == (1, None)
+    assert (number(slots), slots.faults().get("board")) == (1, None)
 
 
 async def test_a_fault_in_one_league_does_not_affect_another(slots: AliasSlots, registry: Registry) -> None:
@@ -144,7 +144,7 @@ async def test_a_fault_in_one_league_does_not_affect_another(slots: AliasSlots, 
     await follow(slots, {CHAMPION: 1, ("vector", "champion"): 1})
     assert slots.champion("board") is None
     assert slots.champion("vector") is not None
-    assert slots.fault("vector") is None
+    assert slots.faults().get("vector") is None
 
 
 async def test_a_live_version_is_not_evicted(slots: AliasSlots, versions: VersionCache) -> None:
@@ -200,7 +200,7 @@ async def test_a_later_update_replaces_a_stalled_load(stalled: Stalled) -> None:
     stalled.gate.set()
     await asyncio.to_thread(stalled.gate.wait)
     await slots.settle(DEADLINE)
-    assert (number(slots), slots.fault("board")) == (3, None), "the version of before does not come back"
+    assert (number(slots), slots.faults().get("board")) == (3, None), "the version of before does not come back"
 
 
 async def test_a_load_that_takes_too_long_is_a_fault_until_it_succeeds(stalled: Stalled) -> None:
@@ -209,13 +209,13 @@ async def test_a_load_that_takes_too_long_is_a_fault_until_it_succeeds(stalled: 
     await follow(slots, {CHAMPION: 2})
     assert number(slots) == 1
     assert slots.is_settled
-    assert "board@2 was not loaded within 0.5 s" in (slots.fault("board") or "")
+    assert "board@2 was not loaded within 0.5 s" in (slots.faults().get("board") or "")
     await follow(slots, {CHAMPION: 2})
     assert stalled.calls.count(("board", 2)) == 1, "a stalled thread is not joined by another one"
     stalled.gate.set()
     while number(slots) != 2:
         await follow(slots, {CHAMPION: 2})
-    assert slots.fault("board") is None
+    assert slots.faults().get("board") is None
 
 
 async def test_any_exception_is_a_fault_of_its_alias(registry: Registry, log: list[str]) -> None:
@@ -227,7 +227,7 @@ async def test_any_exception_is_a_fault_of_its_alias(registry: Registry, log: li
     slots = AliasSlots(VersionCache(exhausted, capacity=1, retry=0))
     await follow(slots, {CHAMPION: 1, OTHER: 1})
     await follow(slots, {CHAMPION: 2, OTHER: 1})
-    assert (number(slots), slots.fault("board"), slots.fault("vector")) == (
+    assert (number(slots), slots.faults().get("board"), slots.faults().get("vector")) == (
         1,
         "champion: MemoryError while loading",
         None,

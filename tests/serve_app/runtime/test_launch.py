@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
 from league.settings import Storage
 from serve_app.runtime import launch
-from serve_app.runtime.launch import DEPLOY_YAML, running
+from serve_app.runtime.launch import DEPLOY_YAML, load_document, running
 from tests.support.waiting import until
 
 
@@ -48,6 +49,51 @@ def test_an_unusable_home_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a directory")
     with pytest.raises(StorageError, match="file"), running(Storage.at(tmp_path / "file" / "home")):
         pass
+
+
+@pytest.mark.parametrize(
+    ("replicas", "max_replicas", "expected"),
+    [(None, None, (2, 2)), (3, None, (3, 3)), (1, 4, (1, 4)), (None, 5, (2, 5))],
+)
+def test_the_options_set_the_bounds_of_the_number_of_replicas(
+    replicas: int | None, max_replicas: int | None, expected: tuple[int, int]
+) -> None:
+    document = load_document(DEPLOY_YAML, None, None, None, replicas, max_replicas, insecure=False)
+    bounds = document["applications"][0]["deployments"][0]["autoscaling_config"]
+    assert (bounds["min_replicas"], bounds["max_replicas"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("replicas", "max_replicas", "message"),
+    [
+        (3, 2, "--max-replicas must be at least 3, as --replicas or min_replicas, got 2"),
+        (None, 1, "--max-replicas must be at least 2, as --replicas or min_replicas, got 1"),
+        (0, 2, "min_replicas must be at least 1, got 0"),
+    ],
+)
+def test_impossible_numbers_of_replicas_are_reported(replicas: int | None, max_replicas: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_document(DEPLOY_YAML, None, None, None, replicas, max_replicas, insecure=False)
+
+
+def test_a_deploy_yaml_may_have_a_fixed_number_of_replicas(tmp_path: Path) -> None:
+    document = yaml.safe_load(DEPLOY_YAML.read_text())
+    deployment = document["applications"][0]["deployments"][0]
+    del deployment["autoscaling_config"]
+    deployment["num_replicas"] = 2
+    deploy = tmp_path / "deploy.yaml"
+    deploy.write_text(yaml.safe_dump(document))
+    loaded = load_document(deploy, None, None, None, 3, None, insecure=False)
+    assert loaded["applications"][0]["deployments"][0]["num_replicas"] == 3
+    with pytest.raises(ConfigError, match=r"--max-replicas: deploy\.yaml has num_replicas"):
+        load_document(deploy, None, None, None, None, 3, insecure=False)
+
+
+def test_an_impossible_target_is_reported(tmp_path: Path) -> None:
+    deploy = tmp_path / "deploy.yaml"
+    deploy.write_text(DEPLOY_YAML.read_text().replace("target: 0.6", "target: 60"))
+    with pytest.raises(ConfigError, match="target must be greater than 0 and less than 1, got 60"):
+        load_document(deploy, None, None, None, None, None, insecure=False)
 
 
 def test_a_missing_haproxy_is_reported(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,10 @@ relies on it.
 import ast
 import inspect
 import json
+import re
 import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -16,7 +19,7 @@ import httpx
 import psutil
 import pytest
 import uvicorn
-from ray.serve._private import grpc_util, http_util
+from ray.serve._private import common, grpc_util, http_util, replica
 from ray.serve._private.common import RequestProtocol
 from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
 from ray.serve._private.replica import SERVE_BUILD_ASGI_APP_METHOD
@@ -29,8 +32,9 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.sync.client import connect
 
-from serve_app.runtime import haproxy, haproxy_script, uvicorn_http, uvicorn_websocket
+from serve_app.runtime import haproxy, haproxy_script, ray_serve, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.ray_serve import AsgiReplica
+from serve_app.runtime.starting_page import starting_page
 from tests.support.clients.actions import BOARD
 from tests.support.servers.under_load import RayServer
 from tests.support.waiting import until
@@ -52,6 +56,11 @@ class TestHAProxyConfiguration:
     @pytest.fixture
     def directory(self, tmp_path: Path) -> Path:
         """A directory with the configuration that Ray generates for one application."""
+        self.generate(tmp_path, replicas=True)
+        return tmp_path
+
+    def generate(self, tmp_path: Path, replicas: bool) -> None:
+        """Write the configuration for one application with or without replicas."""
         config = HAProxyConfig(
             socket_path=str(tmp_path / "admin.sock"),
             server_state_base=str(tmp_path),
@@ -70,22 +79,27 @@ class TestHAProxyConfiguration:
                 path_prefix="/",
                 app_name="policies",
                 protocol=protocol,
-                servers=[ServerConfig("replica", "127.0.0.1", port)],
+                servers=[ServerConfig("replica", "127.0.0.1", port)] if replicas else [],
+                fallback_server=ServerConfig("fallback", "127.0.0.1", port + 2),
             )
             for protocol, port in ((RequestProtocol.HTTP, 40000), (RequestProtocol.GRPC, 40001))
         }
         api = HAProxyApi(config, backends, str(tmp_path / "haproxy.cfg"))
+        api.set_grpc_fallback_server(ServerConfig("fallback", "127.0.0.1", 40003))
         api._generate_config_file_internal()
-        return tmp_path
 
     def start(self, directory: Path) -> None:
-        """Run the script as Ray does, with FAKE in place of HAProxy, and wait for the stand-in."""
+        """Run the script as Ray does, with FAKE in place of HAProxy."""
         binary, script = directory / "binary", directory / "haproxy"
         binary.write_text(FAKE)
         script.write_text(haproxy_script.script(directory, str(binary), STATS, METRICS))
         for path in (binary, script):
             path.chmod(0o700)
         subprocess.run([script, "-db", "-f", directory / "haproxy.cfg"], check=True, timeout=20, cwd=directory)
+
+    def start_with_stand_in(self, directory: Path) -> None:
+        """`start`, and wait for the stand-in."""
+        self.start(directory)
         deadline = monotonic() + 20
         while not (directory / "standin").exists():
             assert monotonic() < deadline, "the stand-in has not started: is Ray's `use_backend` line still there?"
@@ -113,7 +127,7 @@ class TestHAProxyConfiguration:
             )
 
     def test_statistics_listen_on_loopback_only(self, directory: Path) -> None:
-        self.start(directory)
+        self.start_with_stand_in(directory)
         lines = [line.strip() for line in (directory / "haproxy.cfg").read_text().splitlines()]
         for port in (STATS, METRICS):
             (bind,) = (line for line in lines if line.startswith("bind ") and line.endswith(f":{port}"))
@@ -122,7 +136,7 @@ class TestHAProxyConfiguration:
             )
 
     def test_time_limits_are_added(self, directory: Path) -> None:
-        self.start(directory)
+        self.start_with_stand_in(directory)
         text = (directory / "haproxy.cfg").read_text()
         for line in (
             f"defaults\n    timeout http-request {haproxy_script.REQUEST_TIMEOUT}s\n"
@@ -132,7 +146,7 @@ class TestHAProxyConfiguration:
             assert line in text, "haproxy_script.py no longer adds this to Ray's configuration"
 
     def test_the_stand_in_keeps_the_routes_only(self, directory: Path) -> None:
-        self.start(directory)
+        self.start_with_stand_in(directory)
         text = (directory / "standin.cfg").read_text()
         assert "use_backend " in text
         assert "frontend http_frontend" in text
@@ -149,11 +163,74 @@ class TestHAProxyConfiguration:
             )
 
     def test_haproxy_accepts_the_edited_configurations(self, directory: Path) -> None:
-        self.start(directory)
+        self.start_with_stand_in(directory)
         check = [get_haproxy_binary(), "-c", "-f"]
         for name in ("haproxy.cfg", "standin.cfg"):
             found = subprocess.run([*check, directory / name], capture_output=True, text=True, timeout=20)
             assert found.returncode == 0, f"HAProxy refuses {name} after haproxy_script.py: {found.stderr}"
+
+    def test_the_starting_page_responds_until_a_replica_is_known(self, directory: Path) -> None:
+        """Ray's proxy would keep requests waiting; it is a backup in case of faults, once there were replicas."""
+
+        def listens() -> bool:
+            text = (directory / "haproxy.cfg").read_text()
+            return f"bind 127.0.0.1:{HTTP}" in text and f":{GRPC} proto h2" in text
+
+        self.generate(directory, replicas=False)
+        assert listens(), "Ray's template binds the ports in other lines"
+        self.start(directory)
+        assert not listens(), "haproxy_script.py does not find the bind lines"
+        self.generate(directory, replicas=True)
+        self.start_with_stand_in(directory)
+        assert listens(), "haproxy_script.py does not find the servers of the replicas"
+        self.generate(directory, replicas=False)
+        self.start(directory)
+        assert listens(), "haproxy_script.py does not find the routes"
+
+    def test_the_first_haproxy_with_a_replica_takes_over_from_the_starting_page(self, directory: Path) -> None:
+        """Each request gets a response: of the page, and then of the replica."""
+        path, binary = directory / "haproxy.cfg", haproxy_script.find_haproxy()
+        assert binary is not None
+        ports = dict(zip((HTTP, GRPC, STATS, METRICS, 40000), haproxy.free_ports(5), strict=True))
+        text = path.read_text()
+        for port, free in ports.items():
+            text = re.sub(rf":{port}\b", f":{free}", text)
+        path.write_text(text)
+        script = directory / "haproxy"
+        script.write_text(haproxy_script.script(directory, binary, ports[STATS], ports[METRICS]))
+        script.chmod(0o700)
+        replica = ThreadingHTTPServer(("127.0.0.1", ports[40000]), Replica)
+        threading.Thread(target=replica.serve_forever, daemon=True).start()
+        url, answered = f"http://127.0.0.1:{ports[HTTP]}/v1/health/ready", list[int]()
+
+        def answer(wanted: int) -> bool:
+            answered.append(httpx.get(url, trust_env=False).status_code)
+            return answered[-1] == wanted
+
+        with starting_page(directory, binary, "127.0.0.1", ports[HTTP], ports[GRPC]):
+            until(lambda: not haproxy.is_free("127.0.0.1", ports[HTTP]))
+            assert answer(503)
+            with subprocess.Popen([script, "-db", "-f", path], stderr=subprocess.DEVNULL):
+                try:
+                    until(lambda: answer(200))
+                finally:
+                    haproxy.stop(directory)
+                    replica.shutdown()
+                    replica.server_close()
+        assert set(answered) == {503, 200}
+        assert haproxy.processes(directory) == []
+
+
+class Replica(BaseHTTPRequestHandler):
+    """Responds with 200 to every request."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("content-length", "0")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
 
 
 def test_ray_serve_knows_the_variables_that_are_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -375,9 +452,22 @@ class TestServer:
 
     def test_haproxy_listens_on_loopback_only(self, url: str) -> None:
         port = int(url.rpartition(":")[2])
-        addresses = [_listening(process) for process in psutil.Process().children(recursive=True)]
-        ours = [found for found in addresses if any(address.port == port for address in found)]
-        assert ours, "HAProxy is not a descendant of the server any more"
-        listening = set().union(*ours)
-        assert len(listening) >= 4, "HTTP, gRPC, and HAProxy's statistics and metrics"
-        assert {address.ip for address in listening} == {"127.0.0.1"}, listening
+
+        def listening() -> set[Any]:
+            """The addresses of the processes that listen on the port of the server."""
+            addresses = [_listening(process) for process in psutil.Process().children(recursive=True)]
+            return set().union(*(found for found in addresses if any(address.port == port for address in found)))
+
+        # HTTP, gRPC, and HAProxy's statistics and metrics. While HAProxy reloads, they can be missing.
+        until(lambda: len(listening()) >= 4)
+        assert {address.ip for address in listening()} == {"127.0.0.1"}
+
+
+def test_statistics_of_a_replica_replace_those_of_serve() -> None:
+    """A replica records requests in progress under Serve's key, and adds to Serve's count of requests."""
+    assert ray_serve.RUNNING_REQUESTS == common.RUNNING_REQUESTS_KEY
+    recording = inspect.getsource(replica.ReplicaMetricsManager._add_autoscaling_metrics_point_async)
+    assert recording.index("RUNNING_REQUESTS_KEY") < recording.index("metrics_dict.update(custom_metrics)")
+    counter = re.search(r'"serve_deployment_request_counter".*?tag_keys=(\(.*?\))', inspect.getsource(replica), re.S)
+    assert counter is not None
+    assert ast.literal_eval(counter[1]) == ("route",)

@@ -8,12 +8,13 @@ from typing import Any
 
 import httpx
 
+from evaluation.matches.tournament import evaluate
 from evaluation.service.snapshots import refresh
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
-from league.registry.storage.rows import Portion, RunPoint, VerdictRow
+from league.registry.storage.rows import Portion, RunPoint, StrengthRow, VerdictRow
 from tests.support.leagues import tictactoe
 from tests.support.leagues.reported_league import HOSTILE, league_after_nightly
 from tests.support.leagues.tictactoe import LEAGUE
@@ -41,6 +42,7 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
             tictactoe.config(league=HIDDEN, environment=hidden),
         ):
             registry.leagues.register(config, interface(config))
+        change_game(registry)
         registry.traffic.set(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
         registry.versions.set_note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
         registry.runs.begin(
@@ -48,8 +50,40 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
         )
         for number in range(20):
             record(registry, 1000 * (number + 1))
+        registry.strength.record(LEAGUE, RUN, map(strength, (1, 2, 3)))
+        nights(registry)
         compute(registry)
         yield registry
+
+
+def change_game(registry: Registry) -> None:
+    """Play matches of a league, and change its game afterwards."""
+    now = registry.leagues.get(NAMED)
+    before = now.config.model_copy(update={"play": now.config.play.model_copy(update={"opening_plies": 4})})
+    registry.leagues.register(before, now.interface)
+    evaluate(NAMED, ["script:random", "script:one_ply"], registry=registry, blocks=2)
+    registry.leagues.register(now.config, now.interface)
+
+
+def strength(number: int) -> StrengthRow:
+    """The score of a version of the run."""
+    score = 0.4 + number / 10
+    return StrengthRow(number, 6000 * number, "script:random", 200, score, score - 0.1, score + 0.1, datetime.now(UTC))
+
+
+def nights(registry: Registry) -> None:
+    """Two nights of training with the champions 1 and 2."""
+    for number in (1, 2):
+        night, ref = registry.training_nights.open(LEAGUE), f"{LEAGUE}@{number}"
+        score = {"ref": f"{LEAGUE}@3", "games": 64, "score": 0.8 - number / 10, "low": 0.5, "high": 0.9, "gain": None}
+        for step, result in {
+            "train": {"run": RUN, "versions": [ref]},
+            "gate": {"champion_before": None, "champion": ref, "verdicts": []},
+            "exploiter": {"target": ref, "versions": [f"{LEAGUE}@3"], "error": HOSTILE},
+            "measure": {"exploitability": {"ref": ref, "bound": 0.5, "exploiters": [score]}},
+        }.items():
+            registry.training_nights.record(night.id, step, result)
+        registry.training_nights.close(night.id)
 
 
 def compute(registry: Registry) -> None:
@@ -61,6 +95,7 @@ def compute(registry: Registry) -> None:
 def record(registry: Registry, steps: int) -> None:
     """Record progress of the run."""
     curves = {"player/return": steps / 40_000, "player/entropy": 2 - steps / 40_000, "time/sampling": 1.5}
+    curves |= {f"opponents/{LEAGUE}@1/share": 0.3, f"opponents/{LEAGUE}@1/score": 0.4 + steps / 100_000}
     registry.runs.record(LEAGUE, RUN, RunPoint(steps, curves, datetime.now(UTC)), seconds=0.0225 * steps)
 
 

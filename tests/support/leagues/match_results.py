@@ -5,13 +5,24 @@ from datetime import UTC, datetime
 from typing import Any
 
 from league.registry.registry import Registry
-from league.registry.storage.rows import RunPoint
+from league.registry.storage.rows import RunPoint, StrengthRow
 from league.results.ledger import Ledger
 from league.results.records import Forfeit, Schedule
 from tests.support.leagues.ledger_matches import play_match
 
 LEAGUE = "board"
 WON, LOST, PENDING = "board-verdict-won", "board-verdict-lost", "board-verdict-pending"
+EARLIER = "0123456789ab-greedy"
+"""Earlier conditions with results."""
+STRENGTH = StrengthRow(2, 200, "board@1", 40, 0.625, 0.5, 0.75, datetime(2026, 3, 3, 14, tzinfo=UTC))
+EXPLOITER_SCORE = {"ref": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875, "gain": None}
+NIGHT = {
+    "train": {"run": "first", "versions": ["board@2"]},
+    "gate": {"champion_before": "board@1", "champion": "board@2", "verdicts": []},
+    "exploiter": {"target": "board@2", "run": "exploiter", "versions": ["board@3"], "error": "the disk is full"},
+    "measure": {"exploitability": {"ref": "board@2", "bound": 0.625, "exploiters": [EXPLOITER_SCORE]}},
+}
+"""The results of a night's steps."""
 SCHEDULE = Schedule(
     id="board-round_robin-1",
     league=LEAGUE,
@@ -33,6 +44,7 @@ def record(registry: Registry) -> None:
     _matches(registry)
     _verdicts(registry)
     _runs(registry)
+    _nights(registry)
     registry.snapshots.put(LEAGUE, snapshots(), registry.snapshots.current_marks()[LEAGUE])
 
 
@@ -85,6 +97,18 @@ def _runs(registry: Registry) -> None:
         point = RunPoint(steps, {"return": steps / 1000, "shared/entropy": 1.5}, datetime.now(UTC))
         registry.runs.record(LEAGUE, "first", point, seconds=steps / 10)
     registry.runs.end(LEAGUE, "first", "failed", "the environment raised")
+    registry.runs.begin(LEAGUE, "exploiter", algorithm="ppo", settings={}, seed=3, target=1000, exploits="board@2")
+    registry.runs.end(LEAGUE, "exploiter", "ended")
+    registry.strength.record(LEAGUE, "first", [STRENGTH])
+
+
+def _nights(registry: Registry) -> None:
+    """A complete night, and one that has only begun."""
+    night = registry.training_nights.open(LEAGUE)
+    for step, result in NIGHT.items():
+        registry.training_nights.record(night.id, step, result)
+    registry.training_nights.close(night.id)
+    registry.training_nights.open(LEAGUE)
 
 
 def snapshots() -> dict[str, Any]:
@@ -104,6 +128,16 @@ def snapshots() -> dict[str, Any]:
             "sides": ["player_0", "player_1"],
             "environment": "games.none:none",
             "environment_digest": "0" * 64,
+            "earlier": [
+                {
+                    "name": EARLIER,
+                    "actions": "greedy",
+                    "matches": 3,
+                    "changes": [{"name": "play.opening_plies", "before": "4", "now": "2"}],
+                    "actions_changed": False,
+                    "replaced_at": "2026-03-02T14:00:00Z",
+                }
+            ],
         },
         "leaderboard": {
             "sides": ["player_0", "player_1"],
@@ -117,6 +151,8 @@ def snapshots() -> dict[str, Any]:
             "by_side": {},
             "difference": [[None, {"mean": 0.5, "low": None, "high": None}], [None, None]],
         },
+        f"earlier/{EARLIER}/leaderboard": {"sides": [], "leaderboard": leaderboard[1:2], "by_side": {}},
+        f"earlier/{EARLIER}/payoff": None,
         "ratings": {"versions": [rated(number) for number in (1, 2, 3)]},
         f"verdict/{WON}": judgement | {"opened_at": "2026-03-03T14:00:00Z", "closed_at": "2026-03-03T14:09:00Z"},
         f"verdict/{LOST}": stale,

@@ -48,12 +48,21 @@ def registry(home: Path, **parts: object) -> Registry:
     return opened
 
 
-def publish(registry: Registry, graph: bytes, league: str = LEAGUE, exploits: str | None = None) -> VersionRow:
-    """Publish a version with one graph for all policies of the league. exploits: it is an exploiter of this version."""
-    number = len(registry.versions.all(league))
-    return registry.publisher.publish(
-        league, _builder(registry.leagues.get(league), graph, exploits), source=f"hand/{number}", parent=None
-    )
+def publish(
+    registry: Registry,
+    graph: bytes,
+    league: str = LEAGUE,
+    exploits: str | None = None,
+    source: str | None = None,
+    settings: Mapping[str, object] | None = None,
+) -> VersionRow:
+    """Publish a version with one graph for all policies of the league.
+
+    exploits: it is an exploiter of this version. source: by default a new one. settings: of its training.
+    """
+    source = source or f"hand/{len(registry.versions.all(league))}"
+    build = _builder(registry.leagues.get(league), graph, exploits, dict(settings or {}))
+    return registry.publisher.publish(league, build, source=source, parent=None)
 
 
 def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: NDArray | None = None) -> bytes:
@@ -183,7 +192,9 @@ def _model(
     return bytes(model.SerializeToString())
 
 
-def _builder(row: LeagueRow, graph: bytes, exploits: str | None) -> Callable[[Path, int], Manifest]:
+def _builder(
+    row: LeagueRow, graph: bytes, exploits: str | None, settings: dict[str, object]
+) -> Callable[[Path, int], Manifest]:
     def build(directory: Path, number: int) -> Manifest:
         policies = {}
         for name in row.interface.policy_ids:
@@ -207,7 +218,7 @@ def _builder(row: LeagueRow, graph: bytes, exploits: str | None) -> Callable[[Pa
             environment=row.config.environment,
             environment_digest=row.environment_digest,
             algorithm="ppo",
-            settings={},
+            settings=settings,
             seed=0,
             steps=number,
             role=MAIN if exploits is None else EXPLOITER,

@@ -26,7 +26,7 @@ def programs() -> Path | None:
 
 
 @contextmanager
-def server(binaries: Path) -> Iterator[Path]:
+def server(binaries: Path, max_connections: int = 100) -> Iterator[Path]:
     """Run a server; yields the directory of its socket. PostgreSQL does not run as root: root switches to another
     account.
     """
@@ -39,7 +39,7 @@ def server(binaries: Path) -> Iterator[Path]:
         data = str(home / "data")
         initdb = [str(binaries / "initdb"), "-D", data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync"]
         subprocess.run(initdb, check=True, **quiet)
-        options = ["-k", name, "-c", "listen_addresses=", "-c", "fsync=off", "-c", "max_connections=50"]
+        options = ["-k", name, "-c", "listen_addresses=", "-c", "fsync=off", "-c", f"max_connections={max_connections}"]
         process = subprocess.Popen([str(binaries / "postgres"), "-D", data, *options], **quiet)
         try:
             _wait(home, process)

@@ -42,7 +42,7 @@ def main() -> None:
 
     ray.init(address=address, namespace="serve", log_to_driver=False)
     schema = ServeDeploySchema.model_validate(
-        load_document(Path(deploy_yaml), None, None, None, int(count), insecure=True)
+        load_document(Path(deploy_yaml), None, None, None, int(count), None, insecure=True)
     )
     deploy(schema)
     ray.shutdown()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 
 from league.config.league import LeagueConfig
+from league.config.off_policy import DQNConfig
+from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
@@ -196,6 +199,17 @@ def test_exploration_and_priorities_follow_their_schedules(monkeypatch: pytest.M
     assert betas == sorted(betas)
     assert 0.4 < betas[0] < 0.5 < betas[-1] == pytest.approx(0.55)
     assert train(league, 3, inspect_algorithm) == (3072, pytest.approx(0.1), pytest.approx(0.85))
+
+
+def test_the_correction_by_priorities_follows_the_time_if_only_that_is_limited() -> None:
+    assert OffPolicy._beta.fget is not None
+    for settings, expected in (({"minutes": 5}, 0.7), ({"steps": 1000, "minutes": 5}, 0.55)):
+        algorithm = SimpleNamespace(
+            settings=DQNConfig.model_validate({"algorithm": "dqn", "priorities": {"beta": 0.4}, **settings}),
+            progress=ScheduleProgress(steps=250, budget=0.5),
+            steps=250,
+        )
+        assert OffPolicy._beta.fget(algorithm) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("settings", [{}, ALL_EXTENSIONS], ids=["plain", "all extensions"])

@@ -9,10 +9,11 @@ import pytest
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
+from league.results.payoffs import PRIOR_GAMES, payoff_matrix
 from league.results.records import BlockResult
 from league.settings import Storage
 from tests.support.leagues import registries
-from training.algorithms.league_opponents import HALF_LIFE, PRIOR_GAMES, LeagueOpponents, payoff_matrix
+from training.algorithms.league_opponents import HALF_LIFE, LeagueOpponents
 
 
 @pytest.fixture
@@ -54,6 +55,16 @@ def test_candidates_are_the_newest_versions_and_all_champions(registry: Registry
     opponents = opponents_of(registry, ("tictactoe@7",), window=2, champions=False)
     opponents.refresh()
     assert opponents.candidates == ("tictactoe@6",)
+
+
+def test_of_a_mixture_the_members_are_candidates(registry: Registry) -> None:
+    for number in range(6):
+        registries.publish(registry, f"run/{number}")
+    number = registry.publisher.publish_mixture("tictactoe", {1: 0.5, 3: 0.5}).number
+    registry.aliases.set("tictactoe", "champion", number, expected=ANY, actor="me", reason="test")
+    opponents = opponents_of(registry, window=2)
+    opponents.refresh()
+    assert opponents.candidates == tuple(f"tictactoe@{number}" for number in (1, 3, 5, 6))
 
 
 def test_versions_with_another_interface_are_no_candidates(registry: Registry) -> None:

@@ -110,3 +110,14 @@ def test_an_unchanged_policy_is_not_clipped() -> None:
     )
     assert loss.clip_fraction == 0
     assert loss.total.item() == pytest.approx(-steps.advantages.mean().item(), abs=1e-6)
+
+
+def test_all_parts_of_the_loss_are_on_the_device_of_the_data() -> None:
+    """As on a GPU: without a magnet or a teacher, their parts are 0 on the same device."""
+    space = spaces.Discrete(4)
+    data = minibatch(space)
+    columns = (data.actions, data.dist_inputs, data.log_p, data.advantages, data.targets)
+    moved = Minibatch({}, *(column.to("meta") for column in columns))
+    options = {"clip": CLIP, "entropy": ENTROPY, "value_loss": VALUE}
+    loss = ppo_loss(moved, moved.dist_inputs, moved.targets, torch_distribution(space), **options)
+    assert {part.device.type for part in loss} == {"meta"}

@@ -43,6 +43,13 @@ def test_other_errors_have_type_message_and_line_of_the_user_code() -> None:
     assert str(error).endswith("see the traceback in /runs/error.txt")
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_notes_name_the_episode() -> None:
+    fault = KeyError("ball")
+    fault.add_note("in the episode with seed 7")
+    assert " in the episode with seed 7; see the traceback" in str(training_error(through_processes(fault), "a", TRACE))
+
+
 def test_an_error_without_message_or_line() -> None:
     assert str(training_error(MemoryError(), "a", TRACE)) == (
         "league a: training failed with MemoryError; see the traceback in /runs/error.txt"

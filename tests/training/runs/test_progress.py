@@ -1,4 +1,5 @@
 import io
+from collections.abc import Iterable
 
 from rich.console import Console
 
@@ -9,10 +10,11 @@ SETTINGS = PPOConfig(steps=1000, minutes=2)
 METRICS = {"steps": 250, "seconds": 60.0, "steps_per_second": 12.5, "a/return": 0.5, "a/length": 7.0, "a/entropy": 1.25}
 
 
-def output_of(*updates: dict[str, object], terminal: bool = False, policies: tuple[str, ...] = ("a", "b")) -> str:
+def output_of(*updates: dict[str, object], terminal: bool = False, policies: Iterable[str] = ("a", "b")) -> str:
+    """policies: of each agent in turn."""
     file = io.StringIO()
     console = Console(file=file, force_terminal=terminal, width=200)
-    with TrainingProgress(console, SETTINGS, policies) as progress:
+    with TrainingProgress(console, SETTINGS, {f"agent_{i}": policy for i, policy in enumerate(policies)}) as progress:
         for metrics in updates:
             progress.update(metrics)
     return file.getvalue()
@@ -35,6 +37,17 @@ def test_a_log_has_few_lines_but_the_last_one() -> None:
 def test_the_number_of_policies_in_a_line_is_limited() -> None:
     (line,) = output_of(METRICS, policies=("a", "b", "c", "d", "e")).splitlines()
     assert line.endswith("c: no finished episode yet; 2 more")
+
+
+def test_the_first_agents_return_is_shown_where_self_play_cancels_the_policys() -> None:
+    """The policy plays both agents, of which one wins what the other loses."""
+    agents = {"agents/agent_0/return": 0.25, "agents/agent_1/return": -0.25}
+    (line,) = output_of(METRICS | agents | {"a/return": 0.0}, policies=("a", "a")).splitlines()
+    assert "a: return +0.25 as agent_0, length 7.0" in line
+    (line,) = output_of(METRICS | agents, policies=("a", "a")).splitlines()
+    assert "a: return +0.50, length 7.0" in line
+    (line,) = output_of(METRICS | {"a/return": 0.0, "agents/agent_0/return": 0.0}, policies=("a", "a")).splitlines()
+    assert "a: return +0.00, length 7.0" in line
 
 
 def test_a_terminal_has_a_progress_bar() -> None:
@@ -72,4 +85,4 @@ def test_the_most_frequent_opponents_are_shown_with_the_scores_against_them() ->
     (line,) = output_of(
         METRICS | scores | {f"opponents/{ref}/share": share for ref, share in shares.items()}
     ).splitlines()
-    assert line.endswith("; opponents: script:random 25%, a@3 25%, a@2 25%")
+    assert line.endswith("; score 25% against script:random, 25% against a@3, 25% against a@2")

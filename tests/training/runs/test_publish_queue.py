@@ -32,8 +32,8 @@ def queue_of(parent: int | None = None) -> PublishQueue:
     run: Any = SimpleNamespace(
         id="run", record=SimpleNamespace(config=None, parent=parent, git_commit=None, exploits=None)
     )
-    ignore: Any = SimpleNamespace(published=lambda row: None)
-    return PublishQueue(run, ignore, ignore, ignore)
+    unused: Any = None
+    return PublishQueue(run, unused, unused, announce=lambda row: None)
 
 
 def checkpoints(directory: Path, *steps: int) -> list[Path]:

@@ -45,6 +45,10 @@ def test_a_complete_run_continues_with_a_larger_budget(storage: Storage) -> None
             RunDirectory.resume(storage, tictactoe(**budget))
     assert not RunDirectory.resume(storage, tictactoe(steps=11, minutes=5)).record.complete
     RunDirectory.resume(storage, tictactoe(steps=11, minutes=5)).complete()
+    assert RunDirectory.resume(storage, tictactoe(minutes=5)).record.config.training.max_steps is None
+    RunDirectory.resume(storage, tictactoe(minutes=5)).complete()
+    with pytest.raises(NotFound, match="unless --steps or --minutes is larger"):
+        RunDirectory.resume(storage, tictactoe(minutes=5))
     assert RunDirectory.resume(storage, tictactoe(steps=11)).record.config.training.minutes is None
 
 

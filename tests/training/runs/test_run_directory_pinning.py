@@ -4,9 +4,10 @@ import pytest
 
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
-from league.errors import ConfigError, LeagueError, UnknownVersion
+from league.errors import ConfigError, InvalidInput, LeagueError, UnknownVersion
 from tests.support.leagues import tictactoe
 from training.runs.run_directory import pin_opponents, with_pins
+from training.sampling.opponents import without_mixtures
 
 
 def with_opponents(*refs: str) -> LeagueConfig:
@@ -38,6 +39,25 @@ def test_the_magnet_is_pinned_too(tmp_path: Path) -> None:
         assert isinstance(settings, PPOConfig)
         assert settings.magnet is not None
         assert settings.magnet.ref == pinned.get(ref, ref)
+
+
+def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) -> None:
+    registry = tictactoe.registry(tmp_path)
+    for _ in range(2):
+        tictactoe.publish(registry, tictactoe.graph())
+    number = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75}).number
+    registry.aliases.set("tictactoe", "champion", number, expected=None, actor="me", reason="first")
+    spaces = registry.leagues.get("tictactoe").interface
+    league = with_opponents("@champion", "script:random")
+    pins = pin_opponents(league, registry, spaces)
+    assert pins == {"@champion": "tictactoe@3", "script:random": "script:random"}
+    fixed = with_pins(league, pins).training.opponents.fixed
+    played = without_mixtures(fixed, registry.storage)
+    assert [each.ref for each in played] == ["tictactoe@1", "tictactoe@2", "script:random"]
+    assert [each.share for each in played] == pytest.approx([0.075, 0.225, 0.3])
+    magnet = tictactoe.config().with_training(magnet={"ref": "@champion", "weight": 0.1})
+    with pytest.raises(InvalidInput, match=r"tictactoe@3 is a mixture \(@1 25.0%, @2 75.0%\): name one of its members"):
+        pin_opponents(magnet, registry, spaces)
 
 
 @pytest.mark.parametrize(

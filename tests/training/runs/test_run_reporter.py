@@ -53,6 +53,7 @@ def result(steps: int, **curves: object) -> dict[str, object]:
         "done": False,
         "config": {"lr": 1},
         "agents/player_1/return": 0.5,
+        "agents/player_1/length": 5.0,
     } | curves
 
 
@@ -81,9 +82,17 @@ def test_settings_and_curves_are_recorded(registry: Registry, run: RunDirectory)
     assert (row.state, row.error, row.attempts, row.seconds) == ("ended", None, 1, 20.0)
     points = registry.runs.points("tictactoe", run.id)
     assert [(point.steps, point.curves) for point in points] == [
-        (100, {"shared/return": 0.0333333}),
-        (200, {"shared/return": 0.0666667}),
+        (100, {"shared/return": 0.0333333, "agents/player_1/return": 0.5}),
+        (200, {"shared/return": 0.0666667, "agents/player_1/return": 0.5}),
     ]
+
+
+def test_returns_of_many_agents_are_not_recorded(registry: Registry, run: RunDirectory) -> None:
+    crowd = {f"agents/player_{number}/return": 0.5 for number in range(1, 10)}
+    with RunReporter(registry, run) as reporter:
+        reporter.begin(0, 0.0)
+        reporter.report(result(100, loss=1.0, **crowd))
+    assert recorded(registry, run).curves == {"loss": 1.0}
 
 
 def test_reports_faster_than_the_registry_are_merged(
@@ -103,7 +112,9 @@ def test_reports_faster_than_the_registry_are_merged(
         reporter.report(result(200, **{"return": 2.0}))
         resume.set()
     points = registry.runs.points("tictactoe", run.id)
-    assert [(point.steps, point.curves) for point in points] == [(200, {"return": 2.0, "loss": 0.5})]
+    assert [(point.steps, point.curves) for point in points] == [
+        (200, {"return": 2.0, "loss": 0.5, "agents/player_1/return": 0.5})
+    ]
 
 
 @pytest.mark.parametrize(

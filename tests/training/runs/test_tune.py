@@ -14,14 +14,40 @@ def test_learner_and_runners_share_the_available_cpus() -> None:
         cpu_share(100)
 
 
-@pytest.mark.usefixtures("ray_session")
-def test_a_trial_requests_its_learner_here_and_its_runners_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray, "cluster_resources", lambda: {"CPU": 8.0, "GPU": 1.0})
+def machines(monkeypatch: pytest.MonkeyPatch, *resources: dict[str, float]) -> None:
+    monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": True, "Resources": each} for each in resources])
+
+
+def test_a_trial_requests_its_learner_and_its_runners_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    machines(monkeypatch, {"CPU": 8.0, "GPU": 1.0})
     learner, *runners = placement(PPOConfig(runners=2, gpus=0.5, runner_gpus=0.25), 0.5).bundles
     assert (learner["CPU"], learner["GPU"]) == (0.5, 0.5)
-    assert any(resource.startswith("node:") for resource in learner)
     assert runners == [{"CPU": 0.5, "GPU": 0.25}] * 2
     (alone,) = placement(PPOConfig(runners=0, gpus=0.5, runner_gpus=0.25), 1.0).bundles
     assert alone["GPU"] == 0.75, "the runner is in the learner's process"
     with pytest.raises(ConfigError, match=r"1\.5 GPUs requested in total, but Ray has 1"):
         placement(PPOConfig(runners=2, gpus=1, runner_gpus=0.25), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("cpus", "runners", "share"),
+    [((0, 2, 2), 3, 1.0), ((0, 2, 2), 4, 0.66), ((1, 2), 3, 0.66), ((1.5, 0.5), 1, 0.75), ((0.5, 0.5, 0.5), 2, 0.5)],
+)
+def test_every_share_fits_on_a_node(
+    cpus: tuple[float, ...], runners: int, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machines(monkeypatch, *({"CPU": each} for each in cpus))
+    assert cpu_share(runners) == share
+    assert len(placement(PPOConfig(runners=runners), share).bundles) == runners + 1
+
+
+def test_what_no_node_has_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray would wait for ever for a node to join."""
+    machines(monkeypatch, {"CPU": 4.0}, {"GPU": 1.0})
+    with pytest.raises(
+        ConfigError, match=r"the learner needs 0\.5 CPUs and 1 GPUs, but .* 4 CPUs and 0 GPUs; 0 CPUs and 1"
+    ):
+        placement(PPOConfig(runners=1, gpus=1), 0.5)
+    machines(monkeypatch, {"CPU": 2.0, "GPU": 1.0}, {"CPU": 2.0, "GPU": 1.0})
+    with pytest.raises(ConfigError, match=r"3 runners need 0\.5 CPUs and 0\.4 GPUs each"):
+        placement(PPOConfig(runners=3, gpus=0.75, runner_gpus=0.4), 0.5)

@@ -71,9 +71,9 @@ def test_each_transition_is_recorded_once_with_its_successor(
 ) -> None:
     env = Scripted(agents, num_envs, crashing)
     interface_of_league = interface(agents)
-    config = PPOConfig.model_validate({"opening_plies": plies, "opponents": opponents if agents > 1 else []})
+    config = PPOConfig.model_validate({"opponents": opponents if agents > 1 else []})
     recorder = PolicyTransitions(interface_of_league, env.agents, num_envs)
-    play = SelfPlay(env, interface_of_league, config, recorder, INITIAL)
+    play = SelfPlay(env, interface_of_league, config, recorder, INITIAL, opening_plies=plies)
     play.begin(ResetSeeds.of_run(3, num_envs=num_envs, **RUNNER), generator(3, "play"))
     found, streams = defaultdict(list), {}
     for steps in fragment_lengths:
@@ -109,6 +109,7 @@ def joint(league: LeagueConfig, steps: int, num_envs: int = 2) -> TransitionBloc
             league.training,
             recorder,
             {policy: {} for policy in interface_of_league.policy_ids},
+            opening_plies=league.training_openings,
         )
         play.begin(ResetSeeds.of_run(3, num_envs=num_envs, **RUNNER), generator(3, "play"))
         for _ in range(steps):

@@ -38,6 +38,7 @@ from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import CRASHES, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 from training.sampling.reset_seeds import ResetSeeds
+from training.sampling.self_play import GAMES, OPPONENTS
 
 MEETING = "tests.support.environments.simultaneous:meeting"
 RLLIB_MEETING = "tests.support.environments.simultaneous:rllib_meeting"
@@ -287,6 +288,24 @@ def test_environments_are_closed_and_rebuilt(monkeypatch: pytest.MonkeyPatch) ->
     runner.stop()
     runner.stop()
     assert len(closed) == 2
+
+
+def test_an_episode_has_one_member_of_a_mixture_as_opponent(tmp_path: Path) -> None:
+    storage = Storage.at(tmp_path)
+    registry = Registry.open(storage)
+    registry.leagues.register(registries.config(), registries.interface())
+    for seed in range(2):
+        build = registries.builder(graph=masked_mlp((3, 3, 2), actions=9, seed=seed))
+        registry.publisher.publish("tictactoe", build, source=f"run/{seed}", parent=None)
+    mixture = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75})
+    registry.close()
+    runner = runner_of(tictactoe(opponents=[{"ref": mixture.ref, "share": 1.0}]), storage)
+    runner.sample(num_episodes=200)
+    played = runner.get_metrics()[OPPONENTS]
+    games = {ref: values[GAMES].peek() for ref, values in played.items()}
+    assert games.keys() == {"tictactoe@1", "tictactoe@2"}
+    assert 0.1 < games["tictactoe@1"] / sum(games.values()) < 0.4
+    runner.stop()
 
 
 def test_a_version_plays_the_other_side_with_exploration(tmp_path: Path) -> None:

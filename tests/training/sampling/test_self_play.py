@@ -24,12 +24,11 @@ from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import ForwardInput, SelfPlay
 
 
-def self_play(env: Scripted, sides: int = 2, **training: object) -> SelfPlay:
+def self_play(env: Scripted, sides: int = 2, opening_plies: int = 0, **training: object) -> SelfPlay:
     config = PPOConfig.model_validate(training)
     interface_of_league = interface(len(env.agents), sides)
-    play = SelfPlay(
-        env, interface_of_league, config, EpisodeRecorder(interface_of_league, env.agents, env.num_envs), INITIAL
-    )
+    recorder = EpisodeRecorder(interface_of_league, env.agents, env.num_envs)
+    play = SelfPlay(env, interface_of_league, config, recorder, INITIAL, opening_plies=opening_plies)
     begin(play, env)
     return play
 

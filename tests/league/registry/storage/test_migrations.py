@@ -2,6 +2,8 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
 from inspect import unwrap
 from pathlib import Path
 
@@ -11,11 +13,13 @@ from alembic.migration import MigrationContext
 from alembic.operations import Operations
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
+from sqlalchemy.exc import IntegrityError
 
 from league.errors import ConfigError, StorageError
 from league.registry.registry import Registry
 from league.registry.storage import database, migrations
 from league.registry.storage.database import Database
+from league.registry.storage.rows import RunPoint
 from league.registry.storage.tables import Base
 from league.results.ledger import Ledger
 from league.settings import Storage
@@ -88,6 +92,36 @@ def test_a_failed_migration_is_rolled_back(storage: Storage, monkeypatch: pytest
     registry.close()
 
 
+def test_the_budgets_and_points_of_old_runs_are_kept(storage: Storage) -> None:
+    registry = registered(Registry.open(storage), versions=1)
+    begin = partial(registry.runs.begin, LEAGUE, algorithm="ppo", settings={}, seed=1)
+    begin("old", target=1000)
+    registry.runs.record(LEAGUE, "old", RunPoint(10, {"return": 0.5}, datetime.now(UTC)))
+    with registry.database.engine.execution_options(writes=True).begin() as connection:
+        # As revision 0013 left it.
+        connection.execute(text("ALTER TABLE runs ADD COLUMN old BIGINT NOT NULL DEFAULT 1000"))
+        connection.execute(text("ALTER TABLE runs DROP COLUMN target"))
+        connection.execute(text("ALTER TABLE runs RENAME COLUMN old TO target"))
+        connection.execute(text("ALTER TABLE leagues DROP COLUMN archived_at"))
+        connection.execute(text("ALTER TABLE runs DROP COLUMN exploits"))
+        for table in ("earlier_games", "strengths", "change_counter"):
+            connection.execute(text(f"DROP TABLE {table}"))
+        connection.execute(text("DROP INDEX ix_replicas_seen_at"))
+        for column in ("event", "traffic", "changes"):
+            connection.execute(text(f"ALTER TABLE replicas DROP COLUMN {column}"))
+        connection.execute(text("UPDATE alembic_version SET version_num = '0013'"))
+    with pytest.raises(IntegrityError), registry.database.engine.begin() as connection:
+        connection.execute(text("UPDATE runs SET target = NULL"))
+    registry.close()
+    upgraded = Registry.open(storage)
+    assert upgraded.runs.get(LEAGUE, "old").target == 1000
+    assert [point.steps for point in upgraded.runs.points(LEAGUE, "old")] == [10]
+    new = upgraded.runs.begin(LEAGUE, "new", algorithm="ppo", settings={}, seed=1, target=None)
+    assert upgraded.runs.get(LEAGUE, "new") == new
+    assert new.target is None
+    upgraded.close()
+
+
 def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
     """A ledger of an earlier release identifies the contestants of matches only by the schedule."""
     registry = registered(Registry.open(storage), versions=1)
@@ -107,12 +141,22 @@ def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
             "matches": ("league", "first", "second"),
             "acknowledgements": ("event",),
             "versions": ("retired_at", "role", "exploits"),
-            "leagues": ("game", "game_digest"),
+            "leagues": ("game", "game_digest", "archived_at"),
         }
         for table, columns in added.items():
             for column in columns:
                 operations.drop_column(table, column)
-        for table in ("snapshots", "run_points", "runs", "version_notes", "replicas", "training_nights"):
+        for table in (
+            "snapshots",
+            "run_points",
+            "runs",
+            "version_notes",
+            "replicas",
+            "training_nights",
+            "strengths",
+            "earlier_games",
+            "change_counter",
+        ):
             operations.drop_table(table)
         connection.execute(text("UPDATE alembic_version SET version_num = '0005'"))
     registry.close()

@@ -4,11 +4,12 @@ import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
-from sqlalchemy import update
+from sqlalchemy import text, update
 from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
@@ -16,7 +17,7 @@ from league.errors import NotReady, StorageError
 from league.registry.aliases import AliasRepository
 from league.registry.registry import Registry
 from league.registry.storage.artifacts import ArtifactStore
-from league.registry.storage.database import clock
+from league.registry.storage.database import Database, clock
 from league.registry.storage.manifest import Manifest
 from league.registry.storage.rows import Acknowledgement, AliasTarget
 from league.registry.storage.tables import ReplicaTable
@@ -24,9 +25,12 @@ from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.runtime.replica_process import this_process
 from tests.support.clients.actions import BOARD, act
+from tests.support.databases import on_both_databases
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import QUICK, local_client, replica
 from tests.support.waiting import until
+
+pytestmark = on_both_databases
 
 
 def acknowledgement(registry: Registry, league: str = "board") -> Acknowledgement | None:
@@ -100,7 +104,7 @@ def test_serving_continues_without_the_database(registry: Registry) -> None:
     server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
     with local_client(server) as client:
         act(client, version=2, observation=BOARD)
-        with outage(server.registry):
+        with outage(server.registry.database), outage(server.connection.database):
             until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")
             reply = client.get("/v1/leagues")
             assert (reply.status_code, int(reply.headers["retry-after"])) == (503, 1)
@@ -116,15 +120,14 @@ def test_serving_continues_without_the_database(registry: Registry) -> None:
 
 
 @contextmanager
-def outage(registry: Registry) -> Iterator[None]:
-    """Let each transaction of `registry` fail."""
+def outage(database: Database) -> Iterator[None]:
+    """Let each transaction fail."""
 
     @contextmanager
     def transaction() -> Iterator[Session]:
         raise StorageError("the database cannot be used: it is gone")
         yield
 
-    database = registry.database
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "read", transaction)
         patch.setattr(database, "write", transaction)
@@ -143,6 +146,8 @@ def test_serving_continues_without_the_artifacts(client: TestClient, registry: R
 def test_an_empty_registry_replacing_the_followed_one_is_ignored(
     registry: Registry, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    if is_server(registry):
+        pytest.skip("a database that is a file can be replaced")
     with replica(registry.storage) as client:
         assert act(client, observation=BOARD)["version"] == 1
         Registry.open(Storage.at(tmp_path / "other")).close()
@@ -156,6 +161,10 @@ def test_an_empty_registry_replacing_the_followed_one_is_ignored(
         (tmp_path / "away").rename(home)
         promote(registry, "board", 2)
         until(lambda: act(client, observation=BOARD)["version"] == 2)
+
+
+def is_server(registry: Registry) -> bool:
+    return registry.database.engine.dialect.name == "postgresql"
 
 
 def backdate(registry: Registry, replica: str, seconds: float) -> None:
@@ -196,6 +205,8 @@ def test_replicas_that_ended_are_removed_and_silent_ones_are_not(registry: Regis
     for name, process in processes.items():
         registry.replicas.register(name, process)
         backdate(registry, name, 20)
+    registry.replicas.register("elsewhere for a day", processes["elsewhere"])
+    backdate(registry, "elsewhere for a day", 25 * 3600)
     with replica(registry.storage):
         until(lambda: names(registry) == {"replica-1", "stuck", "elsewhere"})
 
@@ -223,3 +234,75 @@ def test_a_stalled_load_delays_neither_other_leagues_nor_acknowledgements(
         assert registry.changes.wait_for_alias(registry.aliases.history("board")[0], 30) == ["replica-1"]
         assert act(client, observation=BOARD)["version"] == 3
         gate.set()
+
+
+def test_a_replica_that_was_taken_for_dead_registers_and_acknowledges_again(registry: Registry) -> None:
+    (registry.artifacts.path("vector", 1) / "shared.onnx").write_bytes(b"tampered")
+    with replica(registry.storage):
+        until(lambda: serves(registry, 1))
+        registry.replicas.remove("replica-1")
+        until(lambda: serves(registry, 1))
+        until(lambda: (row := acknowledgement(registry, "vector")) and row.fault)
+        promote(registry, "board", 2)
+        until(lambda: serves(registry, 2))
+
+
+def test_a_failure_is_forgotten_after_a_rollback(registry: Registry) -> None:
+    """What a replica says of a league where it differs from the registry ends with the difference."""
+    (registry.artifacts.path("board", 2) / "shared.onnx").write_bytes(b"tampered")
+    with replica(registry.storage):
+        promote(registry, "board", 2)
+        until(lambda: (row := acknowledgement(registry)) and row.fault)
+        event = registry.aliases.rollback("board", actor="test", reason="test")
+        assert registry.changes.wait_for_alias(event, 30) == ["replica-1"]
+        row = acknowledgement(registry)
+        assert row is not None
+        assert (row.version, row.fault) == (1, None)
+
+
+def test_changes_by_processes_of_earlier_releases_are_followed(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They do not count changes."""
+    monkeypatch.setattr("serve_app.models.registry_watcher.REREAD", 0.1)
+    with replica(registry.storage):
+        until(lambda: serves(registry, 1))
+        with monkeypatch.context() as earlier:
+            earlier.setattr("league.registry.aliases.change_counter.count", lambda *_: None)
+            promote(registry, "board", 2)
+        until(lambda: serves(registry, 2))
+
+
+def named(storage: Storage, name: str) -> Storage:
+    """The storage, whose connections have a name in PostgreSQL."""
+    return replace(storage, database_url=f"{storage.database_url}&application_name={name}")
+
+
+def processes(registry: Registry, name: str) -> list[int]:
+    """The processes of PostgreSQL for connections with a name."""
+    with registry.database.read() as session:
+        return list(session.scalars(text("SELECT pid FROM pg_stat_activity WHERE application_name = :n"), {"n": name}))
+
+
+def test_postgresql_notifies_replicas(registry: Registry) -> None:
+    if not is_server(registry):
+        pytest.skip("SQLite is polled")
+    seldom = QUICK.model_copy(update={"poll": 600.0, "poll_slowest": 600.0, "heartbeat": 600.0})
+    with replica(registry.storage, seldom):
+        for version in (2, 3):
+            promote(registry, "board", version)
+            until(lambda version=version: serves(registry, version))
+
+
+def test_an_idle_replica_has_one_connection_and_replaces_a_lost_one(registry: Registry) -> None:
+    if not is_server(registry):
+        pytest.skip("SQLite has no server")
+    with replica(named(registry.storage, "idle")) as client:
+        assert client.get("/v1/leagues").status_code == 200
+        until(lambda: len(processes(registry, "idle")) == 1)
+        with registry.database.write() as session:
+            (lost,) = processes(registry, "idle")
+            session.execute(text("SELECT pg_terminate_backend(:process)"), {"process": lost})
+        promote(registry, "board", 2)
+        until(lambda: serves(registry, 2))
+        assert lost not in processes(registry, "idle")

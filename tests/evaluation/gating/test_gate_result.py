@@ -3,7 +3,8 @@ from typing import get_args
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.gating.gate import AnchorResult, Decision, Outcome, combine_results
+from evaluation.gating.gate import Decision, Outcome
+from evaluation.gating.gate_result import AnchorResult, combine_results
 
 OUTCOMES = (None, *get_args(Outcome))
 

@@ -3,7 +3,7 @@
 The training state of a version is by far its largest part, and only needed to continue training from it. It is kept
 for the versions that an alias points to, for the newest ones, and for young ones. All files of a version are removed if
 moreover no alias ever pointed to it and no canary, shadow, verdict or recorded game refers to it. Its row stays: the
-version is *retired*, and its number is never reused.
+version is *retired*, and its number is never reused. What refers to a mixture refers to its members.
 
 Versions are marked before their files are removed. An interrupted removal is completed by the next one.
 """
@@ -18,9 +18,10 @@ from sqlalchemy.orm import Session
 
 from league.errors import InvalidReference
 from league.refs import CheckpointRef, parse_ref
-from league.registry import leagues, traffic
+from league.registry import leagues, traffic, versions
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
+from league.registry.storage.manifest import MIXTURE
 from league.registry.storage.tables import (
     READY,
     AliasEventTable,
@@ -88,11 +89,11 @@ class RetentionRepository(Repository):
         return removal
 
     def _removal(self, league: str, retired: AbstractSet[int], untrained: AbstractSet[int]) -> Removal:
-        versions = {number: self._artifacts.size(league, number) for number in sorted(retired)}
+        sizes = {number: self._artifacts.size(league, number) for number in sorted(retired)}
         training = {number: self._artifacts.training_size(league, number) for number in sorted(untrained)}
         return Removal(
             league,
-            {number: size for number, size in versions.items() if size},
+            {number: size for number, size in sizes.items() if size},
             {number: size for number, size in training.items() if size},
         )
 
@@ -104,8 +105,12 @@ def _candidates(session: Session, league: str, keep: int, before: datetime) -> t
         select(table).filter_by(league=league, state=READY, retired_at=None).order_by(table.number.desc())
     ).all()
     old = {version.number for version in ready[keep:] if version.reserved_at < before}
-    old -= set(session.scalars(select(AliasTable.version).filter_by(league=league)))
+    aliased = set(session.scalars(select(AliasTable.version).filter_by(league=league)))
+    old -= aliased | versions.members(session, league, aliased)
     needed = _needed(session, league)
+    needed |= versions.members(session, league, needed)
+    # A mixture has no files but its manifest.
+    needed |= set(session.scalars(select(table.number).filter_by(league=league, role=MIXTURE)))
     gone = session.scalars(select(table.number).where(table.league == league, table.retired_at.is_not(None)))
     return (old - needed) | set(gone), old & needed
 

@@ -1,0 +1,160 @@
+"""Do replicas follow the load? One replica gets a load, four times as much, and then the first again.
+
+Printed: the time from the step up to the first answer of a second replica, the time from the step down until one is
+gone, and the calls that were lost. Settings are those of deploy.yaml, except for a shorter `downscale_delay_s`. The
+cost of a request is measured first; the first load needs a fifth of a core, and four times as much exceeds the target
+of one replica.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from benchmarks.leagues.served_league import publish
+from benchmarks.load.steps import StepLoad, Steps, stepping
+from benchmarks.processes import replica_processes
+from league.registry.registry import Registry
+from serve_app.runtime.launch import DEPLOY_YAML, running
+
+APPEARED, LOST = 10.0, 0
+"""Targets: seconds, calls of our client."""
+FIRST, FACTOR = 0.2, 4
+"""Share of a core that the first load needs, and the step."""
+DOWNSCALE_DELAY = 10.0
+HIDDEN = (2048, 2048)
+"""Units of the network. Inference dominates the cost of a request, which hence does not depend on the rate."""
+SAMPLE = 30.0
+"""Requests per second with which the cost of a request is measured."""
+STEADY = 15.0
+"""Seconds with a constant load."""
+DEADLINE = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Following:
+    """How replicas followed the load.
+
+    Attributes:
+        rate: First load in requests per second.
+        cost: Processor time of a request in seconds.
+        appeared: Seconds from the step up to the first answer of the second replica.
+        removed: Seconds from the step down until it was gone.
+        seen: What callers saw.
+    """
+
+    rate: float
+    cost: float
+    appeared: float
+    removed: float
+    seen: Steps
+
+
+def main() -> int:
+    """Print the measurements; 1 if a target was missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="short phases of constant load")
+    found = follow(5.0 if parser.parse_args().quick else STEADY)
+    seen, rate = found.seen, found.rate
+    print(f"load: {rate:,.0f}, {FACTOR * rate:,.0f}, {rate:,.0f} requests/s, each {1e3 * found.cost:.2f} ms", end="")
+    print(" of processor time")
+    print(f"second replica answers after {found.appeared:.1f} s   (at most {APPEARED:g} s)")
+    print(f"gone {found.removed:.1f} s after the step down, of which {DOWNSCALE_DELAY:g} s are `downscale_delay_s`")
+    print(
+        f"{len(seen.lost)} of {seen.calls:,} calls of the client lost   (at most {LOST}), longest {seen.longest:.2f} s;"
+        f" {sum(seen.statuses.values())} of {seen.attempts:,} single attempts failed {seen.statuses or ''}"
+    )
+    for error in seen.lost:
+        print(f"    {error}")
+    return int(found.appeared > APPEARED or len(seen.lost) > LOST)
+
+
+def follow(steady: float) -> Following:
+    """Serve, and step the load up and down. steady: seconds of each constant load.
+
+    Raises AssertionError if the number of replicas changes under a constant load, and TimeoutError if it does not
+    follow a step.
+    """
+    with _served() as (url, registry):
+        with stepping(url) as load:
+            cost = _cost(load, steady)
+            rate = FIRST / cost
+            load.set_rate(rate)
+            _hold(registry, 1, steady)
+            up = time.monotonic()
+            load.set_rate(FACTOR * rate)
+            _await(registry, 2)
+            _hold(registry, 2, steady)
+            down = time.monotonic()
+            load.set_rate(rate)
+            _await(registry, 1)
+            removed = time.monotonic() - down
+            _hold(registry, 1, steady)
+        appeared, *others = load.seen.since(up)
+        assert not others, "a second replica was added, removed, and added again"
+    return Following(rate, cost, appeared, removed, load.seen)
+
+
+@contextmanager
+def _served() -> Iterator[tuple[str, Registry]]:
+    """The URL of one or two replicas, and their registry."""
+    document = yaml.safe_load(DEPLOY_YAML.read_text())
+    document["applications"][0]["deployments"][0]["autoscaling_config"]["downscale_delay_s"] = DOWNSCALE_DELAY
+    with tempfile.TemporaryDirectory() as scratch:
+        registry = publish(Path(scratch) / "home", versions=1, hidden=HIDDEN)
+        deploy = Path(scratch) / "deploy.yaml"
+        deploy.write_text(yaml.safe_dump(document))
+        with running(registry.storage, replicas=1, max_replicas=2, deploy=deploy) as url:
+            yield url, registry
+        registry.close()
+
+
+def _cost(load: StepLoad, seconds: float) -> float:
+    """Processor time of a request in seconds."""
+    (replica,) = replica_processes()
+    idle = _busy(replica.cpu_times, seconds)
+    load.set_rate(SAMPLE)
+    return (_busy(replica.cpu_times, seconds) - idle) / SAMPLE
+
+
+def _busy(times: Callable[[], object], seconds: float) -> float:
+    """Share of a core that a process uses."""
+    before, at = _total(times()), time.monotonic()
+    time.sleep(seconds)
+    return (_total(times()) - before) / (time.monotonic() - at)
+
+
+def _total(times: object) -> float:
+    return float(times.user + times.system)  # type: ignore[attr-defined]
+
+
+def _replicas(registry: Registry) -> int:
+    """Replicas that follow the registry."""
+    return len(registry.replicas.registered())
+
+
+def _hold(registry: Registry, number: int, seconds: float) -> None:
+    """Wait, and check the number of replicas."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        assert _replicas(registry) == number, f"{_replicas(registry)} replicas under a constant load, not {number}"
+        time.sleep(0.05)
+
+
+def _await(registry: Registry, number: int) -> None:
+    """Wait for the number of replicas."""
+    deadline = time.monotonic() + DEADLINE
+    while _replicas(registry) != number:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{_replicas(registry)} replicas after {DEADLINE:g} s, not {number}")
+        time.sleep(0.05)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

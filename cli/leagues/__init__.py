@@ -1,0 +1,1 @@
+"""Commands about whole leagues: create, list, archive and remove them, and compare their training runs."""

@@ -1,0 +1,222 @@
+"""What the games of a verdict show, computed from the ledger: the gate result, its report, and the confirmation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from evaluation.gating.exploitability import exploitability_bound
+from evaluation.gating.gate import Decision, cell_counts, decide_matches
+from evaluation.gating.gate_result import (
+    AnchorResult,
+    CompanionResult,
+    ExploitabilityResult,
+    ExploiterResult,
+    GateResult,
+    combine_results,
+    exploitability_result,
+    exploiter_result,
+)
+from evaluation.matches.game_records import forfeits
+from evaluation.results import (
+    AnchorReport,
+    Confirmation,
+    Difference,
+    ExploitabilityReport,
+    ExploiterReport,
+    VerdictReport,
+)
+from evaluation.statistics.payoff import paired_difference
+from evaluation.statistics.sequential import elo_estimate
+from league.config.gate import GateConfig
+from league.refs import CheckpointRef, parse_ref
+from league.registry.registry import Registry
+from league.registry.storage.rows import VerdictRow
+from league.results.ledger import Ledger
+from league.results.records import GAMES_PER_BLOCK, Match
+
+
+def is_applied(registry: Registry, verdict: VerdictRow) -> bool:
+    """Whether the champion was moved because of this verdict, even if it has changed since."""
+    return any(event.verdict == verdict.id for event in registry.aliases.history(verdict.league))
+
+
+def gate_of(verdict: VerdictRow) -> GateConfig:
+    """The gate's settings when the verdict was opened, including its α."""
+    return GateConfig.model_validate(verdict.settings["gate"])
+
+
+def gate_statistics(decision: Decision) -> dict[str, Any]:
+    """The fields of a report that describe a sequential test. Infinite bounds are None."""
+    estimate = decision.estimate
+    return _test_statistics(decision) | {
+        "score": decision.score,
+        "elo": estimate and _finite(estimate.elo),
+        "interval": estimate and (_finite(estimate.low), _finite(estimate.high)),
+    }
+
+
+def _test_statistics(decision: Decision) -> dict[str, Any]:
+    """The fields of a CompanionReport."""
+    return {
+        "llr": decision.llr,
+        "bounds": decision.bounds,
+        "blocks": decision.blocks,
+        "games": decision.games,
+        "unique_games": decision.unique_games or 0,
+        "counts": decision.counts,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _matches(registry: Registry, verdict: VerdictRow, schedule: str | None = None) -> Sequence[Match]:
+    return Ledger(registry).matches(league=verdict.league, schedule=schedule or verdict.schedule)
+
+
+def gate_result(registry: Registry, verdict: VerdictRow) -> GateResult:
+    """Compute the gate result of a verdict from the ledger."""
+    gate, candidate_ref = gate_of(verdict), verdict.candidate_ref
+    matches = _matches(registry, verdict)
+    champion = decide_matches(gate, matches, candidate_ref)
+    forfeited = forfeits(matches[: champion.blocks], candidate_ref)
+    companions: list[CompanionResult] = []
+    for anchor in verdict.settings.get("anchors", ()):
+        ref, margin, schedule = anchor["ref"], anchor["margin"], anchor["schedule"]
+        matches = _matches(registry, verdict, schedule)
+        decision = decide_matches(gate.against_anchor(margin), matches, candidate_ref)
+        companions.append(AnchorResult(ref, margin, schedule, decision))
+        forfeited += forfeits(matches[: decision.blocks], candidate_ref)
+    for exploiter in verdict.settings.get("exploiters", ()):
+        matches = _matches(registry, verdict, exploiter["schedule"])
+        result = exploiter_result(gate, matches, candidate_ref, verdict.champion, exploiter)
+        companions.append(result)
+        forfeited += forfeits(matches[: 2 * result.decision.blocks], candidate_ref)
+    planned = len(companions) + ("exploitability" in verdict.settings)
+    if (test := verdict.settings.get("exploitability")) is not None:
+        matches = _matches(registry, verdict, test["schedule"])
+        found = exploitability_result(gate, matches, candidate_ref, verdict.champion, test)
+        companions.append(found)
+        forfeited += forfeits(matches[: found.decision.games // GAMES_PER_BLOCK], candidate_ref)
+    opponent = "the champion" if isinstance(parse_ref(verdict.champion), CheckpointRef) else verdict.champion
+    return combine_results(champion, companions, planned, None if gate.forfeits else forfeited, opponent)
+
+
+def difference_of_returns(
+    registry: Registry, verdict: VerdictRow, blocks: int | None = None, name: str | None = None
+) -> Difference | None:
+    """Mean return of the candidate minus the champion's if their returns are compared or tested, else None.
+
+    Args:
+        registry: The registry of the verdict.
+        verdict: The verdict.
+        blocks: Number of matches, by default all.
+        name: Schedule of the matches, by default that of the verdict.
+    """
+    if Ledger(registry).schedule(verdict.schedule).scoring == "game" and gate_of(verdict).model != "returns":
+        return None
+    return paired_difference(_matches(registry, verdict, name)[:blocks], verdict.candidate_ref)
+
+
+def report_of(
+    registry: Registry, verdict: VerdictRow, outcome: str, seen: GateResult, note: str | None
+) -> VerdictReport:
+    """Report of a verdict that ends with this gate result."""
+    return VerdictReport(
+        verdict=verdict.id,
+        candidate=verdict.candidate_ref,
+        opponent=verdict.champion,
+        outcome=outcome,
+        **gate_statistics(seen.champion),
+        promoted=is_applied(registry, verdict),
+        alpha=verdict.alpha,
+        anchors=tuple(map(anchor_report, seen.anchors)),
+        exploiters=tuple(map(exploiter_report, seen.exploiters)),
+        exploitability=exploitability_report(seen.exploitability, verdict.candidate_ref),
+        difference=difference_of_returns(registry, verdict, seen.champion.blocks),
+        note=note,
+    )
+
+
+OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "inconclusive", None: "open"}
+
+
+def anchor_report(anchor: AnchorResult) -> AnchorReport:
+    """Report of one non-inferiority test."""
+    return AnchorReport(
+        ref=anchor.ref,
+        margin=anchor.margin,
+        schedule=anchor.schedule,
+        outcome=OUTCOMES[anchor.decision.outcome],
+        **gate_statistics(anchor.decision),
+    )
+
+
+PAIRED_OUTCOMES = OUTCOMES | {"promote": "not worse", "reject": "worse"}
+
+
+def exploiter_report(exploiter: ExploiterResult) -> ExploiterReport:
+    """Report of one paired test against an exploiter."""
+    own, champion = exploiter.scores or (None, None)
+    return ExploiterReport(
+        ref=exploiter.ref,
+        exploits=exploiter.exploits,
+        margin=exploiter.margin,
+        schedule=exploiter.schedule,
+        outcome=PAIRED_OUTCOMES[exploiter.decision.outcome],
+        **_test_statistics(exploiter.decision),
+        score=own,
+        champion_score=champion,
+        difference=exploiter.difference,
+    )
+
+
+EXPLOITABILITY_OUTCOMES = OUTCOMES | {"promote": "not more exploitable", "reject": "more exploitable"}
+
+
+def exploitability_report(test: ExploitabilityResult | None, candidate: str) -> ExploitabilityReport | None:
+    """Report of the test of exploitability."""
+    if test is None:
+        return None
+    exploiters = {candidate: test.of_candidate, test.ref: test.of_champion}
+    bounds = {ref: exploitability_bound(ref, own, test.sample) for ref, own in exploiters.items() if test.sample}
+    return ExploitabilityReport(
+        ref=test.ref,
+        margin=test.margin,
+        schedule=test.schedule,
+        outcome=EXPLOITABILITY_OUTCOMES[test.decision.outcome],
+        **_test_statistics(test.decision),
+        candidate=bounds.get(candidate),
+        champion=bounds.get(test.ref),
+        difference=test.difference,
+        difference_over_exploiters=test.difference_over_exploiters,
+    )
+
+
+def confirmation(registry: Registry, verdict: VerdictRow) -> Confirmation | None:
+    """Improvement of a promotion measured by its confirmation match; None until that is complete.
+
+    The match has a fixed length and no influence on the decision, so the estimate is unbiased. The estimate of the
+    verdict itself is optimistic, because the test stopped when the results looked good.
+    """
+    name = verdict.settings.get("confirmation")
+    if name is None:
+        return None
+    schedule, matches = Ledger(registry).schedule(name), _matches(registry, verdict, name)
+    if len(matches) < schedule.length:
+        return None
+    counts = cell_counts(matches, verdict.candidate_ref)
+    estimate = elo_estimate(counts, "logistic")
+    return Confirmation(
+        verdict=verdict.id,
+        candidate=verdict.candidate_ref,
+        opponent=verdict.champion,
+        games=2 * len(matches),
+        score=sum(i * n for i, n in enumerate(counts)) / (len(counts) - 1) / len(matches),
+        elo=estimate.elo,
+        interval=(estimate.low, estimate.high),
+        difference=difference_of_returns(registry, verdict, name=name),
+    )

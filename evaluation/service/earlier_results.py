@@ -1,0 +1,101 @@
+"""Results under earlier conditions: before the game of a league changed, or the way in which versions select actions.
+
+They count in no rating, payoff or verdict of the league, but stay viewable with tables of their own.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from evaluation.matches.leaderboard import CountedGames
+from evaluation.results import iso_timestamp
+from league.conditions import Conditions, GameChange, game_changes
+from league.registry.registry import Registry
+from league.registry.snapshots import FORMAT, earlier_part
+from league.registry.storage.rows import LeagueRow
+from league.results.ledger import Ledger
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierResults:
+    """Matches under earlier conditions.
+
+    Attributes:
+        conditions: Those of the matches.
+        matches: Their number.
+        changes: What of the game differs from the current one; None if it was not recorded.
+        actions_changed: Whether versions select actions in another way now.
+        replaced_at: When the league had this game last; None if it still has it, or this was not recorded.
+    """
+
+    conditions: Conditions
+    matches: int
+    changes: tuple[GameChange, ...] | None
+    actions_changed: bool
+    replaced_at: datetime | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON document."""
+        return {
+            "name": self.conditions.name,
+            "actions": self.conditions.actions,
+            "matches": self.matches,
+            "changes": None if self.changes is None else [change._asdict() for change in self.changes],
+            "actions_changed": self.actions_changed,
+            "replaced_at": self.replaced_at and iso_timestamp(self.replaced_at),
+        }
+
+
+def earlier_results(registry: Registry, league: LeagueRow) -> list[EarlierResults]:
+    """Return the earlier conditions under which a league has matches, newest first. Purged ones are left out."""
+    ledger, games = Ledger(registry), {row.digest: row for row in registry.leagues.earlier_games(league.slug)}
+    purged, played = ledger.purged(league.slug), ledger.counts(league.slug)
+    matches: Counter[Conditions] = Counter()
+    for schedule in ledger.schedules(league.slug):
+        is_earlier = schedule.conditions != league.conditions and schedule.scoring != "team"
+        if is_earlier and schedule.id not in purged and schedule.id in played:
+            matches[schedule.conditions] += played[schedule.id]
+    found = []
+    for conditions, number in reversed(matches.items()):
+        game = games.get(conditions.game_digest)
+        same_game = conditions.game_digest == league.game_digest
+        changes = () if same_game else game_changes(game.game, league.game) if game and game.game else None
+        found.append(
+            EarlierResults(
+                conditions=conditions,
+                matches=number,
+                changes=changes,
+                actions_changed=conditions.actions != league.conditions.actions,
+                replaced_at=game.replaced_at if game else None,
+            )
+        )
+    return found
+
+
+def refresh_earlier_results(registry: Registry, league: str) -> None:
+    """Recompute the stale tables of results under earlier conditions. Raises UnknownLeague."""
+    row, known = registry.leagues.get(league), registry.snapshots.marks(league)
+    for results in earlier_results(registry, row):
+        name, mark = results.conditions.name, f"{FORMAT}; {results.matches} matches; {row.interface_digest}"
+        if known.get(earlier_part(name, "leaderboard")) == mark:
+            continue
+        played = CountedGames(registry, row, conditions=results.conditions)
+        found = tables(played, list(row.interface.sides))
+        registry.snapshots.put(league, {earlier_part(name, part): table for part, table in found.items()}, mark)
+
+
+def tables(played: CountedGames, sides: Sequence[str]) -> dict[str, Any]:
+    """Return the documents `leaderboard` and `payoff` of some games."""
+    payoff = played.payoff()
+    return {
+        "leaderboard": {
+            "sides": list(sides),
+            "leaderboard": [standing.to_json() for standing in played.leaderboard],
+            "by_side": {side: [each.to_json() for each in own] for side, own in played.by_side().items()},
+        },
+        "payoff": payoff.to_json() if payoff else None,
+    }

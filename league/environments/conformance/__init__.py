@@ -1,0 +1,1 @@
+"""The checks of `league check-env`: whether an environment does what training and matches need."""

@@ -1,0 +1,131 @@
+"""Checks environments (`league check-env`): spaces, seeding, masks, rewards, global state and PettingZoo's API tests.
+
+Episodes are played with random legal actions. A *fault* leads to wrong results or failing runs; a *note* is a warning.
+"""
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.test import api_test, parallel_api_test
+
+from league.conditions import describe_selection
+from league.config.environment import EnvironmentConfig
+from league.config.league import LeagueConfig
+from league.environments.building import build, describe, describe_policies
+from league.environments.conformance.episodes import Examiner
+from league.environments.conformance.findings import Examination, Vectorised
+from league.environments.implementation import implementation
+from league.environments.vector.equality import compare
+from league.environments.vector.measurement import steps_per_second
+from league.errors import LeagueError, one_line, raised_at
+from league.interface import Interface
+from league.spaces import Box, Discrete, MultiDiscrete, Space
+
+CYCLES = 50
+"""Number of cycles of PettingZoo's API tests."""
+
+COMPARED_COPIES, COMPARED_STEPS = 32, 20_000
+"""Size of the comparison of a vectorised environment with its stock environment."""
+MEASURED_COPIES, MEASURED_SECONDS = 1024, 1.0
+"""Copies and duration of the measurement of its speed."""
+
+
+def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, seed: int = 0) -> Examination:
+    """Play and check episodes with random legal actions. Never raises exceptions of the environment.
+
+    Args:
+        config: The league.
+        episodes: Number of episodes, each played several times.
+        steps: Maximum number of steps per episode. None: an episode that has not ended after `play.max_moves` steps is
+            a fault.
+        seed: Seed of the first episode.
+
+    Returns:
+        The findings, with the lengths of the episodes, the speed and the effect of random openings.
+    """
+    found = Examination()
+    try:
+        found.implementation = implementation(config.environment).reason
+        env = build(config.environment)
+        interface = describe(env, config)
+    except LeagueError as error:
+        found.add("fault", str(error))
+        return found
+    except Exception as error:
+        found.add("fault", f"{config.environment.entry_point} cannot be created: {one_line(error, with_type=True)}")
+        return found
+    found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
+    found.agents = len(interface.agents)
+    found.policies = describe_policies(interface)
+    found.actions = describe_selection(config, interface)
+    for agent, spaces in interface.agents.items():
+        if not _is_supported(spaces.action):
+            found.add(
+                "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
+            )
+    found.interface = interface
+    examiner = Examiner(env, interface, config, found, steps)
+    try:
+        examiner.examine(episodes, seed)
+    except LeagueError as error:
+        found.add("fault", str(error))
+    except Exception as error:
+        where = "".join(f"{place}, " for place in [raised_at(error)] if place)
+        reason = one_line(error, with_type=True)
+        found.add("fault", f"the environment raised an exception ({where}{examiner.place}): {reason}")
+    finally:
+        env.close()
+    if found.passed:
+        _run_pettingzoo_tests(build(config.environment), found)
+    if found.passed:
+        _compare_vectorised(config.environment, interface, found, seed)
+    return found
+
+
+def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: Examination, seed: int) -> None:
+    """Compare the vectorised environment, if there is one, with the stock one."""
+    vector = implementation(config).vector
+    if vector is None:
+        return
+    try:
+        comparison = compare(config, vector(COMPARED_COPIES, **config.kwargs), COMPARED_STEPS, seed)
+        if comparison.difference is not None:
+            found.add("fault", f"the vectorised environment differs: {comparison.difference}")
+            return
+        actions = [spaces.action for spaces in interface.agents.values()]
+        rate = steps_per_second(vector(MEASURED_COPIES, **config.kwargs), actions, seed, MEASURED_SECONDS)
+    except Exception as error:
+        found.add("fault", f"the vectorised environment raised an exception: {one_line(error, with_type=True)}")
+        return
+    found.vectorised = Vectorised(comparison.steps, MEASURED_COPIES, rate, comparison.stock_rate)
+
+
+def _is_supported(space: Space) -> bool:
+    """Discrete, MultiDiscrete, or a Box of floats."""
+    return isinstance(space, Discrete | MultiDiscrete) or (isinstance(space, Box) and np.dtype(space.dtype).kind == "f")
+
+
+def _run_pettingzoo_tests(env: Any, found: Examination) -> None:
+    """Run PettingZoo's API tests. They check more than is required here, so failures are notes."""
+    try:
+        with _silence():
+            if isinstance(env, AECEnv):
+                api_test(env, num_cycles=CYCLES)
+            elif isinstance(env, ParallelEnv):
+                parallel_api_test(env, num_cycles=CYCLES)
+    except Exception as error:
+        found.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")
+    finally:
+        env.close()
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield

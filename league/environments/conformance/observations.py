@@ -1,0 +1,101 @@
+"""Checks of observations against their spaces."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from league.environments.adapters import Observation
+from league.environments.building import action_space, observation_space
+from league.environments.conformance.findings import Examination, Trace
+from league.spaces import Box, Leaf, inputs
+from league.spaces.arrays import tensors
+from league.spaces.conversion import from_gymnasium
+
+ENOUGH_TURNS = 20
+"""Minimum turns of an agent for the check that its observations change."""
+
+
+class ObservationCheck:
+    """Splits an agent's observations into arrays, and checks them against its space."""
+
+    def __init__(self, agent: str, env: Any, found: Examination) -> None:
+        self._agent, self._found = agent, found
+        self._gymnasium = observation_space(env, agent)
+        self._space = from_gymnasium(self._gymnasium)
+        self._leaves = inputs(self._space)
+        self._kept: tuple[Any, Observation] | None = None
+        action_space(env, agent)
+
+    def __call__(self, value: Any) -> Observation:
+        if self._kept is not None and _changed(*self._kept):
+            self._found.add(
+                "note", "its observations are modified after they are returned: they are copied", self._agent
+            )
+        arrays = tensors(self._space, value)
+        for name, leaf in self._leaves.items():
+            if arrays[name].shape != leaf.shape:
+                shape, expected = list(arrays[name].shape), list(leaf.shape)
+                self._found.add(
+                    "fault", f"observes {name} with shape {shape}, but its space has {expected}", self._agent
+                )
+        if not self._gymnasium.contains(value):
+            self._found.add(
+                "note",
+                f"observations are not in its space {_shortened(self._gymnasium)}: the bounds or the dtype differ;"
+                " values are cast to the dtype of the space",
+                self._agent,
+                example=_example_outside(self._leaves, arrays),
+            )
+        copies = {name: np.array(array) for name, array in arrays.items()}
+        self._kept = (arrays, copies)
+        return copies
+
+
+def _shortened(space: gymnasium.Space[Any]) -> str:
+    text = str(space)
+    return text if len(text) <= 80 else f"{text[:79]}…"
+
+
+def _changed(arrays: Observation, copies: Observation) -> bool:
+    return any(not np.array_equal(arrays[name], copies[name], equal_nan=True) for name in copies)
+
+
+def _example_outside(leaves: Mapping[str, Leaf], arrays: Observation) -> str:
+    """Describe the first value outside of its bounds; empty if only the dtype or the structure differs."""
+    for name, leaf in leaves.items():
+        if not isinstance(leaf, Box) or np.shape(arrays[name]) != leaf.shape:
+            continue
+        low, high = _bound(leaf, leaf.low, -np.inf), _bound(leaf, leaf.high, np.inf)
+        array = np.asarray(arrays[name], np.float64)
+        for index in map(tuple, np.argwhere((array < low) | (array > high))[:1].tolist()):
+            place = f"{name}[{', '.join(map(str, index))}]"
+            return f"{place} is {array[index]:g}, outside of [{low[index]:g}, {high[index]:g}]"
+    return ""
+
+
+def _bound(leaf: Box, bound: Any, infinite: float) -> NDArray[np.float64]:
+    return np.broadcast_to(np.asarray(infinite if bound is None else bound, np.float64), leaf.shape)
+
+
+def check_constant_observations(traces: Sequence[Trace], env: Any, found: Examination) -> None:
+    """Find agents whose observation never changes in the second half of an episode, when frame stacks are full.
+
+    A constant image is a fault; a constant vector is a note, because a game may have a single state.
+    """
+    for index, agent in enumerate(env.possible_agents):
+        seen = [[observation for reporting, observation, *_ in trace if reporting == index] for trace in traces]
+        turns = max(map(len, seen))
+        if turns < ENOUGH_TURNS or any(len(set(own[len(own) // 2 :])) > 1 for own in seen):
+            continue
+        space = observation_space(env, agent)
+        if isinstance(space, gymnasium.spaces.Box) and len(space.shape) > 1:
+            text = (
+                f"observes a constant image for {turns} turns; some environments draw only with"
+                " `kwargs: {render_mode: rgb_array}`"
+            )
+            found.add("fault", text, agent)
+        else:
+            found.add("note", f"observes a constant value in an episode of {turns} turns", agent)

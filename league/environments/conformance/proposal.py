@@ -1,0 +1,246 @@
+"""Proposes a configuration for an environment (`league init`): a YAML file in which every line has a comment.
+
+The environment is built and played as by `league check-env`. Its agents and spaces determine policies, sides, network
+and algorithm; the openings are those that were measured.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+import yaml
+
+from league.conditions import action_selection
+from league.config.base import JSON
+from league.config.league import LeagueConfig
+from league.environments.conformance.examination import examine
+from league.environments.conformance.findings import Examination
+from league.errors import ConfigError
+from league.interface import Interface
+from league.refs import SLUG
+from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete, Space, inputs
+
+COMMENT_COLUMN = 50
+"""Column of the comments, unless a line is longer."""
+LISTED_AGENTS = 8
+"""More agents of a policy are named by a pattern."""
+SHORT_EPISODE = 5
+"""Actions of an agent per episode up to which rewards are not discounted."""
+SMALL_BOARD, IMAGE = 4, 36
+"""Least height and width of an observation for one convolution, and for the three of Mnih et al. (2015)."""
+BOARD_CONVOLUTIONS = [{"filters": 32, "kernel": 3}]
+IMAGE_CONVOLUTIONS = [
+    {"filters": 32, "kernel": 8, "stride": 4},
+    {"filters": 64, "kernel": 4, "stride": 2},
+    {"filters": 64, "kernel": 3},
+]
+PLAIN = re.compile(r"[A-Za-z_][\w.:/-]*", re.ASCII)
+"""Texts that need no quotes in YAML, except words such as `yes`."""
+WIDE = 10.0
+"""Numbers beyond ± this value are normalised."""
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A configuration file that passes `league check-env`, and what was found while it was made."""
+
+    text: str
+    config: LeagueConfig
+    found: Examination
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A line of the file: key and value with their indentation, and the comment. Empty: a blank line."""
+
+    text: str = ""
+    comment: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text:<{COMMENT_COLUMN}}  # {self.comment}" if self.comment else self.text
+
+
+def propose(league: str, entry_point: str, kwargs: JSON, folder: str, shown: str | None = None) -> Proposal:
+    """Examine an environment and propose a configuration.
+
+    Args:
+        league: Name of the league.
+        entry_point: As `environment.entry_point`.
+        kwargs: As `environment.kwargs`.
+        folder: Where entry points are searched first.
+        shown: This folder relative to the file; None if it is that of the file.
+
+    Raises:
+        ConfigError: The environment cannot be built, or violates the contract.
+    """
+    environment: JSON = {"entry_point": entry_point} | ({"kwargs": kwargs} if kwargs else {})
+    document = {"league": league, "environment": environment, "folder": folder}
+    config = LeagueConfig.from_mapping(document, source=entry_point)
+    found = examine(config)
+    faults = [str(finding) for finding in found.findings if finding.severity == "fault"]
+    if faults or found.interface is None or found.openings is None:
+        raise ConfigError(f"{entry_point} cannot be a league's environment: {'; '.join(faults)}")
+    lines = [
+        *_header(config, environment, shown),
+        *_policies(found.interface, found.has_common_reward),
+        *_play(config, found, found.interface),
+        *_training(found, found.interface),
+        *_gate(),
+    ]
+    text = "\n".join(map(str, lines)) + "\n"
+    proposed = LeagueConfig.from_mapping(yaml.safe_load(text) | {"folder": document["folder"]}, source="the proposal")
+    return Proposal(text, proposed, found)
+
+
+def _header(config: LeagueConfig, environment: JSON, shown: str | None) -> Iterator[_Line]:
+    yield _Line("# Written by `league init`. docs/configuration.md describes all settings.")
+    yield _Line(f"league: {config.league}", "name in all commands and URLs")
+    if shown is not None:
+        yield _Line(f"folder: {_inline(shown)}", "where the code is searched, relative to this file")
+    yield _Line()
+    yield _Line("environment:", "what is played")
+    yield _Line(f"  entry_point: {_inline(environment['entry_point'])}", "module or function that creates it")
+    if kwargs := environment.get("kwargs"):
+        yield _Line(f"  kwargs: {_inline(kwargs)}", "arguments of its constructor")
+
+
+def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
+    yield _Line()
+    yield _Line("policies:", "policy → its agents; each policy is one network")
+    for policy in interface.policy_ids:
+        own = [agent for agent in interface.agents if interface.policies[agent] == policy]
+        space = interface.agents[own[0]].action
+        yield _Line(f"  {policy}: {_inline(_patterns(own, list(interface.agents)))}", _described(space))
+    yield _Line()
+    if is_team:
+        yield _Line("sides:", "side → its agents; the sides are opponents")
+        yield _Line('  team: ["*"]', "all agents had equal returns, so they are one team")
+    elif len(interface.sides) <= LISTED_AGENTS and all(map(SLUG.fullmatch, interface.sides)):
+        yield _Line("sides:", "side → its agents; the sides are opponents")
+        for side, agents in interface.sides.items():
+            yield _Line(f"  {_inline(side)}: {_inline(list(agents))}", "agents of one team belong to one side")
+    else:
+        yield _Line("sides: null", "each agent is a side of its own")
+
+
+def _play(config: LeagueConfig, found: Examination, interface: Interface) -> Iterator[_Line]:
+    assert found.openings is not None
+    measured, reason = found.openings, "the most likely ones; sampled if information is hidden"
+    actions = "greedy" if found.has_common_reward else action_selection(config, interface)
+    if found.has_common_reward:
+        reason = "the most likely ones, as there is no opponent"
+    elif actions == "sampled":
+        reason = "drawn at random, as the environment hides information"
+    yield _Line()
+    yield _Line("play:", "the games that are rated")
+    yield _Line(f"  actions: {actions}", reason)
+    if actions == "sampled":
+        yield _Line("  opening_plies: 0", "random moves at the start; sampled actions vary the games")
+    else:
+        seeds = f"{measured.games} seeds alone: {measured.different_games} different"
+        yield _Line(f"  opening_plies: {measured.recommended}", f"random moves at the start; {seeds}")
+
+
+def _training(found: Examination, interface: Interface) -> Iterator[_Line]:
+    turns = max(found.lengths) / len(interface.agents)
+    others = _other_algorithms(interface, found.api)
+    yield _Line()
+    yield _Line("training:", "league train")
+    yield _Line(
+        "  algorithm: ppo", f"also possible: {', '.join(others)}" if others else "the only one for these spaces"
+    )
+    yield _Line("  steps: 1_000_000", "budget: actions of all agents")
+    yield _Line("  minutes: null", "time limit; the earlier of the two ends training")
+    yield _Line("  checkpoint_every: 200_000", "actions between published versions")
+    yield _Line("  runners: 1", "processes that sample; 0 samples in the learner's")
+    if turns <= SHORT_EPISODE:
+        yield _Line("  gamma: 1.0", f"no discount: at most {turns:.0f} actions of an agent per episode")
+    else:
+        yield _Line("  gamma: 0.99", "discount per action; smaller favours quick wins")
+    if interface.hidden_information and not found.has_common_reward:
+        yield _Line("  lr: {initial: 0.001, final: 0.0}", "learning rate, annealed as information is hidden")
+        yield _Line("  entropy: {initial: 0.1, final: 0.02}", "exploration, annealed for the same reason")
+    else:
+        yield _Line("  lr: 0.0005", "learning rate of Adam")
+        yield _Line("  entropy: 0.05", "exploration; less makes the policy decide sooner")
+    leaves = [leaf for spaces in interface.agents.values() for leaf in _observed(spaces.observation)]
+    if convolutions := _convolutions(leaves):
+        yield _Line(f"  convolutions: {_inline(convolutions)}", "for observations (height, width, channels)")
+    yield _Line("  hidden: [256, 256]", "widths of the hidden layers")
+    if any(map(_is_wide, leaves)):
+        yield _Line("  normalize_observations: true", "the bounds of observations are wide or infinite")
+    if not found.has_common_reward:
+        yield _Line("  opponents: []", "such as {ref: script:random, share: 0.2}; else self-play")
+
+
+def _gate() -> Iterator[_Line]:
+    yield _Line()
+    yield _Line("gate:", "league nightly: the test for promotions")
+    yield _Line("  elo1: 30", "gain in Elo that the test should detect")
+    yield _Line("  max_blocks: 4000", "pairs of games after which a test ends undecided")
+    yield _Line("  anchors: []", "bots or versions that a champion must not lose to")
+
+
+def _patterns(own: list[str], agents: list[str]) -> list[str]:
+    """Agents of a policy by their names or, if there are many, by a pattern that fits no other agent."""
+    if len(own) == len(agents):
+        return ["*"]
+    stem = own[0].rstrip("0123456789")
+    if len(own) > LISTED_AGENTS and [agent for agent in agents if agent.startswith(stem)] == own:
+        return [f"{stem}*"]
+    return own
+
+
+def _described(space: Space) -> str:
+    match space:
+        case Discrete():
+            return f"{space.n} discrete actions"
+        case MultiDiscrete():
+            return f"{len(np.ravel(space.nvec))} discrete choices per action"
+        case Box():
+            return f"{prod(space.shape)} continuous numbers per action"
+    return space.type
+
+
+def _other_algorithms(interface: Interface, api: str) -> list[str]:
+    """Algorithms other than PPO for the action spaces, see docs/training.md."""
+    actions = [spaces.action for spaces in interface.agents.values()]
+    found = []
+    if all(isinstance(action, Discrete) for action in actions):
+        found.append("dqn")
+        if api != "AEC" and len(interface.policy_ids) == 1:
+            found.append("qmix (a team)")
+    if api != "AEC" and all(isinstance(action, Discrete | Box) for action in actions):
+        found.append("maddpg")
+    return found
+
+
+def _observed(space: Any) -> list[Leaf]:
+    return [leaf for name, leaf in inputs(space).items() if name != ACTION_MASK]
+
+
+def _convolutions(leaves: list[Leaf]) -> list[dict[str, int]]:
+    """Convolutions that fit the smallest image-like part of the observations; empty without one."""
+    sizes = [min(leaf.shape[:2]) for leaf in leaves if isinstance(leaf, Box) and len(leaf.shape) == 3]
+    if not sizes or min(sizes) < SMALL_BOARD:
+        return []
+    return IMAGE_CONVOLUTIONS if min(sizes) >= IMAGE else BOARD_CONVOLUTIONS
+
+
+def _is_wide(leaf: Leaf) -> bool:
+    """Whether the numbers of a part are unbounded or large. Images are scaled by their bounds."""
+    if not isinstance(leaf, Box) or np.dtype(leaf.dtype).kind != "f" or len(leaf.shape) == 3:
+        return False
+    bounds = [*np.ravel(leaf.low), *np.ravel(leaf.high)]
+    return any(bound is None or not -WIDE <= bound <= WIDE for bound in bounds)  # None: infinite
+
+
+def _inline(value: Any) -> str:
+    """A value in the flow style of YAML. Texts are quoted only where necessary."""
+    if isinstance(value, str):
+        return value if PLAIN.fullmatch(value) and yaml.safe_load(value) == value else json.dumps(value)
+    return yaml.safe_dump(value, default_flow_style=True, width=1000, sort_keys=False, allow_unicode=True).strip()

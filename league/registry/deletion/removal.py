@@ -1,0 +1,349 @@
+"""Removes versions and leagues with everything that depends on them.
+
+    rows that depend deleted, versions abandoned → files removed → rows of versions and league deleted
+
+The first step is one transaction, after which nothing refers to the files. If the process ends before the last step,
+the next removal completes it; a publication also completes that of a version. An archived league without versions is
+what an interrupted removal of a league leaves.
+"""
+
+import json
+import shutil
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+
+from sqlalchemy import ColumnElement, Select, and_, delete, exists, func, or_, select, update
+from sqlalchemy.orm import InstrumentedAttribute, Session
+
+from league.errors import Conflict
+from league.files import disk_errors
+from league.refs import CheckpointRef, short_verdict
+from league.registry import evaluations, leagues, traffic, versions
+from league.registry.publishing import VersionPublisher
+from league.registry.storage import change_counter
+from league.registry.storage.artifacts import ArtifactStore
+from league.registry.storage.database import Database, Repository
+from league.registry.storage.rows import VerdictRow, detached
+from league.registry.storage.tables import (
+    ABANDONED,
+    READY,
+    AliasEventTable,
+    AliasTable,
+    Base,
+    EvaluationTable,
+    IdempotentCallTable,
+    LeagueTable,
+    MatchTable,
+    NightlyRunTable,
+    RunTable,
+    ScheduleTable,
+    ShadowCountTable,
+    SnapshotTable,
+    StrengthTable,
+    TrafficEventTable,
+    VerdictTable,
+    VersionNoteTable,
+    VersionTable,
+)
+from league.registry.training import runs
+
+MAX_NAMED = 3
+"""Verdicts, versions or runs that a reason names."""
+
+
+@dataclass(frozen=True, slots=True)
+class RemovalPlan:
+    """What is removed.
+
+    Attributes:
+        target: `connect_four`, or `connect_four@3`.
+        versions: Version → size of its files in bytes.
+        aliases: Aliases that are removed.
+        verdicts: Ids of verdicts that are removed with their schedules.
+        matches: Number of recorded matches that are removed.
+        runs: Ids of training runs that are removed, with their files on this machine.
+        reasons: What depends on the target, in words; empty if nothing does.
+    """
+
+    target: str
+    versions: dict[int, int]
+    aliases: tuple[str, ...] = ()
+    verdicts: tuple[str, ...] = ()
+    matches: int = 0
+    runs: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Dependents:
+    """Rows that depend on a target, and why they do."""
+
+    aliases: list[str] = field(default_factory=list)
+    verdicts: list[str] = field(default_factory=list)
+    schedules: set[str] = field(default_factory=set)
+    """Those of the verdicts, which are deleted as a whole."""
+    played: set[str] = field(default_factory=set)
+    """Other schedules in which the version takes part. Their matches between others stay."""
+    reasons: list[str] = field(default_factory=list)
+
+
+class RemovalRepository(Repository):
+    """Plans and carries out removals."""
+
+    def __init__(self, database: Database, artifacts: ArtifactStore, home: Path) -> None:
+        super().__init__(database)
+        self._artifacts, self._home = artifacts, home
+        self._publisher = VersionPublisher(database, artifacts)
+
+    def plan_version(self, ref: CheckpointRef) -> RemovalPlan:
+        """Return what the removal of a version removes. Raises UnknownLeague, UnknownVersion or UnknownAlias."""
+        with self._database.read() as session:
+            version = versions.resolve(session, ref)
+            found = _dependents_of_version(session, version.league, version.number)
+            matches = _count_matches(session, _matches_of(version.ref, found))
+        return RemovalPlan(
+            version.ref,
+            {version.number: self._artifacts.size(version.league, version.number)},
+            tuple(found.aliases),
+            tuple(found.verdicts),
+            matches,
+            reasons=tuple(found.reasons),
+        )
+
+    def plan_league(self, league: str) -> RemovalPlan:
+        """Return what the removal of a league removes. Raises UnknownLeague."""
+        with self._database.read() as session:
+            leagues.require(session, league)
+            numbers = session.scalars(
+                select(VersionTable.number).filter_by(league=league).order_by(VersionTable.number)
+            )
+            sizes = {number: self._artifacts.size(league, number) for number in numbers}
+            aliases = _names(session, AliasTable.name, league)
+            verdicts = _names(session, VerdictTable.id, league)
+            run_ids = _names(session, RunTable.id, league)
+            matches = _count_matches(session, MatchTable.league == league)
+        reasons = [
+            *(f"the alias {name} is set" for name in aliases),
+            *_counted(len(verdicts), "verdict", map(short_verdict, verdicts)),
+            *_counted(matches, "recorded match", plural="recorded matches"),
+            *_counted(len(run_ids), "training run", run_ids),
+        ]
+        return RemovalPlan(league, sizes, aliases, verdicts, matches, run_ids, tuple(reasons))
+
+    def remove_version(self, ref: CheckpointRef, *, force: bool = False) -> RemovalPlan:
+        """Remove a version. Its number is never reused. Returns what was removed.
+
+        force: also remove what depends on it.
+
+        Raises:
+            UnknownLeague: The league does not exist.
+            UnknownVersion: The version does not exist.
+            Conflict: Something depends on it and `force` is false, it is a member of a mixture, or the league is being
+                trained or evaluated.
+            StorageError: A file cannot be removed. The next removal or publication removes it.
+        """
+        plan = self.plan_version(ref)
+        target = CheckpointRef.parse(plan.target)
+        assert isinstance(target.version, int)
+        with self._database.write() as session:
+            leagues.lock(session, target.league)
+            versions.require(session, target.league, target.version)
+            _require_idle(session, target.league)
+            _require_no_member(session, target.league, target.version)
+            found = _dependents_of_version(session, target.league, target.version)
+            _require_free(plan.target, found.reasons, force)
+            _delete_dependents(session, target.league, target.version, found)
+        self._publisher.sweep(target.league)
+        return plan
+
+    def remove_league(self, league: str, *, force: bool = False) -> RemovalPlan:
+        """Remove a league with all its versions, results and runs. Returns what was removed.
+
+        force: also if it has aliases, verdicts, recorded matches or training runs.
+
+        Raises:
+            UnknownLeague: The league does not exist.
+            Conflict: It is in use and `force` is false, or it is being trained or evaluated.
+            StorageError: A file cannot be removed. The next removal removes it.
+        """
+        plan = self.plan_league(league)
+        with self._database.write() as session:
+            row = leagues.lock(session, league)
+            _require_idle(session, league)
+            _require_free(league, plan.reasons, force)
+            row.archived_at = row.archived_at or datetime.now(UTC)
+            change_counter.count(session, "aliases")
+            change_counter.count(session, "traffic")
+            _delete_calls(session, league)
+            for table in reversed(Base.metadata.sorted_tables):
+                if "league" in table.columns and table.name != VersionTable.__tablename__:
+                    session.execute(delete(table).where(table.c.league == league))
+            session.execute(update(VersionTable).filter_by(league=league).values(state=ABANDONED, parent=None))
+        for number in plan.versions:
+            self._artifacts.remove_training(league, number)
+            self._artifacts.discard(league, number)
+        for directory in (self._home / "runs" / league, self._home / "sweeps" / league):
+            with disk_errors(directory), suppress(FileNotFoundError):
+                shutil.rmtree(directory)
+        report = self._home / "reports" / f"{league}.html"
+        with disk_errors(report):
+            report.unlink(missing_ok=True)
+        with self._database.write() as session:
+            session.execute(delete(VersionTable).filter_by(league=league, state=ABANDONED))
+            session.execute(delete(LeagueTable).filter_by(slug=league))
+        return plan
+
+
+def _dependents_of_version(session: Session, league: str, number: int) -> _Dependents:
+    """Find what depends on a version: aliases, verdicts, recorded matches, other versions, runs and traffic."""
+    ref, found = f"{league}@{number}", _Dependents()
+    found.aliases += session.scalars(
+        select(AliasTable.name).filter_by(league=league, version=number).order_by(AliasTable.name)
+    )
+    for verdict in session.scalars(select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at)):
+        companions = [*verdict.settings.get("anchors", ()), *verdict.settings.get("exploiters", ())]
+        if number == verdict.candidate or ref in (verdict.champion, *(each["ref"] for each in companions)):
+            found.verdicts.append(verdict.id)
+            found.schedules |= set(detached(VerdictRow, verdict).schedules)
+    documents = session.execute(select(ScheduleTable.id, ScheduleTable.document).filter_by(league=league))
+    found.played = {id_ for id_, document in documents if ref in json.loads(document)["contestants"]}
+    found.played -= found.schedules
+    matches = _count_matches(session, _matches_of(ref, found))
+    children = session.scalars(_ready(league).filter_by(parent=number)).all()
+    exploiters = session.scalars(_ready(league).filter_by(exploits=ref)).all()
+    uses = or_(RunTable.parent == number, RunTable.exploits == ref)
+    started = session.scalars(select(RunTable.id).filter_by(league=league).where(uses).order_by(RunTable.id)).all()
+    nights = session.scalars(select(NightlyRunTable).filter_by(league=league, ended_at=None)).all()
+    setting = traffic.current_setting(session, league)
+    portions = {"canary": setting.canary, "shadow": setting.shadow}
+    names = {number, *found.aliases}
+    found.reasons = [
+        *(f"the alias {name} points to it" for name in found.aliases),
+        *(f"it is the {name}" for name, portion in portions.items() if portion and portion.version in names),
+        *(f"it is a member of @{mixture}" for mixture in _mixtures_of(session, league, number)),
+        *(f"it is a member of the mixture @{each}" for each in _mixtures_of(session, league, number)),
+        *_counted(len(found.verdicts), "verdict", map(short_verdict, found.verdicts)),
+        *_counted(matches, "recorded match", plural="recorded matches"),
+        *(f"nightly run {night.id} tests it" for night in nights if number in night.candidates),
+        *_counted(len(children), "version trained from it", _refs(children), "versions trained from it"),
+        *_counted(len(exploiters), "exploiter of it", _refs(exploiters), "exploiters of it"),
+        *_counted(len(started), "training run that uses it", started, "training runs that use it"),
+    ]
+    return found
+
+
+def _delete_dependents(session: Session, league: str, number: int, found: _Dependents) -> None:
+    """Delete what depends on a version, and abandon it. Children and runs keep their weights and lose their parent."""
+    gone = set(session.scalars(select(AliasEventTable.id).filter_by(league=league, version=number)))
+    session.execute(delete(IdempotentCallTable).where(IdempotentCallTable.event.in_(gone)))
+    change_counter.count(session, "aliases")
+    session.execute(delete(AliasTable).filter_by(league=league, version=number))
+    _relink(session, league, gone)
+    session.execute(delete(AliasEventTable).where(AliasEventTable.id.in_(gone)))
+    session.execute(update(AliasEventTable).where(AliasEventTable.verdict.in_(found.verdicts)).values(verdict=None))
+    session.execute(delete(VerdictTable).where(VerdictTable.id.in_(found.verdicts)))
+    session.execute(delete(MatchTable).where(_matches_of(f"{league}@{number}", found)))
+    session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.schedules)))
+    session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.played), ~_has_matches()))
+    session.execute(delete(SnapshotTable).filter_by(league=league))
+    session.execute(delete(VersionNoteTable).filter_by(league=league, version=number))
+    strength, ref = StrengthTable, f"{league}@{number}"
+    measured = or_(strength.version == number, strength.opponent == ref)
+    session.execute(delete(strength).where(strength.league == league, measured))
+    counts = ShadowCountTable
+    of_version = or_(counts.candidate == number, counts.champion == number)
+    session.execute(delete(counts).where(counts.league == league, of_version))
+    session.execute(update(VersionTable).filter_by(league=league, parent=number).values(parent=None))
+    session.execute(update(RunTable).filter_by(league=league, parent=number).values(parent=None))
+    session.execute(update(VersionTable).filter_by(league=league, number=number).values(state=ABANDONED))
+
+
+def _matches_of(ref: str, found: _Dependents) -> ColumnElement[bool]:
+    """Matches of deleted schedules, and those of other schedules in which the version takes part."""
+    takes_part = or_(MatchTable.first == ref, MatchTable.second == ref)
+    return or_(MatchTable.schedule.in_(found.schedules), and_(MatchTable.schedule.in_(found.played), takes_part))
+
+
+def _has_matches() -> ColumnElement[bool]:
+    return exists().where(MatchTable.schedule == ScheduleTable.id)
+
+
+def _relink(session: Session, league: str, gone: Collection[int]) -> None:
+    """Let a rollback return to the event beneath those that are deleted."""
+    events = {event.id: event for event in session.scalars(select(AliasEventTable).filter_by(league=league))}
+    for event in events.values():
+        while event.beneath is not None and event.beneath in gone:
+            event.beneath = events[event.beneath].beneath
+    session.flush()
+
+
+def _delete_calls(session: Session, league: str) -> None:
+    """Delete the idempotency keys whose results are deleted with a league."""
+    call = IdempotentCallTable
+    for column, table in (
+        (call.event, AliasEventTable),
+        (call.traffic, TrafficEventTable),
+        (call.evaluation, EvaluationTable),
+    ):
+        session.execute(delete(call).where(column.in_(select(table.id).filter_by(league=league))))
+
+
+def _require_idle(session: Session, league: str) -> None:
+    """Raise Conflict while the league is trained or evaluated."""
+    now = datetime.now(UTC)
+    for run in runs.active(session, league):
+        if now - run.heartbeat_at < runs.HEARTBEAT_TIMEOUT:
+            raise Conflict(f"training run {run.id} of league {league} is active: stop it first, or wait for its end")
+    for evaluation in evaluations.active(session, league):
+        raise Conflict(f"evaluation {evaluation.id} of league {league} is {evaluation.state}: stop it, or wait")
+
+
+def _require_no_member(session: Session, league: str, number: int) -> None:
+    """Raise Conflict if the version is a member of a mixture, which could not play without it."""
+    if containing := _mixtures_of(session, league, number):
+        raise Conflict(
+            f"{league}@{number} is a member of {', '.join(f'{league}@{each}' for each in containing)}:"
+            " remove the mixture first"
+        )
+
+
+def _mixtures_of(session: Session, league: str, number: int) -> list[int]:
+    numbers = session.scalars(select(VersionTable.number).filter_by(league=league, state=READY)).all()
+    found = versions.mixtures(session, league, numbers)
+    return sorted(each for each, mixture in found.items() if number in mixture.versions)
+
+
+def _require_free(target: str, reasons: Sequence[str], force: bool) -> None:
+    if reasons and not force:
+        raise Conflict(
+            f"{target} is in use: {'; '.join(reasons)}. --force removes it with everything that depends on it"
+        )
+
+
+def _ready(league: str) -> Select[VersionTable]:
+    return select(VersionTable).filter_by(league=league, state=READY).order_by(VersionTable.number)
+
+
+def _refs(rows: Iterable[VersionTable]) -> list[str]:
+    return [f"@{row.number}" for row in rows]
+
+
+def _names(session: Session, column: InstrumentedAttribute[str], league: str) -> tuple[str, ...]:
+    return tuple(session.scalars(select(column).where(column.class_.league == league).order_by(column)))
+
+
+def _count_matches(session: Session, which: ColumnElement[bool]) -> int:
+    return session.scalar(select(func.count()).select_from(MatchTable).where(which)) or 0
+
+
+def _counted(count: int, what: str, names: Iterable[str] = (), plural: str | None = None) -> Iterator[str]:
+    """`2 verdicts (0f3a62d1, 77c01d2e)`, or nothing."""
+    if count:
+        first = list(islice(names, MAX_NAMED))
+        more = [f"{count - MAX_NAMED} more"] if first and count > MAX_NAMED else []
+        listed = f" ({', '.join(first + more)})" if first else ""
+        yield f"{count:,} {what if count == 1 else plural or f'{what}s'}{listed}"

@@ -1,0 +1,229 @@
+"""Follows the registry's aliases, traffic settings and API keys, and acknowledges what this replica serves.
+
+One task on the event loop. It reads what has changed, as the change counter tells: after a notification of PostgreSQL,
+otherwise by polling.
+"""
+
+import asyncio
+import random
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+
+from league.errors import LeagueError, StorageError
+from league.registry.registry import Registry
+from league.registry.replicas import KEPT
+from league.registry.storage.rows import AliasTarget, ChangeCounts, KeyRow, ReadPosition, ServedState
+from league.registry.storage.rows import Traffic as Setting
+from serve_app.models.alias_slots import Alias, AliasSlots
+from serve_app.models.polling import JITTER, Polling
+from serve_app.models.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
+from serve_app.models.traffic_split import TrafficSplit, pinned_slots
+from serve_app.runtime.ray_serve import logger
+from serve_app.runtime.replica_process import ReplicaProcess
+from serve_app.settings import ServeSettings
+
+POLL_NOTIFIED = 1.0
+"""Seconds between polls where PostgreSQL notifies of changes: a notification may be lost, for example in a pooler."""
+SPREAD = 0.02
+"""Seconds over which replicas that were notified at the same moment read. Changes in this time are read together."""
+REREAD = 60.0
+"""Seconds after which everything is read again: processes of earlier releases do not count changes."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """What the registry requires of replicas. A part is None if it has not changed since the last time."""
+
+    counts: ChangeCounts
+    connection: int
+    """Number of the connection that it was read through."""
+    aliases: Mapping[Alias, AliasTarget] | None
+    traffic: Mapping[str, Setting] | None
+    keys: list[KeyRow] | None
+
+
+@dataclass(slots=True)
+class _Acknowledged:
+    """What the registry knows of this replica."""
+
+    position: ReadPosition | None = None
+    differing: dict[str, ServedState] = field(default_factory=dict)
+
+
+class RegistryWatcher:
+    """Keeps slots, traffic and keys at what the registry requires, and acknowledges it as `replica`.
+
+    update_keys: raises StorageError if the keys are those of a different database. on_heartbeat: called at each
+    heartbeat, in the thread of the connection.
+    """
+
+    def __init__(
+        self,
+        connection: RegistryConnection,
+        slots: AliasSlots,
+        traffic: TrafficSplit,
+        update_keys: Callable[[list[KeyRow]], None],
+        replica: str,
+        process: ReplicaProcess,
+        settings: ServeSettings,
+        on_heartbeat: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._connection = connection
+        self._slots = slots
+        self._traffic = traffic
+        self._update_keys = update_keys
+        self._replica = replica
+        self._process = process
+        self._settings = settings
+        self._on_heartbeat = on_heartbeat
+        self._polling = Polling(self.poll_once, "the registry", settings, self._pause)
+        self._aliases: Mapping[Alias, AliasTarget] = {}
+        self._wanted_traffic: Mapping[str, Setting] = {}
+        self._position = ReadPosition(0, 0, 0)
+        self._newest_events: Mapping[str, int] = {}
+        """league → its newest alias event"""
+        self._last_read: _Read | None = None
+        self._reread_at = 0.0
+        self._heartbeat_at = 0.0
+        """When the next one is due, a time of `time.monotonic`."""
+        self._acknowledged = _Acknowledged()
+        self._is_current = False
+        """Whether the last poll succeeded and everything is served."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether everything was read at least once and is still polled."""
+        return self._polling.is_ready
+
+    @asynccontextmanager
+    async def watching(self) -> AsyncIterator[None]:
+        """Follow the registry while the context is active; enters after everything was read and loaded once."""
+        try:
+            async with self._polling.running():
+                yield
+        finally:
+            self._slots.close()
+            with suppress(LeagueError, TimeoutError):
+                await asyncio.wait_for(
+                    self._connection.call(lambda registry: registry.replicas.remove(self._replica)), SHUTDOWN_TIMEOUT
+                )
+
+    async def poll_once(self) -> None:
+        """Read what has changed, start to load what it names, and acknowledge. Raises StorageError.
+
+        A version that takes longer than a pause to load is acknowledged by a later call.
+        """
+        self._is_current = False
+        if time.monotonic() >= self._heartbeat_at:
+            # Before the aliases are read for the first time: nobody waits for a replica that is not registered.
+            await self._register()
+        read = await self._connection.call(self._read)
+        self._accept(read)
+        if read.aliases is not None or read.traffic is not None or self._slots.differing():
+            wanted = {alias: target.version for alias, target in self._aliases.items()}
+            self._slots.update(wanted | pinned_slots(self._wanted_traffic))
+            await self._slots.settle(self._settings.poll)
+            self._traffic.update(self._wanted_traffic)
+        if self._slots.is_settled:
+            self._polling.mark_ready()
+        await self._acknowledge()
+        self._is_current = not self._slots.differing()
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait until the next poll: the next notification, unless a version must be loaded or the last poll failed."""
+        longest = max(seconds, POLL_NOTIFIED * random.uniform(1 - JITTER, 1 + JITTER))
+        timeout = max(0.0, min(longest, self._heartbeat_at - time.monotonic()))
+        if not self._is_current or not await self._connection.wait(timeout):
+            await asyncio.sleep(seconds)
+        else:
+            await asyncio.sleep(random.uniform(0, SPREAD))
+
+    async def _register(self) -> None:
+        """Register this replica, and remove those that ended without deregistering."""
+        if not await self._connection.call(self._report_life):
+            self._acknowledged = _Acknowledged()
+        self._heartbeat_at = time.monotonic() + self._settings.heartbeat
+
+    def _report_life(self, registry: Registry) -> bool:
+        is_known = registry.replicas.register(self._replica, self._process.description)
+        for other in registry.replicas.silent():
+            if other.silence > KEPT or self._process.has_ended(other.process):
+                registry.replicas.remove(other.replica)
+                logger.info("replica %s has ended without deregistering", other.replica)
+        self._on_heartbeat()
+        return is_known
+
+    def _read(self, registry: Registry) -> _Read:
+        """Read the parts that have changed, or all through a new connection: it may be a different database."""
+        counts, connection = registry.changes.counts(), self._connection.opened
+        last = self._last_read
+        is_current = last is not None and connection == last.connection and time.monotonic() < self._reread_at
+        known = last.counts if last is not None and is_current else None
+        return _Read(
+            counts,
+            connection,
+            registry.aliases.all() if known is None or known.aliases != counts.aliases else None,
+            registry.traffic.all() if known is None or known.traffic != counts.traffic else None,
+            registry.keys.all() if known is None or known.keys != counts.keys else None,
+        )
+
+    def _accept(self, read: _Read) -> None:
+        """Take over what was read. Raises StorageError, and takes over nothing, if it is of a different database."""
+        if read.aliases is not None and not read.aliases and self._aliases:
+            raise StorageError("the registry has no aliases, but had some before: it is a different database")
+        if read.keys is not None:
+            self._update_keys(read.keys)
+        if read.aliases is not None:
+            self._aliases = read.aliases
+            self._newest_events = _newest_events(read.aliases)
+        if read.traffic is not None:
+            self._wanted_traffic = read.traffic
+        if None not in (read.aliases, read.traffic, read.keys):
+            self._reread_at = time.monotonic() + REREAD
+        settings = (one.id or 0 for one in self._wanted_traffic.values())
+        newest = max(self._newest_events.values(), default=0), max(settings, default=0)
+        self._position = ReadPosition(read.counts.to_acknowledge, *newest)
+        self._last_read = read
+
+    async def _acknowledge(self) -> None:
+        """Acknowledge what was read, and leagues that differ from it, if this has changed."""
+        known, position, differing = self._acknowledged, self._position, self._differing()
+        changed = {league: state for league, state in differing.items() if known.differing.get(league) != state}
+        settled = None if known.position is None else known.differing.keys() - differing.keys()
+        if position == known.position and not changed and not settled:
+            return
+        self._acknowledged = _Acknowledged()  # unknown, until it is certain that the change was committed
+        if await self._connection.call(
+            lambda registry: registry.replicas.acknowledge(self._replica, position, changed, settled)
+        ):
+            self._acknowledged = _Acknowledged(position, differing)
+        else:
+            self._heartbeat_at = 0.0  # another replica took this one for dead: register again
+
+    def _differing(self) -> dict[str, ServedState]:
+        """league → what is served, where this differs from what was read."""
+        leagues = self._slots.differing() | self._traffic.differing()
+        if not leagues:
+            return {}
+        numbers, faults = self._slots.numbers(), self._slots.faults()
+        return {league: self._serves(league, numbers.get(league, {}), faults.get(league)) for league in leagues}
+
+    def _serves(self, league: str, numbers: Mapping[str, int], fault: str | None) -> ServedState:
+        champion = self._slots.champion(league)
+        return ServedState(
+            version=champion.number if champion else None,
+            sha256=champion.sha256 if champion else None,
+            fault=fault,
+            aliases=numbers,
+            event=self._newest_events.get(league),
+            traffic=self._traffic.applied_setting(league),
+        )
+
+
+def _newest_events(aliases: Mapping[Alias, AliasTarget]) -> dict[str, int]:
+    newest: dict[str, int] = {}
+    for (league, _), target in aliases.items():
+        newest[league] = max(target.event, newest.get(league, 0))
+    return newest

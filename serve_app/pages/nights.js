@@ -1,0 +1,58 @@
+// Nights of training: the strength and the learned exploitability of the champion after each night.
+
+import { html } from "./vendor/preact-htm.js";
+import { apiPath } from "./api.js";
+import { Chart } from "./chart.js";
+import { useChangeToken, useList } from "./data.js";
+import { Await, EmptyState, leaguePath, ShowMore, Table, Time } from "./components.js";
+import { Term } from "./term.js";
+import { range } from "./strength.js";
+import { interval, percent, shortRef, signed } from "./format.js";
+
+export function Nights({ league }) {
+  const nights = useList(apiPath(league, "nights"), "nights", useChangeToken("runs", "computed_at", "aliases"));
+  return html`<section aria-labelledby="heading">
+    <div class="head"><h2 id="heading">Nights of training</h2></div>
+    <${Await} result=${nights}>${nights.items && (nights.items.length
+      ? html`<${Charts} nights=${nights.items.toReversed()} /><${List} league=${league} nights=${nights.items} />`
+      : html`<${EmptyState}>No nights of training yet. Start one with <code>league nightly ${league} --train</code>.<//>`)}<//>
+    <${ShowMore} list=${nights} />
+  </section>`;
+}
+
+function Charts({ nights }) {
+  const rated = nights.filter((night) => night.rating != null);
+  const measured = nights.filter((night) => night.exploitability);
+  const last = { rated: rated.at(-1), measured: measured.at(-1)?.exploitability };
+  return html`<div class="curves">
+    ${rated.length > 0 && html`<article><h3>Strength</h3>
+      <${Chart} label="Ratings of the champions of ${rated.length} nights. Last: ${last.rated.champion} with ${signed(last.rated.rating)} Elo." xName="night" yName="Elo"
+        x=${rated.map((night) => night.night)} lines=${[{ name: "rating of the champion", values: rated.map((night) => night.rating), dots: true }]}
+        intervals=${rated.map((night) => night.interval)} format=${(value) => signed(value)} />
+      <p class="muted small">Today's ratings of the champions of that time, on one scale, with 95 % intervals.</p></article>`}
+    ${measured.length > 0 && html`<article><h3>Learned exploitability</h3>
+      <${Chart} label="Scores of exploiters in ${measured.length} nights. Last: ${percent(last.measured.score)}, 95 % interval ${range(last.measured)}." xName="night"
+        x=${measured.map((night) => night.night)} lines=${[{ name: "score of the exploiter", values: measured.map((night) => night.exploitability.score), dots: true }]}
+        intervals=${measured.map(({ exploitability: { low, high } }) => [low, high])} thresholds=${[{ name: "even", value: 0.5, tone: "muted" }]} format=${(share) => percent(share, 0)} />
+      <p class="muted small">The score of the best exploiter against the champion, with its interval. A best response scores at least the lower end.</p></article>`}
+  </div>`;
+}
+
+function List({ league, nights }) {
+  const head = [["Night", "number"], ["Started"], ["Versions"], ["Champion"], [html`<${Term} name="rating">Rating<//>`, "number"], ["95 % interval"], ["Exploiter's score", "number"], ["95 % interval"], ["Errors"]];
+  return html`<${Table} caption="Nights, newest first" head=${head} cls="full">${nights.map((night) => html`<${Row} key=${night.night} league=${league} night=${night} />`)}<//>`;
+}
+
+function Row({ league, night: { night, run, exploiter_run: exploiterRun, versions, champion, champion_before: before, rating, interval: bounds, exploitability, errors, began_at: began, ended_at: ended } }) {
+  const score = exploitability && percent(exploitability.score);
+  return html`<tr>
+    <th scope="row" class="number">${night}</th>
+    <td class="nowrap"><${Time} at=${began} date />${!ended && html` <small class="muted">not complete</small>`}</td>
+    <td><a href=${leaguePath(league, "runs", run)}>${versions.map(shortRef).join(", ") || "none"}</a></td>
+    <td class="nowrap">${champion ? html`<span class="ref">${shortRef(champion)}</span>${champion !== before && html` <small>new</small>`}` : html`<span class="muted">–</span>`}</td>
+    <td class="number strong">${signed(rating)}</td><td class="nowrap muted">${interval(bounds)}</td>
+    <td class="number">${score && exploiterRun ? html`<a href=${leaguePath(league, "runs", exploiterRun)}>${score}</a>` : score ?? html`<span class="muted">–</span>`}</td>
+    <td class="nowrap muted">${exploitability ? range(exploitability) : "–"}</td>
+    <td class="wrap">${errors.join("; ")}</td>
+  </tr>`;
+}

@@ -1,0 +1,259 @@
+"""Ten typical mistakes: the message is one line that names the file, key or line, and what to do."""
+
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from league.config.gate import GateConfig
+from league.registry.registry import Registry
+from tests.support.command import League
+from tests.support.leagues import tictactoe
+
+GAME = '''
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+
+class Guess(ParallelEnv):
+    """Both agents observe a digit; the one who names it gets 1."""
+
+    metadata = {"name": "guess"}
+    possible_agents = ["a", "b"]
+    most = 5
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 9, (1,), np.float32)
+
+    def action_space(self, agent):
+        return spaces.Discrete(10)
+
+    def reset(self, seed=None, options=None):
+        self.rng, self.agents, self.steps = np.random.default_rng(seed), list(self.possible_agents), 0
+        return self.observe(), {agent: {} for agent in self.agents}
+
+    def observe(self):
+        self.digit = int(self.rng.integers(10))
+        return {agent: np.array([self.digit], np.float32) for agent in self.agents}
+
+    def step(self, actions):
+        self.steps += 1
+        rewards = {agent: float(action == self.digit) for agent, action in actions.items()}
+        observations = self.observe()
+        ended = dict.fromkeys(self.agents, self.steps == self.most)
+        if self.steps == self.most:
+            self.agents = []
+        return observations, rewards, ended, dict.fromkeys(ended, False), {agent: {} for agent in ended}
+'''
+TRAINING = {"runners": 0, "num_envs": 2, "steps": 64, "train_batch_size": 32, "minibatch_size": 32, "hidden": [8]}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with a game of the user."""
+    folder = tmp_path / "project"
+    folder.mkdir()
+    (folder / f"guess_{tmp_path.name}.py").write_text(GAME)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def module(folder: Path) -> Path:
+    return next(folder.glob("*.py"))
+
+
+def write(folder: Path, **changes: Any) -> Path:
+    document = {
+        "league": "guess",
+        "environment": {"entry_point": f"{module(folder).stem}:Guess"},
+        "training": TRAINING,
+        **changes,
+    }
+    path = folder / "guess.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def replaced(folder: Path, old: str, new: str) -> int:
+    """Change a line of the game; return its number."""
+    text = module(folder).read_text()
+    assert text.count(old) == 1
+    text = text.replace(old, new)
+    module(folder).write_text(text)
+    return next(number for number, line in enumerate(text.splitlines(), 1) if new.splitlines()[-1].strip() in line)
+
+
+def one_line(text: str) -> str:
+    assert "Traceback" not in text
+    (line,) = text.strip().splitlines()
+    return line
+
+
+def test_the_game_itself_is_sound(league: League, folder: Path) -> None:
+    write(folder)
+    result = league("check-env", "guess.yaml")
+    assert result.code == 0, result.out
+    assert "The environment passes" in result.out
+
+
+def test_a_misspelt_key(league: League, folder: Path) -> None:
+    write(folder, training={**TRAINING, "stesp": 5})
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    assert one_line(result.err) == "league: guess.yaml: training.stesp: unknown key, did you mean 'steps'?"
+
+
+def test_a_failing_import(league: League, folder: Path) -> None:
+    line = replaced(folder, "import numpy as np", "import numpy as np\nimport no_such_library")
+    write(folder)
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    message = one_line(result.err)
+    assert message.startswith("league: environment.entry_point: ")
+    assert "No module named 'no_such_library'" in message
+    assert f"{module(folder)}, line {line}" in message
+
+
+def test_a_misspelt_function(league: League, folder: Path) -> None:
+    write(folder, environment={"entry_point": f"{module(folder).stem}:Gues"})
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    stem = module(folder).stem
+    expected = f"environment.entry_point: {stem!r} ({module(folder)}) has no 'Gues', did you mean 'Guess'?"
+    assert one_line(result.err) == f"league: {expected}"
+
+
+def test_an_exception_in_step(league: League, folder: Path) -> None:
+    line = replaced(folder, "self.steps += 1", "self.steps += self.speed")
+    write(folder)
+    result = league("check-env", "guess.yaml", "--json")
+    assert result.code == 1
+    (fault,) = [each["text"] for each in result.json["findings"] if each["severity"] == "fault"]
+    assert f"{module(folder)}, line {line}, step 1 of the episode with seed 0" in fault
+    assert "AttributeError: 'Guess' object has no attribute 'speed'" in fault
+
+
+@pytest.mark.slow
+def test_an_exception_in_step_during_training(league_process: League, folder: Path) -> None:
+    line = replaced(folder, "self.steps += 1", "self.steps += self.speed")
+    write(folder)
+    result = league_process("train", "guess.yaml", timeout=400)
+    assert result.code == 1
+    message = result.err.strip().splitlines()[-1]
+    assert f"'Guess' object has no attribute 'speed' at {module(folder)}:{line} in the episode with seed" in message
+
+
+def test_an_endless_episode(league: League, folder: Path) -> None:
+    replaced(folder, "most = 5", "most = None")
+    write(folder, play={"max_moves": 200})
+    result = league("check-env", "guess.yaml", "--json")
+    assert result.code == 1
+    (fault,) = [each["text"] for each in result.json["findings"] if each["severity"] == "fault"]
+    assert "did not end within 200 steps (play.max_moves)" in fault
+    assert "terminate or truncate it in the environment, or raise play.max_moves" in fault
+
+
+def test_an_observation_outside_of_its_space(league: League, folder: Path) -> None:
+    replaced(folder, "return spaces.Box(0, 9, (1,), np.float32)", "return spaces.Box(0, 9, (2,), np.float32)")
+    write(folder)
+    result = league("check-env", "guess.yaml", "--json")
+    assert result.code == 1
+    faults = [each for each in result.json["findings"] if each["severity"] == "fault"]
+    assert faults[0]["text"] == "observes observation with shape [1], but its space has [2]"
+    assert faults[0]["agents"] == ["a", "b"]
+
+
+def test_a_wrong_name_of_a_league(league: League, registry: Registry) -> None:
+    result = league("versions", "tictactoo")
+    assert result.code == 2
+    assert one_line(result.err) == "league: there is no league 'tictactoo', did you mean 'tictactoe'?"
+
+
+def test_a_wrong_name_of_a_configuration(league: League, folder: Path) -> None:
+    write(folder)
+    result = league("train", "gues")
+    assert result.code == 2
+    message = one_line(result.err)
+    assert "'gues' is neither a YAML file nor a bundled configuration" in message
+    assert message.endswith("for a league of your own, name its file")
+
+
+def test_a_leagues_name_in_place_of_its_file(league: League, folder: Path) -> None:
+    write(folder)
+    result = league("train", "guess")
+    assert result.code == 2
+    assert one_line(result.err).endswith(": did you mean guess.yaml?")
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        yield server.getsockname()[1]
+
+
+def test_a_port_in_use(league_process: League, registry: Registry, taken_port: int) -> None:
+    result = league_process("serve", "--port", str(taken_port))
+    assert result.code == 1
+    message = result.err.strip().splitlines()[-1]
+    assert message == (
+        f"league: port {taken_port} of 127.0.0.1 is in use: stop the other server, or choose another with --port"
+    )
+
+
+def test_no_version_yet(league: League, home: Path) -> None:
+    tictactoe.registry(home)
+    result = league("promote", "tictactoe@1")
+    assert result.code == 2
+    expected = "league tictactoe has no version 1; none is published yet: `league train CONFIG` publishes versions"
+    assert one_line(result.err) == f"league: {expected}"
+
+
+def test_code_is_found_from_another_directory(league: League, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(folder)
+    monkeypatch.chdir(folder.parent)
+    assert league("check-env", str(folder / "guess.yaml")).code == 0
+
+
+def test_another_directory(league: League, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(folder)
+    (folder.parent / "elsewhere").mkdir()
+    monkeypatch.chdir(folder.parent / "elsewhere")
+    module(folder).rename(folder.parent / "moved.py")
+    result = league("train", os.path.relpath(folder / "guess.yaml"))
+    assert result.code == 2
+    message = one_line(result.err)
+    assert "environment.entry_point: cannot import" in message
+    assert f"searched: {folder}, " in message
+
+
+@pytest.mark.parametrize(
+    ("anchor", "message"),
+    [
+        ("script:one_pli", "unknown script 'one_pli'; known: random, "),
+        ("@3", "league guess has no version yet: train it first"),
+        ("tictactoe@1", "tictactoe@1 is not a version of league guess"),
+    ],
+)
+@pytest.mark.parametrize(("command", "code"), [("check-env", 1), ("train", 2), ("nightly", 2)])
+def test_an_invalid_anchor(league: League, folder: Path, command: str, code: int, anchor: str, message: str) -> None:
+    write(folder, gate={"anchors": [anchor]})
+    result = league(command, "guess.yaml")
+    assert result.code == code
+    assert f"gate.anchors: {message}" in result.out + result.err
+
+
+def test_an_invalid_anchor_of_a_league_with_versions(league: League, registry: Registry) -> None:
+    row = registry.leagues.get("tictactoe")
+    invalid = row.config.model_copy(update={"gate": GateConfig.model_validate({"anchors": ["@9"]})})
+    registry.leagues.register(invalid, row.interface)
+    for command in (("nightly", "tictactoe"), ("evaluate", "tictactoe")):
+        result = league(*command)
+        assert result.code == 2
+        assert "gate.anchors: league tictactoe has no version 9; the newest is 3" in one_line(result.err)

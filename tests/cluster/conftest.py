@@ -1,0 +1,25 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.cluster import league_cluster
+from tests.support.cluster.league_cluster import LeagueCluster
+
+
+@pytest.fixture(scope="package")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all machines share."""
+    found = tmp_path_factory.mktemp("cluster")
+    for path in (found, found.parent):
+        path.chmod(0o755)  # PostgreSQL runs as another user
+    return found
+
+
+@pytest.fixture(scope="package")
+def cluster(directory: Path) -> Iterator[LeagueCluster]:
+    """A cluster of three nodes in network namespaces."""
+    if (reason := league_cluster.obstacle()) is not None:
+        pytest.skip(reason)
+    with league_cluster.cluster(directory) as running:
+        yield running

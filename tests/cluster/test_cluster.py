@@ -1,0 +1,69 @@
+"""Three nodes with addresses of their own: training, tournaments and serving while nodes are lost, cut off and join.
+
+The tests use one cluster in the order of this file: what one trains, the next ones play and serve.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from league.stack import VERIFIED
+from tests.support.cluster import scenarios
+from tests.support.cluster.league_cluster import LeagueCluster
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+BLOCKS = 400
+OUTAGE = 30.0
+"""Seconds without a head, and without the database."""
+
+
+def test_a_learner_runs_where_there_are_cpus(cluster: LeagueCluster, directory: Path) -> None:
+    """The driver is on the head, which has none: the learner and its checkpoints are on a worker."""
+    output = scenarios.train(cluster, directory)
+    assert f"Published {scenarios.LEAGUE}@2" in output
+
+
+def test_training_continues_after_the_loss_of_a_worker(cluster: LeagueCluster, directory: Path) -> None:
+    scenarios.lose_worker_while_training(cluster, directory)
+
+
+def test_a_tournament_is_the_same_after_the_loss_of_a_worker(cluster: LeagueCluster) -> None:
+    disturbed, undisturbed = scenarios.lose_worker_during_tournament(cluster, BLOCKS)
+    assert disturbed == undisturbed
+    assert disturbed.count("\n") >= BLOCKS
+
+
+def test_a_node_with_another_version_is_refused(cluster: LeagueCluster, directory: Path) -> None:
+    said = scenarios.join_with_another_version(cluster, directory, "onnxruntime", "1.2.3")
+    assert f"has onnxruntime 1.2.3, this one has {VERIFIED['onnxruntime']}" in said
+
+
+@pytest.fixture(scope="module")
+def key(cluster: LeagueCluster) -> Iterator[str]:
+    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "test")
+    with scenarios.serving(cluster) as token:
+        yield token
+
+
+def test_no_call_is_lost_with_a_worker(cluster: LeagueCluster, key: str) -> None:
+    calls, killed = scenarios.lose_worker_while_serving(cluster, key)
+    assert calls.lost == []
+    assert len(calls.attempts_lost) <= scenarios.THREADS, "no more than those in flight"
+    assert calls.new_replicas(killed), "others are started elsewhere"
+
+
+def test_no_call_is_lost_with_the_database(cluster: LeagueCluster, key: str) -> None:
+    calls, _ = scenarios.cut_off_database(cluster, key, 2, OUTAGE)
+    assert calls.lost == []
+    assert calls.attempts_lost == []
+    assert calls.versions() == ["1", "2"], "promoted meanwhile, followed afterwards"
+
+
+def test_no_call_is_lost_with_the_head(cluster: LeagueCluster, key: str) -> None:
+    calls, killed, _ = scenarios.lose_head(cluster, key, 1, OUTAGE)
+    assert calls.lost == []
+    assert calls.attempts_lost == []
+    assert calls.versions() == ["2", "1"], "promoted meanwhile"
+    assert calls.new_replicas(killed) == [], "replicas continue"

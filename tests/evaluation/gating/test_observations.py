@@ -1,0 +1,42 @@
+import pytest
+
+from evaluation.gating.gate import decide_pairs
+from evaluation.gating.observations import matches_each, observe
+from league.config.gate import GateConfig
+from league.results.records import Game, Match
+
+GATE = GateConfig()
+
+
+def match(contestants: tuple[str, str], score: float) -> Match:
+    """A block in which the first contestant has this score in both games."""
+    games = tuple(Game((i, 1 - i), 1, (), (), (score, -score), (score, 1 - score)) for i in (0, 1))
+    return Match("s/0", "league", "s", 0, contestants, 1, "digest", games)
+
+
+def round_of(own: tuple[float, ...], other: tuple[float, ...]) -> list[Match]:
+    """A round in which candidate and champion have these scores against their exploiters."""
+    pairs = zip(own, other, strict=True)
+    return [match((who, f"{who}-{i}"), s) for i, both in enumerate(pairs) for who, s in zip("ab", both, strict=True)]
+
+
+def test_a_round_is_one_observation_of_mean_scores() -> None:
+    matches = [*round_of((1.0, 0.5), (0.0, 0.5)), *round_of((0.0, 0.0), (1.0, 0.5))]
+    seen = observe(GATE, matches, "a", "b", pairs=2)
+    assert seen.scores == pytest.approx([0.5 + 0.25, 0.5 - 0.375])
+    assert seen.gaps == pytest.approx([0.5, -0.75])
+    assert (seen.comparisons, matches_each("b", 2)) == (8, 4)
+    decision = decide_pairs(GATE.against_exploiter(0.1), matches, "a", "b", pairs=2)
+    assert (decision.blocks, decision.games, len(decision.counts)) == (2, 16, 17)
+
+
+def test_an_incomplete_round_is_ignored() -> None:
+    matches = round_of((1.0, 0.5), (0.0, 0.5))
+    for end in range(4):
+        assert observe(GATE, matches[:end], "a", "b", pairs=2).scores == []
+
+
+def test_differences_of_returns_are_means_of_a_round() -> None:
+    returns = GateConfig(model="returns", return_bound=2, margin=0.5)
+    seen = observe(returns, round_of((1.0, 0.5), (0.0, 0.5)), "a", "b", pairs=2)
+    assert seen.gaps == pytest.approx([1.0])

@@ -1,0 +1,122 @@
+"""Proposed configurations: what agents, spaces and measured play decide."""
+
+from typing import Any
+
+import pytest
+import yaml
+
+from league.environments.conformance.findings import Examination
+from league.environments.conformance.openings import OpeningMeasurement
+from league.environments.conformance.proposal import _header, _inline, _play, _policies, _training, propose
+from league.errors import ConfigError
+from league.interface import AgentInterface, Interface
+from league.spaces import Box, DictSpace, Discrete, MultiDiscrete
+from tests.support.leagues.registries import config
+
+THREE = Discrete(n=3)
+
+
+def spaces(action: Any = THREE, shape: tuple[int, ...] = (4,), low: Any = -1, high: Any = 1) -> AgentInterface:
+    seen = Box(dtype="float32", shape=shape, low=low, high=high)
+    return AgentInterface(observation=DictSpace(spaces={"observation": seen}), action=action)
+
+
+def interface(*kinds: AgentInterface, hidden: bool = False) -> Interface:
+    agents = {f"player_{number}": kind for number, kind in enumerate(kinds)}
+    return Interface(
+        agents=agents,
+        policies={agent: f"policy_{kinds.index(kind)}" for agent, kind in agents.items()},
+        sides={agent: (agent,) for agent in agents},
+        hidden_information=hidden,
+    )
+
+
+def examined(api: str = "AEC", length: int = 100, common: bool = False) -> Examination:
+    openings = OpeningMeasurement(1, 20, (), 3)
+    return Examination(api=api, lengths=[length], has_common_reward=common, openings=openings)
+
+
+def parsed(lines: Any) -> Any:
+    """The YAML of some lines, each of which has a comment."""
+    text = [str(line) for line in lines]
+    assert all(" # " in line for line in text if line)
+    return yaml.safe_load("\n".join(text))
+
+
+def training(found: Examination, *kinds: AgentInterface, hidden: bool = False) -> Any:
+    return parsed(_training(found, interface(*kinds, hidden=hidden)))["training"]
+
+
+def test_the_network_fits_the_observations() -> None:
+    assert "convolutions" not in training(examined(), spaces(), spaces())
+    assert "convolutions" not in training(examined(), spaces(shape=(3, 3, 2)))
+    assert training(examined(), spaces(shape=(6, 7, 2)))["convolutions"] == [{"filters": 32, "kernel": 3}]
+    assert len(training(examined(), spaces(shape=(84, 84, 3), low=0, high=255))["convolutions"]) == 3
+    assert len(training(examined(), spaces(shape=(84, 84, 3)), spaces(shape=(8, 8, 3)))["convolutions"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(-1, 1, None), (None, None, True), (0, 1000, True), (0, None, True), ([0, 0, 0, None], 1, True)],
+)
+def test_wide_observations_are_normalised(low: Any, high: Any, expected: bool | None) -> None:
+    assert training(examined(), spaces(low=low, high=high)).get("normalize_observations") is expected
+
+
+def test_the_algorithm_fits_the_actions() -> None:
+    box = Box(dtype="float32", shape=(2,), low=-1, high=1)
+    for api, action, others in (
+        ("AEC", Discrete(n=3), "also possible: dqn"),
+        ("Parallel", Discrete(n=3), "also possible: dqn, qmix (a team), maddpg"),
+        ("Parallel", box, "also possible: maddpg"),
+        ("AEC", box, "the only one for these spaces"),
+        ("Parallel", MultiDiscrete(nvec=[2, 3], start=[0, 0], shape=(2,)), "the only one for these spaces"),
+    ):
+        lines = list(map(str, _training(examined(api), interface(spaces(action), spaces(action)))))
+        assert next(line for line in lines if "algorithm: ppo" in line).endswith(others)
+
+
+def test_episodes_and_hidden_information_decide_discount_and_annealing() -> None:
+    assert training(examined(length=8), spaces(), spaces())["gamma"] == 1.0
+    open_, hidden = (training(examined(), spaces(), spaces(), hidden=value) for value in (False, True))
+    assert (open_["gamma"], open_["lr"]) == (0.99, 0.0005)
+    assert hidden["lr"] == {"initial": 0.001, "final": 0.0}
+
+
+def test_measured_openings_are_used_unless_actions_are_sampled() -> None:
+    known = parsed(_play(config(), examined(), interface(spaces(), spaces())))["play"]
+    hidden = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True)))["play"]
+    team = parsed(_play(config(), examined(common=True), interface(spaces(), spaces(), hidden=True)))["play"]
+    assert known == {"actions": "greedy", "opening_plies": 3}
+    assert hidden == {"actions": "sampled", "opening_plies": 0}
+    assert team == {"actions": "greedy", "opening_plies": 3}
+
+
+def test_policies_and_sides() -> None:
+    two = interface(spaces(), spaces(Discrete(n=5)))
+    document = parsed(_policies(two, is_team=False))
+    assert document["policies"] == {"policy_0": ["player_0"], "policy_1": ["player_1"]}
+    assert document["sides"] == {"player_0": ["player_0"], "player_1": ["player_1"]}
+    many = interface(*[spaces()] * 9, *[spaces(Discrete(n=5))] * 9)
+    document = parsed(_policies(many, is_team=False))
+    assert document["policies"]["policy_0"] == [f"player_{number}" for number in range(9)], "a pattern fits others"
+    assert document["sides"] is None
+    assert parsed(_policies(many, is_team=True))["sides"] == {"team": ["*"]}
+
+
+@pytest.mark.parametrize(
+    "value", ["a.b:c", "yes", "a: b", "..", "#", "", "a'b\"", {"game": "x", "n": [1, True]}, [None]]
+)
+def test_values_survive_yaml(value: Any) -> None:
+    assert yaml.safe_load(f"key: {_inline(value)}  # comment") == {"key": value}
+
+
+def test_the_header_names_the_environment() -> None:
+    environment = {"entry_point": "openspiel", "kwargs": {"game": "kuhn_poker"}}
+    document = yaml.safe_load("\n".join(map(str, _header(config(), environment, None))))
+    assert document == {"league": "tictactoe", "environment": environment}
+
+
+def test_an_environment_that_cannot_be_built_is_refused(tmp_path: Any) -> None:
+    with pytest.raises(ConfigError, match="nowhere_to_be_found"):
+        propose("mine", "nowhere_to_be_found:make_env", {}, str(tmp_path))
