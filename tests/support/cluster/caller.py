@@ -1,6 +1,7 @@
 """Calls a served policy without pause, with and without the client's retries, and reports what was lost.
 
-Starts when the server answers, runs until SIGTERM, and keeps a JSON file up to date. Arguments: base URL, API key, league, number of threads, file.
+Starts when the server answers, runs until SIGTERM, and keeps a JSON file up to date. Arguments: base URL, API key,
+league, number of threads, file.
 """
 
 import json
