@@ -164,18 +164,6 @@ class NightlyRunRepository(Repository):
             return _nightly_row(run)
 
     @repeat_after_deadlock
-    def settle(self, verdict: str, name: str, value: dict[str, Any]) -> VerdictRow:
-        """Set a setting that was None when the verdict was opened, and return the verdict.
-
-        A setting that is set, and a closed verdict, stay as they are. Raises UnknownVerdict.
-        """
-        with self._database.write() as session:
-            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
-            if row.outcome is None and row.settings[name] is None:
-                row.settings = row.settings | {name: value}
-            return _row(row)
-
-    @repeat_after_deadlock
     def close(self, run: int, report: dict[str, Any] | None) -> None:
         """End a nightly run and store its report. Idempotent."""
         with self._database.write() as session:

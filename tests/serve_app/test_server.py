@@ -79,7 +79,9 @@ def test_one_scrape_covers_all_replicas(url: str, served: Registry) -> None:
         until(lambda: len(replicas()) == 2)
 
 
-def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
+def versions_of(url: str) -> Callable[[], Callable[[], int]]:
+    """Return callers, each with a key of its thread and a connection, whose calls return the version that acted."""
+
     def caller() -> Callable[[], int]:
         client = httpx.Client(base_url=url, headers={"x-league-key": f"caller-{threading.get_ident()}"})
 
@@ -90,6 +92,11 @@ def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
 
         return call
 
+    return caller
+
+
+def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
+    caller = versions_of(url)
     promote(served, "board", 1)
     with load(caller, callers=4) as seen:
         for share in (1.0, 0.0, 1.0):
@@ -105,19 +112,9 @@ def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
 
 
 def test_mixtures_are_swapped_under_load_and_pinned_in_every_replica(url: str, served: Registry) -> None:
-    def caller() -> Callable[[], int]:
-        client = httpx.Client(base_url=url, headers={"x-league-key": f"caller-{threading.get_ident()}"})
-
-        def call() -> int:
-            reply = client.post(ACTION, json={"observation": BOARD})
-            assert reply.status_code == 200, reply.text
-            return int(reply.json()["version"])
-
-        return call
-
     promote(served, "board", 1)
     mixtures = [served.publisher.publish_mixture("board", shares) for shares in ({1: 0.3, 3: 0.7}, {2: 0.5, 3: 0.5})]
-    with load(caller, callers=4) as seen:
+    with load(versions_of(url), callers=4) as seen:
         for row in mixtures * 2:
             promote(served, "board", row.number)
             served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
