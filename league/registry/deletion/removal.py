@@ -224,7 +224,6 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     found.reasons = [
         *(f"the alias {name} points to it" for name in found.aliases),
         *(f"it is the {name}" for name, portion in portions.items() if portion and portion.version in names),
-        *(f"it is a member of @{mixture}" for mixture in _mixtures_of(session, league, number)),
         *(f"it is a member of the mixture @{each}" for each in _mixtures_of(session, league, number)),
         *_counted(len(found.verdicts), "verdict", map(short_verdict, found.verdicts)),
         *_counted(matches, "recorded match", plural="recorded matches"),

@@ -224,7 +224,7 @@ def test_a_member_of_a_mixture_is_not_removed_before_the_mixture(registry: Regis
     publish(registry, "run/2")
     mixture = registry.publisher.publish_mixture(LEAGUE, {1: 0.5, 2: 0.5})
     member = CheckpointRef(LEAGUE, 1)
-    assert f"it is a member of @{mixture.number}" in registry.removal.plan_version(member).reasons
+    assert f"it is a member of the mixture @{mixture.number}" in registry.removal.plan_version(member).reasons
     with pytest.raises(Conflict, match=rf"{LEAGUE}@1 is a member of {mixture.ref}: remove the mixture first"):
         registry.removal.remove_version(member, force=True)
     registry.removal.remove_version(CheckpointRef(LEAGUE, mixture.number))
