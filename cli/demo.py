@@ -62,9 +62,8 @@ def _train(config: "LeagueConfig", minutes: float) -> None:
     from evaluation.service.strength_process import strength_process
     from training.runs.train import train
 
-    _step(
-        1, f"Train for {minutes:g} minutes: self-play and games against script:one_ply (masked PPO, RLlib, Ray Tune)."
-    )
+    _step(1, f"Train for {minutes:g} minutes by masked PPO (RLlib, Ray Tune): self-play, and games against {OPPONENT}.")
+    say("The policy also imitates script:minimax_4, a search to a depth of four moves, most of all at first.")
     say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
     paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS)
     registry = open_registry()
