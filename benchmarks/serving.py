@@ -6,7 +6,8 @@ answers with a constant; the same handler and model on uvicorn alone; FastAPI wi
 serving a policy, which reads a flat board and answers with the arg max. Servers run one at a time, in rounds; ratios
 are computed within a round, and the medians over the rounds are reported. One replica each, unless stated otherwise. By
 default Serve sends 5 concurrent requests to a replica and backs off beyond that: RLlib's example is measured with 5
-connections, too, and its better rate counts.
+connections, too, and its better rate counts. Processor time per request is that of all processes of a server; unlike
+rates it says nothing about waiting, but it hardly depends on what else runs on the machine.
 
 --peers compares with LitServe, MLServer and BentoML instead, one worker each, next to FastAPI. They run our graph with
 ONNX Runtime, answer with the action only, and are installed into a cache folder.
@@ -20,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from math import nan
@@ -28,6 +29,7 @@ from pathlib import Path
 from statistics import median
 
 import httpx
+import psutil
 import yaml
 
 from benchmarks.leagues.served_league import BODY, LEAGUE, PLANES, publish
@@ -64,6 +66,7 @@ class ServerUnderTest:
     connections: tuple[int, ...] = (CONNECTIONS,)
     rates: list[dict[int, float]] = field(default_factory=list)
     latencies: list[float] = field(default_factory=list)
+    costs: list[float] = field(default_factory=list)
     failed: int = 0
 
     def measure(self, seconds: float) -> None:
@@ -71,9 +74,13 @@ class ServerUnderTest:
         with self.start() as url:
             rates = {}
             for connections in self.connections:
-                load = measure(url, self.body, connections=connections, seconds=seconds, warm_up=2)
+                self.failed += measure(url, self.body, connections=connections, seconds=2, warm_up=0).failed
+                before = _processor_seconds()
+                load = measure(url, self.body, connections=connections, seconds=seconds, warm_up=0)
+                spent = sum(after - before.get(pid, after) for pid, after in _processor_seconds().items())
                 rates[connections] = load.rate
                 self.failed += load.failed
+            self.costs.append(1e6 * spent / load.requests)
             one = measure(url, self.body, connections=1, seconds=seconds, warm_up=0.5)
         self.rates.append(rates)
         self.failed += one.failed
@@ -89,7 +96,18 @@ class ServerUnderTest:
             f"{median(each[count] for each in self.rates):,.0f}/s at {count}" for count in self.connections
         )
         failed = f", {self.failed} failed" if self.failed else ""
-        return f"{rates} connections, p50 {median(self.latencies):.2f} ms at 1{failed}"
+        cost = f"{median(self.costs):.0f} µs of processor time per request"
+        return f"{rates} connections, {cost}, p50 {median(self.latencies):.2f} ms at 1{failed}"
+
+
+def _processor_seconds() -> dict[int, float]:
+    """Processor time of each process that this one, or one of its own, has started."""
+    found = {}
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            times = process.cpu_times()
+            found[process.pid] = times.user + times.system
+    return found
 
 
 def main() -> int:
@@ -128,7 +146,9 @@ def _is_as_fast(servers: dict[str, ServerUnderTest]) -> bool:
 
 def _compare(ours: ServerUnderTest, peer: ServerUnderTest, least: float | None) -> bool:
     ratio = median(ours.best(number) / (peer.best(number) or nan) for number in range(len(ours.rates)))
-    print(f"ours / {peer.name}: {ratio:.2f}×" + ("" if least is None else f"   (at least {least:g}×)"))
+    cheaper = median(other / own for own, other in zip(ours.costs, peer.costs, strict=True))
+    target = "" if least is None else f"   (at least {least:g}×)"
+    print(f"ours / {peer.name}: {ratio:.2f}×{target}, with 1/{cheaper:.2f} of its processor time per request")
     return least is None or not ratio < least
 
 

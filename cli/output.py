@@ -132,6 +132,11 @@ def text(value: Any) -> str:
     return CONTROL.sub("�", str(value))
 
 
+def counted(number: int, noun: str) -> str:
+    """Format a number of things: `1 game`, `2 games`."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:
     """Format a rating and its interval as `+123 [+100, +150]`."""
     if rating is None:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from cli.options import LeagueName, open_registry
-from cli.output import console, emit, say
+from cli.output import console, counted, emit, say
 from league.errors import ConfigError
 from league.refs import check_slug
 
@@ -40,6 +40,7 @@ def report(
     with console.status(f"reading {league}"):
         found = league_report(registry, league)
     write(found, out)
-    say(f"{out}: {found.games} games, {len(found.verdicts)} verdicts, {len(found.upsets)} upsets.")
+    counts = (found.games, "game"), (len(found.verdicts), "verdict"), (len(found.upsets), "upset")
+    say(f"{out}: {', '.join(counted(number, noun) for number, noun in counts)}.")
     for sentence in found.left_out:
         say(sentence)

@@ -10,7 +10,7 @@ import typer
 
 from cli.options import DEFAULT_URL, open_registry
 from cli.output import emit, say
-from league.errors import ConfigError, InvalidReference
+from league.errors import ConfigError, InvalidReference, RemoteError
 from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_ref
 from league.settings import Storage
 
@@ -132,13 +132,21 @@ def act(
 def _ask(
     ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, url: str
 ) -> dict[str, Any]:
+    import httpx
     import numpy as np
 
     from league.client import Client
 
     model = str(PolicyRef(ref.league, policy))
-    with Client(url) as client:
-        response = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
+    try:
+        with Client(url) as client:
+            response = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
+    except RemoteError as error:
+        if not isinstance(error.__cause__, httpx.ConnectError):
+            raise
+        raise RemoteError(
+            f"{error}; `league serve` starts a server, --url names another, --local needs none"
+        ) from error
     return {
         "action": np.asarray(response.action).tolist(),
         "model": model,

@@ -79,8 +79,10 @@ def check_env(
             say(found.implementation)
             say(found.policies)
             say(found.actions)
-            if found.openings is not None:
-                say(str(found.openings))
+            if (openings := found.openings) is not None:
+                say(str(openings))
+                if (plies := league.play.opening_plies) != openings.recommended and 0 < plies <= len(openings.lengths):
+                    say(f"play.opening_plies is {plies}. {openings.effect(plies)}.")
         if (vectorised := found.vectorised) is not None:
             ratio = vectorised.steps_per_second / vectorised.stock_steps_per_second
             say(
@@ -215,7 +217,7 @@ def runs(
                 row.state,
                 row.role if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}",
                 row.steps,
-                round(row.seconds / 60, 1),
+                f"{row.seconds / 60:.1f}",
                 "; ".join(_score(each, league) for each in strength[row.id]),
             )
             for row in rows
@@ -301,7 +303,7 @@ def _show(report: "SweepReport", config: str) -> None:
                 *(str(trial.settings[name]) for name in names),
                 trial.score,
                 None if trial.outcome is None else trial.outcome.steps,
-                None if trial.outcome is None else round(trial.outcome.seconds / 60, 1),
+                None if trial.outcome is None else f"{trial.outcome.seconds / 60:.1f}",
                 _note(trial.error, trial.outcome is None, trial.outcome is not None and trial.outcome.ended_early),
             )
             for trial in report.trials

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from cli.options import Actor, AsJson, open_registry
-from cli.output import emit, say
+from cli.output import counted, emit, say
 
 Verdict = Annotated[
     str, typer.Argument(metavar="VERDICT", help="ID of the verdict or its first digits, as shown by `league history`.")
@@ -27,7 +27,9 @@ def verify(
         return
     say(f"{found.outcome}: {found.matches} matches follow the schedule, {found.numbers} recorded numbers reproduced.")
     if found.replayed:
-        say(f"{found.replayed} games were replayed with identical results.")
+        say(f"{counted(found.replayed, 'game')} replayed with identical results.")
+    if not found.is_current:
+        say("The game of the league has changed since. The verdict stands, but its games count in no current rating.")
 
 
 def void(

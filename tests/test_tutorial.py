@@ -1,4 +1,7 @@
-"""The tutorial works as written, up to the champion: its files are saved and its commands are run, in order."""
+"""The tutorial works as written: its files are saved, its commands are run in order, and its programs call the server.
+
+The program in C# is only compared with the others.
+"""
 
 import json
 import os
@@ -6,9 +9,15 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from shutil import which
 
 import pytest
+
+from league.settings import Storage
+from serve_app.runtime.launch import running
+from tests.support.leagues.browser_leagues import answer
 
 PAGE = Path(__file__).parent.parent / "docs/tutorial.md"
 
@@ -17,25 +26,71 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(), flags=re.S | re.M)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_tutorial_leads_to_a_champion(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of the tutorial after its commands, with a champion."""
+    folder = tmp_path_factory.mktemp("tutorial")
     game, bot, _ = blocks("python")
-    (tmp_path / "nim.py").write_text(game)
-    (tmp_path / "nim_bot.py").write_text(bot)
-    (tmp_path / "nim.yaml").write_text(blocks("yaml")[0])
-    environment = os.environ | {"LEAGUE_HOME": str(tmp_path / "home")}
+    (folder / "nim.py").write_text(game)
+    (folder / "nim_bot.py").write_text(bot)
+    (folder / "nim.yaml").write_text(blocks("yaml")[0])
+    environment = os.environ | {"LEAGUE_HOME": str(folder / "league-home")}
     printed = []
     for line in blocks("sh")[0].splitlines():
         command = [str(Path(sys.executable).with_name("league")), *shlex.split(line)[1:]]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
         printed.append(done.stdout)
     assert "the champion is now nim@1" in printed[2]
-    assert (tmp_path / "game.gif").stat().st_size > 0
-    again = crontab_command(tmp_path, league=Path(sys.executable).with_name("league")).replace(" --train", "")
-    assert subprocess.run(["/bin/sh", "-c", again], cwd="/", env={"PATH": "/usr/bin:/bin"}, check=False).returncode == 0
-    assert "the champion is still nim@1" in (tmp_path / "nightly.log").read_text()
+    assert (folder / "game.gif").stat().st_size > 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def url(folder: Path) -> Iterator[str]:
+    with running(Storage.at(folder / "league-home"), replicas=1) as url:
+        yield url
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("suffix", "program"),
+    [(".py", [sys.executable]), (".mjs", [which("node") or "node"])],
+    ids=["Python", "JavaScript"],
+)
+def test_the_programs_call_the_server(url: str, tmp_path: Path, suffix: str, program: list[str]) -> None:
+    if not which(program[0]):
+        pytest.skip("Node is not installed")
+    text = blocks("python")[2] if suffix == ".py" else blocks("js")[0]
+    path = tmp_path / f"call{suffix}"
+    path.write_text(text.replace("http://127.0.0.1:8000", url))
+    done = subprocess.run([*program, str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) in (0, 1, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_person_plays_against_the_champion(url: str) -> None:
+    """The code of the game is found, although the server was started in another directory."""
+    game = answer("POST", f"{url}/v1/leagues/nim/play", {"opponent": "nim@champion", "agent": "first", "actions": [1]})
+    moves = [(move["agent"], move["ref"]) for step in game["steps"] for move in step["moves"]]
+    assert moves[:2] == [("first", "person"), ("second", "nim@1")]
+    assert game["picture"].startswith("data:image/png")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_line_of_the_crontab_trains_a_night(folder: Path) -> None:
+    with (folder / "nim.yaml").open("a") as file:
+        file.write("nightly: {steps: 1000, exploiter: 0}\n")
+    command = crontab_command(folder, league=Path(sys.executable).with_name("league"))
+    done = subprocess.run(["/bin/sh", "-c", command], cwd="/", env={"PATH": "/usr/bin:/bin"}, check=False)
+    log = (folder / "nightly.log").read_text()
+    assert done.returncode == 0, log
+    assert re.search(r"the champion is (still|now) nim@\d", log)
+    assert "nim@2" in log
 
 
 def crontab_command(folder: Path, league: Path) -> str:
@@ -54,7 +109,7 @@ def test_the_line_of_the_crontab_is_well_formed(tmp_path: Path) -> None:
     tool.write_text('#!/bin/sh\necho "$LEAGUE_HOME" "$@"\n')
     tool.chmod(0o700)
     subprocess.run(["/bin/sh", "-c", crontab_command(tmp_path, tool)], cwd="/", check=True)
-    assert (tmp_path / "nightly.log").read_text() == f"{tmp_path / 'home'} nightly --train nim\n"
+    assert (tmp_path / "nightly.log").read_text() == f"{tmp_path / 'home'} nightly --train nim.yaml\n"
 
 
 def test_the_calls_in_all_languages_are_the_same() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.options import AsJson, open_registry
-from cli.output import emit, say
+from cli.output import counted, emit, say
 from league.errors import InvalidInput
 from league.refs import CheckpointRef, check_slug
 
@@ -59,7 +59,7 @@ def remove(
 
 
 def _sentences(plan: "RemovalPlan") -> Iterator[str]:
-    versions = "" if "@" in plan.target else f"{len(plan.versions)} versions, "
+    versions = "" if "@" in plan.target else f"{counted(len(plan.versions), 'version')}, "
     yield f"{plan.target}: {versions}{_megabytes(plan)} of files"
     if plan.aliases:
         yield f"  aliases: {', '.join(plan.aliases)}"

@@ -37,6 +37,7 @@ class Verification(Document):
     """A verdict that was verified.
 
     matches: matches in the ledger. numbers: recomputed fields of the evidence. replayed: replayed games.
+    is_current: whether its games count today: neither the league's game nor the selection of actions has changed since.
     """
 
     verdict: str
@@ -44,6 +45,7 @@ class Verification(Document):
     matches: int
     numbers: int
     replayed: int
+    is_current: bool
 
 
 def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verification:
@@ -79,7 +81,9 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     if wrong:
         raise VerdictRefuted(f"the record of verdict {row.short_id} contradicts its games: {'; '.join(wrong)}")
     replayed = _replay(registry, row, matches, replays)
-    return Verification(row.id, row.outcome, len(matches), len(computed), replayed)
+    conditions = Ledger(registry).schedule(row.schedule).conditions
+    is_current = conditions == registry.leagues.get(row.league).conditions
+    return Verification(row.id, row.outcome, len(matches), len(computed), replayed, is_current)
 
 
 def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Match]:

@@ -15,9 +15,9 @@ from league.config.play import PlayConfig
 from league.config.ppo import PPOConfig
 from league.config.sweep import SweepConfig
 from league.config.training import NightlyConfig
-from league.config.validation_errors import describe_validation_error
+from league.config.validation_errors import describe_validation_error, describe_yaml_error
 from league.entry_points import search_in
-from league.errors import ConfigError, InvalidReference, one_line
+from league.errors import ConfigError, InvalidReference
 from league.interface import digest
 from league.refs import check_slug
 
@@ -72,7 +72,7 @@ class LeagueConfig(Part):
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not a YAML file: {one_line(error)}") from error
+            raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
         return cls.from_mapping(_with_folder(document, Path(path)), source=str(path))
 
     @classmethod

@@ -3,13 +3,22 @@
 import difflib
 from typing import Any, get_args, get_origin
 
+import yaml
 from pydantic import BaseModel, ValidationError
 
 from league.config.algorithms import ALGORITHMS
 from league.config.schedules import SCHEDULE_FORMS
+from league.errors import one_line
 
 RENAMED_KEYS = {"copies": "num_envs"}
 """Former key → current key."""
+
+
+def describe_yaml_error(error: yaml.YAMLError | UnicodeDecodeError) -> str:
+    """Return why a file is not YAML, and the line."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None and error.problem:
+        return f"line {error.problem_mark.line + 1}: not valid YAML: {error.problem}"
+    return f"not a YAML file: {one_line(error)}"
 
 
 def describe_validation_error(model: type[BaseModel], error: ValidationError) -> str:

@@ -44,6 +44,8 @@ export function Verdict({ league, verdict }) {
     <${Await} result=${found}>${loaded && html`
       <div class="head"><h2 id="heading"><span class="ref">${loaded.candidate}</span> against <span class="ref">${loaded.opponent}</span></h2> <${Outcome} value=${loaded.outcome} /></div>
       ${loaded.reason && html`<p class="lead">${loaded.reason}</p>`}
+      ${loaded.earlier_game && html`<div class="notice" role="status"><p><strong>The game of this league has changed since.</strong> These games count in no current rating.</p>
+        <a href=${query(leaguePath(league), { game: loaded.earlier_game })}>Show the results of that game</a></div>`}
       <${Evidence} verdict=${loaded} />
       <${Statistics} league=${league} verdict=${loaded} />
       ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
@@ -80,7 +82,7 @@ function Statistics({ league, verdict }) {
       verdict.elo != null && ["Elo difference", html`${signed(verdict.elo)} <small>${interval(verdict.interval)}</small>`],
       difference && ["Difference in mean return", html`${signed(difference.mean, 2)} <small>${number(difference.low)} to ${number(difference.high)}</small>`],
       verdict.hypotheses && ["Hypotheses", html`${signed(verdict.hypotheses[0])} vs ${signed(verdict.hypotheses[1])} <small>${unit}, ${verdict.model}</small>`],
-      verdict.alpha != null && ["Alpha budget", percent(verdict.alpha, 2)],
+      verdict.alpha != null && ["Alpha budget", percent(verdict.alpha, verdict.alpha < 0.001 ? 3 : 2)],
       ["Opened", html`<${Time} at=${verdict.opened_at} date />`],
       verdict.closed_at && ["Decided", html`<${Time} at=${verdict.closed_at} date />`],
     ]} />

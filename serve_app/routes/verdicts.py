@@ -15,6 +15,7 @@ from league.errors import UnknownVerdict
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import VerdictRow
+from league.results.ledger import Ledger
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import documents, parsing
 
@@ -57,7 +58,10 @@ def _listed(row: VerdictRow) -> dict[str, Any]:
 def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
     row = registry.verdicts.find(verdict, league)
     found = registry.snapshots.get(league, f"verdict/{row.id}")
+    conditions = Ledger(registry).schedule(row.schedule).conditions
+    is_current = conditions == registry.leagues.get(league).conditions
     document = {"league": league, "reason": None, "computed_at": None} | _listed(row)
+    document["earlier_game"] = None if is_current else conditions.name
     if found is not None:
         judgement = found.document
         document |= {"computed_at": found.at.isoformat()} | judgement | documents.verdict_summary(row)

@@ -108,6 +108,15 @@ def test_a_misspelt_key(league: League, folder: Path) -> None:
     assert one_line(result.err) == "league: guess.yaml: training.stesp: unknown key, did you mean 'steps'?"
 
 
+def test_a_line_that_is_not_yaml(league: League, folder: Path) -> None:
+    with write(folder).open("a") as file:
+        file.write("gate: {anchors: [}\n")
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    line = len((folder / "guess.yaml").read_text().splitlines())
+    assert one_line(result.err).startswith(f"league: guess.yaml: line {line}: not valid YAML: ")
+
+
 def test_a_failing_import(league: League, folder: Path) -> None:
     line = replaced(folder, "import numpy as np", "import numpy as np\nimport no_such_library")
     write(folder)
@@ -166,6 +175,15 @@ def test_an_observation_outside_of_its_space(league: League, folder: Path) -> No
     faults = [each for each in result.json["findings"] if each["severity"] == "fault"]
     assert faults[0]["text"] == "observes observation with shape [1], but its space has [2]"
     assert faults[0]["agents"] == ["a", "b"]
+
+
+def test_an_observation_of_another_structure(league: League, folder: Path) -> None:
+    replaced(folder, "np.array([self.digit], np.float32)", '{"digit": self.digit}')
+    write(folder)
+    result = league("check-env", "guess.yaml", "--json")
+    assert result.code == 1
+    (fault,) = [each["text"] for each in result.json["findings"] if each["severity"] == "fault"]
+    assert fault == "a observes a dict with digit, but its space is Box(0.0, 9.0, (1,), float32)"
 
 
 def test_a_wrong_name_of_a_league(league: League, registry: Registry) -> None:

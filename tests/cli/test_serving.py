@@ -26,6 +26,13 @@ def test_act_locally_on_text_a_file_and_stdin(league: League, registry: Registry
         assert document["sha256"] == registry.versions.get("tictactoe", 3).sha256
 
 
+def test_a_server_that_does_not_answer(league: League, registry: Registry) -> None:
+    result = league("act", "tictactoe@3", "--url", "http://127.0.0.1:9", "-o", json.dumps(EMPTY))
+    assert result.code == 1
+    assert "http://127.0.0.1:9/v1/policies/tictactoe/action?version=3 cannot be reached: " in result.err
+    assert "`league serve` starts a server, --url names another, --local needs none" in result.err
+
+
 def test_exploration_with_a_seed_is_reproducible(league: League, registry: Registry) -> None:
     first = league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out
     assert first == league("act", "tictactoe@1", "--local", "--explore", "--seed", "5").out

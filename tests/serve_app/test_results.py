@@ -147,6 +147,11 @@ def test_a_verdict_has_its_curve_once_computed(reader: TestClient) -> None:
     assert (pending["outcome"], pending["computed_at"], pending["reason"]) == ("open", None, None)
 
 
+def test_a_verdict_of_an_earlier_game_names_it(reader: TestClient) -> None:
+    found = [get(reader, f"{BOARD}/verdicts/{each}", "Verdict")["earlier_game"] for each in (LOST, WON, PENDING)]
+    assert found == [EARLIER, None, None]
+
+
 def test_an_outdated_reason_of_a_verdict_is_omitted(reader: TestClient) -> None:
     lost = get(reader, f"{BOARD}/verdicts/{LOST}", "Verdict")
     assert (lost["outcome"], lost["reason"]) == ("reject", None)

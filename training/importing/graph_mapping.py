@@ -8,7 +8,8 @@ import yaml
 from onnx.helper import tensor_dtype_to_np_dtype
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
 
-from league.errors import ConfigError, EnvironmentMismatch, one_line
+from league.config.validation_errors import describe_yaml_error
+from league.errors import ConfigError, EnvironmentMismatch
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
 from league.spaces import ACTION_MASK, Box, DictSpace, Leaf, inputs
@@ -72,7 +73,7 @@ class GraphMapping(BaseModel):
             key = ".".join(map(str, first["loc"])) or "mapping"
             raise ConfigError(f"{path}: {key}: {first['msg']}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not a YAML file: {one_line(error)}") from error
+            raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
 
 
 Shape = tuple[int | None, ...]

@@ -139,8 +139,8 @@ def _check_openings(plies: int, found: Examination) -> None:
     if (best := found.openings.recommended) and not plies:
         found.add("note", f"greedy policies would repeat one game: set play.opening_plies, for example to {best}")
     lengths = found.openings.lengths
-    if 0 < plies <= len(lengths) and (ended := lengths[plies - 1].ended) > MANY_ENDED:
-        found.add("note", f"random openings of {plies} plies (play.opening_plies) end {ended:.0%} of the games")
+    if 0 < plies <= len(lengths) and lengths[plies - 1].ended > MANY_ENDED:
+        found.add("note", f"play.opening_plies: {plies} is long for this game. {found.openings.effect(plies)}")
 
 
 def _check_report(agent: str, report: Report, found: Examination) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from league.environments.adapters import Observation
 from league.environments.building import action_space, observation_space
 from league.environments.conformance.findings import Examination, Trace
+from league.errors import EnvironmentMismatch
 from league.spaces import Box, Leaf, inputs
 from league.spaces.arrays import tensors
 from league.spaces.conversion import from_gymnasium
@@ -34,7 +35,7 @@ class ObservationCheck:
             self._found.add(
                 "note", "its observations are modified after they are returned: they are copied", self._agent
             )
-        arrays = tensors(self._space, value)
+        arrays = self._arrays(value)
         for name, leaf in self._leaves.items():
             if arrays[name].shape != leaf.shape:
                 shape, expected = list(arrays[name].shape), list(leaf.shape)
@@ -52,6 +53,16 @@ class ObservationCheck:
         copies = {name: np.array(array) for name, array in arrays.items()}
         self._kept = (arrays, copies)
         return copies
+
+    def _arrays(self, value: Any) -> Observation:
+        """Split an observation. Raises EnvironmentMismatch if its structure is not that of the space."""
+        try:
+            return tensors(self._space, value)
+        except (TypeError, ValueError, LookupError) as error:
+            kind = f"a dict with {', '.join(map(str, value))}" if isinstance(value, Mapping) else type(value).__name__
+            raise EnvironmentMismatch(
+                f"{self._agent} observes {kind}, but its space is {_shortened(self._gymnasium)}"
+            ) from error
 
 
 def _shortened(space: gymnasium.Space[Any]) -> str:

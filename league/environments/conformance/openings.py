@@ -38,6 +38,11 @@ class OpeningLength:
     distinct: float
     ended: float
 
+    def __str__(self) -> str:
+        count = round(self.distinct * OPENINGS)
+        positions = f"{count} different position{'s' * (count != 1)}"
+        return f"{positions} in {OPENINGS} games and end {self.ended:.1%} of them"
+
 
 @dataclass(frozen=True, slots=True)
 class OpeningMeasurement:
@@ -62,11 +67,12 @@ class OpeningMeasurement:
         seeds = f"With deterministic play, {self.games} seeds give {games}"
         if not self.lengths:
             return f"{seeds}: random openings are not needed."
-        best = self.lengths[self.recommended - 1]
-        return (
-            f"{seeds}. Random openings of {self.recommended} plies lead to different positions in {best.distinct:.0%}"
-            f" of the games and end {best.ended:.1%} of them: play.opening_plies: {self.recommended} is recommended."
-        )
+        plies = self.recommended
+        return f"{seeds}. {self.effect(plies)}: play.opening_plies: {plies} is recommended."
+
+    def effect(self, plies: int) -> str:
+        """What openings of a measured length do, in a sentence without its stop."""
+        return f"Random openings of {'1 ply' if plies == 1 else f'{plies} plies'} reach {self.lengths[plies - 1]}"
 
 
 def measure_openings(adapter: EnvAdapter, spaces: Sequence[gymnasium.Space[Any]], seed: int) -> OpeningMeasurement:

@@ -23,13 +23,15 @@ def test_an_open_verdict_becomes_void_and_ratings_start_anew(tmp_path: Path) -> 
     registry = tictactoe.registry(tmp_path, play={"opening_plies": 2, "num_envs": 8}, gate=GATE)
     tictactoe.publish(registry, tictactoe.graph(wins=True, blocks=True))
     row = registry.leagues.get(tictactoe.LEAGUE)
-    conclude(registry, open_verdict(registry, row, 1, "script:random"))
+    first = conclude(registry, open_verdict(registry, row, 1, "script:random"))
+    assert verify(first.verdict, registry=registry).is_current
     tictactoe.publish(registry, tictactoe.graph())
     champion = registry.aliases.current(tictactoe.LEAGUE).get("champion")
     opened = open_verdict(registry, row, 2, "script:random" if champion is None else f"{tictactoe.LEAGUE}@{champion}")
     assert compute_leaderboard(registry, tictactoe.LEAGUE)
 
     register(registry, actions="sampled")
+    assert not verify(first.verdict, registry=registry).is_current
     row = registry.leagues.get(tictactoe.LEAGUE)
     report = conclude(registry, opened)
     assert (report.outcome, report.note) == (

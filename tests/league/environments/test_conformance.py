@@ -215,7 +215,9 @@ def test_openings_that_end_many_games_get_a_note() -> None:
     config = league("pettingzoo.classic.tictactoe_v3")
     config = config.model_copy(update={"play": config.play.model_copy(update={"opening_plies": 7})})
     assert re.search(
-        r"random openings of 7 plies \(play.opening_plies\) end \d+% of the games", findings(examine(config), "note")
+        r"play.opening_plies: 7 is long for this game. Random openings of 7 plies reach \d+ different positions in 200"
+        r" games and end \d+.\d% of them",
+        findings(examine(config), "note"),
     )
 
 

@@ -65,8 +65,12 @@ def _matches(registry: Registry) -> None:
 
 
 def _verdicts(registry: Registry) -> None:
-    settings = {"gate": {"alpha": 0.05}}
+    """A rejected version in an earlier game, the champion, and an open verdict."""
+    settings, ledger = {"gate": {"alpha": 0.05}}, Ledger(registry)
+    current = registry.leagues.get(LEAGUE).game_digest
     for verdict, candidate in ((LOST, 3), (WON, 2), (PENDING, 3)):
+        game = f"{EARLIER.partition('-')[0]:0<64}" if verdict == LOST else current
+        ledger.open(replace(SCHEDULE, id=verdict, kind="verdict", game_digest=game))
         registry.verdicts.open(LEAGUE, candidate, f"board@{1 if verdict != PENDING else 2}", verdict, settings)
         if verdict == WON:
             registry.aliases.set(
