@@ -163,6 +163,7 @@ class RegistryWatcher:
 
     def _read(self, registry: Registry) -> _Read:
         """Read the parts that have changed, or all through a new connection: it may be a different database."""
+        self._connection.discard_notifications()
         counts, connection = registry.changes.counts(), self._connection.opened
         last = self._last_read
         is_current = last is not None and connection == last.connection and time.monotonic() < self._reread_at
