@@ -44,6 +44,7 @@ class Following:
     Attributes:
         rate: First load in requests per second.
         cost: Processor time of a request in seconds.
+        started: Seconds from the step up until Ray had started the second replica, which then loads the program.
         appeared: Seconds from the step up to the first answer of the second replica.
         removed: Seconds from the step down until it was gone.
         seen: What callers saw.
@@ -51,6 +52,7 @@ class Following:
 
     rate: float
     cost: float
+    started: float
     appeared: float
     removed: float
     seen: Steps
@@ -64,7 +66,8 @@ def main() -> int:
     seen, rate = found.seen, found.rate
     print(f"load: {rate:,.0f}, {FACTOR * rate:,.0f}, {rate:,.0f} requests/s, each {1e3 * found.cost:.2f} ms", end="")
     print(" of processor time")
-    print(f"second replica answers after {found.appeared:.1f} s   (at most {APPEARED:g} s)")
+    print(f"second replica answers after {found.appeared:.1f} s   (at most {APPEARED:g} s);", end="")
+    print(f" Ray started it after {found.started:.1f} s")
     print(f"gone {found.removed:.1f} s after the step down, of which {DOWNSCALE_DELAY:g} s are `downscale_delay_s`")
     print(
         f"{len(seen.lost)} of {seen.calls:,} calls of the client lost   (at most {LOST}), longest {seen.longest:.2f} s;"
@@ -89,16 +92,18 @@ def follow(steady: float) -> Following:
             _hold(registry, 1, steady)
             up = time.monotonic()
             load.set_rate(FACTOR * rate)
-            _await(registry, 2)
+            _await(lambda: len(replica_processes()), 2)
+            started = time.monotonic() - up
+            _await(lambda: _replicas(registry), 2)
             _hold(registry, 2, steady)
             down = time.monotonic()
             load.set_rate(rate)
-            _await(registry, 1)
+            _await(lambda: _replicas(registry), 1)
             removed = time.monotonic() - down
             _hold(registry, 1, steady)
         appeared, *others = load.seen.since(up)
         assert not others, "a second replica was added, removed, and added again"
-    return Following(rate, cost, appeared, removed, load.seen)
+    return Following(rate, cost, started, appeared, removed, load.seen)
 
 
 @contextmanager
@@ -147,12 +152,12 @@ def _hold(registry: Registry, number: int, seconds: float) -> None:
         time.sleep(0.05)
 
 
-def _await(registry: Registry, number: int) -> None:
+def _await(replicas: Callable[[], int], number: int) -> None:
     """Wait for the number of replicas."""
     deadline = time.monotonic() + DEADLINE
-    while _replicas(registry) != number:
+    while replicas() != number:
         if time.monotonic() > deadline:
-            raise TimeoutError(f"{_replicas(registry)} replicas after {DEADLINE:g} s, not {number}")
+            raise TimeoutError(f"{replicas()} replicas after {DEADLINE:g} s, not {number}")
         time.sleep(0.05)
 
 

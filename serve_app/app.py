@@ -9,7 +9,7 @@ A request is answered in the process that it reaches first. Inference requests b
 
 import gc
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from importlib import import_module
@@ -122,6 +122,7 @@ class PolicyServer(ray_serve.AsgiReplica):
             machine=ray_serve.node_address(),
             is_exposed=is_exposed(ray_serve.listening_host()),
             evaluation_client=evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
+            is_draining=ray_serve.is_draining,
         )
         self._load = LoadSampler(self._replica.metrics)
         self._count_requests = ray_serve.request_counter()
@@ -156,7 +157,7 @@ class Replica:
 
     `process`: where it runs, by default only that it is on this machine; `machine` is the address of its node;
     `is_exposed`: whether other machines reach it;
-    `evaluation_client`: None without an evaluation service.
+    `evaluation_client`: None without an evaluation service; `is_draining`: whether the replica is being stopped.
     """
 
     def __init__(
@@ -168,6 +169,7 @@ class Replica:
         machine: str = LOOPBACK,
         is_exposed: bool = False,
         evaluation_client: EvaluationClient | None = None,
+        is_draining: Callable[[], bool] = lambda: False,
     ) -> None:
         self.registry = registry
         self.settings = settings
@@ -197,13 +199,14 @@ class Replica:
             process or this_process(),
             settings,
             on_heartbeat=registry.database.close_unused,
+            on_replicas=lambda number: self.stream.replicas_counted(number),
         )
         self.access = AccessControl(self.api_keys, settings, is_exposed)
         self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
         dependencies = StreamDependencies(
             self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
         )
-        self.stream = StreamRoute(dependencies, replica)
+        self.stream = StreamRoute(dependencies, replica, is_draining)
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
         self.reporter = MetricsReporter(
             self.connection, self.metrics, self.shadow, self._in_flight, self._statistics, replica, settings
@@ -311,7 +314,7 @@ class Replica:
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
                 await running.enter_async_context(self.events.watching())
-                await running.enter_async_context(self.stream.checking_keys())
+                await running.enter_async_context(self.stream.checking())
                 yield
         finally:
             self.shadow.close()

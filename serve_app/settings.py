@@ -31,11 +31,11 @@ class ServeSettings(BaseModel):
     """Bytes of incomplete messages of all streams of a replica; a stream that exceeds them is closed with 1013."""
     max_in_flight: int = Field(default=256, ge=1)
     """Inference requests in flight per replica; further ones are refused with 429."""
-    max_streams: int = Field(default=1024, ge=1)
-    """Open streams per replica; further ones are refused with 429."""
+    max_streams: int = Field(default=10_000, ge=1)
+    """Open streams per replica, at most three quarters of its file descriptors; further ones are refused with 429."""
     max_listeners: int = Field(default=200, ge=1)
     """Open event streams per replica; further ones are refused with 429."""
-    max_streams_per_key: int = Field(default=256, ge=1)
+    max_streams_per_key: int = Field(default=2500, ge=1)
     """Open streams of one API key per replica; further ones are refused with 429."""
     max_listeners_per_key: int = Field(default=50, ge=1)
     """Open event streams of one API key per replica; further ones are refused with 429."""

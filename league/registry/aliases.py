@@ -31,6 +31,7 @@ class AnyVersion(Enum):
 
 
 ANY = AnyVersion.ANY
+_ALL = select(*(AliasTable.__table__.c[name] for name in ("league", "name", "version", "event")))
 
 
 class AliasRepository(Repository):
@@ -43,9 +44,8 @@ class AliasRepository(Repository):
 
     def all(self) -> dict[tuple[str, str], AliasTarget]:
         """Return (league, alias) → its target, of all leagues, by one cheap query."""
-        with self._database.read() as session:
-            found = session.execute(select(AliasTable.league, AliasTable.name, AliasTable.version, AliasTable.event))
-            return {(league, name): AliasTarget(version, event) for league, name, version, event in found}
+        found = self._database.rows(_ALL)
+        return {(league, name): AliasTarget(version, event) for league, name, version, event in found}
 
     @repeat_after_deadlock
     def set(

@@ -43,8 +43,7 @@ class ChangeRepository(Repository):
 
         What is read afterwards contains all these changes.
         """
-        with self._database.read() as session:
-            return change_counter.counts(session)
+        return change_counter.counts(self._database)
 
     def token(self, league: str, since: timedelta = LIVENESS_TIMEOUT) -> ChangeToken:
         """Return the change token of a league, which differs after any change. Raises UnknownLeague.

@@ -10,11 +10,11 @@ All times are those of the database's clock, because the clocks of replicas may 
 
 from collections.abc import Collection, Mapping
 from dataclasses import asdict
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Join, and_, case, delete, func, select, true, update
+from sqlalchemy import ColumnElement, Join, and_, bindparam, case, delete, func, select, true, update
 from sqlalchemy.orm import Session
 
 from league.refs import CHAMPION
@@ -42,6 +42,21 @@ KEPT = timedelta(days=1)
 """Replicas that died without deregistering are removed after this time, unless another replica notices earlier."""
 LIVENESS_TIMEOUT = timedelta(seconds=15)
 """A replica without a report for longer is silent: dead, stuck, or cut off from the database."""
+_UPDATE = update(ReplicaTable).where(ReplicaTable.replica == bindparam("name"))
+_UPDATE_NOW = _UPDATE.values(seen_at=func.clock_timestamp())
+"""Built once, since replicas execute them again and again."""
+
+
+class ReplicaCounts(NamedTuple):
+    """Numbers of replicas.
+
+    Attributes:
+        registered: Replicas that have registered and were not removed.
+        silent: Those of them that are silent.
+    """
+
+    registered: int
+    silent: int
 
 
 class ReplicaRepository(Repository):
@@ -54,19 +69,24 @@ class ReplicaRepository(Repository):
         process: where it runs; see RegisteredReplica. Returns whether it was registered already; if not, nothing that
         it has acknowledged is known.
         """
+        if self._update(replica, {"process": dict(process)}):
+            return True
         with self._database.write() as session:
-            now = sql_clock(session)
-            running = update(ReplicaTable).filter_by(replica=replica).values(process=dict(process), seen_at=now)
-            is_known = row_count(session, running) > 0
-            if not is_known:
-                _remove(session, replica)
-                insert(session, ReplicaTable, [{"replica": replica, "process": process, "seen_at": clock(session)}])
-            return is_known
+            _remove(session, replica)
+            insert(session, ReplicaTable, [{"replica": replica, "process": process, "seen_at": clock(session)}])
+        return False
 
     def registered(self) -> list[RegisteredReplica]:
         """Return all replicas that have registered and were not removed."""
         with self._database.read() as session:
             return _registered(session, true())
+
+    def counts(self) -> ReplicaCounts:
+        """Return how many replicas have registered and were not removed, and how many of them are silent."""
+        now = datetime.now(UTC) if self._database.is_sqlite else func.clock_timestamp()
+        silent = func.count().filter(ReplicaTable.seen_at <= now - LIVENESS_TIMEOUT)
+        (found,) = self._database.rows(select(func.count(), silent).select_from(ReplicaTable))
+        return ReplicaCounts(*found)
 
     def silent(self) -> list[RegisteredReplica]:
         """Return the registered replicas that are silent."""
@@ -87,6 +107,8 @@ class ReplicaRepository(Repository):
         more; None: all others.
         Returns False, and records nothing, if the replica is not registered: another one took it for dead.
         """
+        if not differing and settled is not None and not settled:
+            return self._update(replica, position._asdict())
         with self._database.write() as session:
             seen = {"seen_at": sql_clock(session)} | position._asdict()
             if not row_count(session, update(ReplicaTable).filter_by(replica=replica).values(seen)):
@@ -129,6 +151,12 @@ class ReplicaRepository(Repository):
         with self._database.write() as session:
             _remove(session, replica)
             session.execute(delete(ReplicaReportTable).where(ReplicaReportTable.at < clock(session) - KEPT))
+
+    def _update(self, replica: str, values: Mapping[str, Any]) -> bool:
+        """Set values of a registered replica, which is alive now. Returns False if it is not registered."""
+        if self._database.is_sqlite:
+            return self._database.execute(_UPDATE, {"name": replica, "seen_at": datetime.now(UTC), **values}) > 0
+        return self._database.execute(_UPDATE_NOW, {"name": replica, **values}) > 0
 
 
 def acknowledgements(session: Session, league: str) -> list[Acknowledgement]:

@@ -1,11 +1,22 @@
 """Limits the connections that stay open: in a replica, and for each API key."""
 
+import resource
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from league.errors import Overloaded
 from serve_app.access.api_keys import ApiKey
+
+DESCRIPTORS = 0.75
+"""Share of a process's file descriptors that connections of one kind may use. Other connections, databases and files
+need the rest; without one, a process accepts no connection at all."""
+
+
+def within_descriptors(limit: int) -> int:
+    """Return how many connections of one kind, at most `limit`, this process may hold."""
+    descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return limit if descriptors == resource.RLIM_INFINITY else min(limit, int(DESCRIPTORS * descriptors))
 
 
 class ConnectionLimit:

@@ -41,6 +41,10 @@ class RegistryConnection:
         """Number of connections so far."""
         return self._listener.opened
 
+    def discard_notifications(self) -> None:
+        """Discard the notifications that have arrived, before what they announce is read. Only in `call`."""
+        self._listener.discard()
+
     async def call(self, function: Callable[[Registry], T]) -> T:
         """Query or change the registry."""
         loop = asyncio.get_running_loop()

@@ -56,7 +56,7 @@ class RegistryWatcher:
     """Keeps slots, traffic and keys at what the registry requires, and acknowledges it as `replica`.
 
     update_keys: raises StorageError if the keys are those of a different database. on_heartbeat: called at each
-    heartbeat, in the thread of the connection.
+    heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas.
     """
 
     def __init__(
@@ -69,6 +69,7 @@ class RegistryWatcher:
         process: ReplicaProcess,
         settings: ServeSettings,
         on_heartbeat: Callable[[], None] = lambda: None,
+        on_replicas: Callable[[int], None] = lambda _: None,
     ) -> None:
         self._connection = connection
         self._slots = slots
@@ -78,6 +79,7 @@ class RegistryWatcher:
         self._process = process
         self._settings = settings
         self._on_heartbeat = on_heartbeat
+        self._on_replicas = on_replicas
         self._polling = Polling(self.poll_once, "the registry", settings, self._pause)
         self._aliases: Mapping[Alias, AliasTarget] = {}
         self._wanted_traffic: Mapping[str, Setting] = {}
@@ -142,21 +144,26 @@ class RegistryWatcher:
 
     async def _register(self) -> None:
         """Register this replica, and remove those that ended without deregistering."""
-        if not await self._connection.call(self._report_life):
+        is_known, replicas = await self._connection.call(self._report_life)
+        if not is_known:
             self._acknowledged = _Acknowledged()
+        self._on_replicas(replicas)
         self._heartbeat_at = time.monotonic() + self._settings.heartbeat
 
-    def _report_life(self, registry: Registry) -> bool:
+    def _report_life(self, registry: Registry) -> tuple[bool, int]:
+        """Whether this replica was registered, and the number of replicas."""
         is_known = registry.replicas.register(self._replica, self._process.description)
-        for other in registry.replicas.silent():
+        replicas = registry.replicas.counts()
+        for other in registry.replicas.silent() if replicas.silent else ():
             if other.silence > KEPT or self._process.has_ended(other.process):
                 registry.replicas.remove(other.replica)
                 logger.info("replica %s has ended without deregistering", other.replica)
         self._on_heartbeat()
-        return is_known
+        return is_known, replicas.registered
 
     def _read(self, registry: Registry) -> _Read:
         """Read the parts that have changed, or all through a new connection: it may be a different database."""
+        self._connection.discard_notifications()
         counts, connection = registry.changes.counts(), self._connection.opened
         last = self._last_read
         is_current = last is not None and connection == last.connection and time.monotonic() < self._reread_at

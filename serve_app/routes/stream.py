@@ -5,12 +5,17 @@
 
 With serve_app.runtime.uvicorn_websocket, messages are answered within the call that received them; other ASGI servers
 pass them through the ASGI queue. A stream is closed when its key becomes invalid, even if it receives no messages.
+
+A change of the number of replicas reloads HAProxy, which cuts the streams that it forwards, all at once, two minutes
+later. Streams are closed before, one after the other, so that their clients do not reconnect at the same moment.
 """
 
 import asyncio
-from collections.abc import AsyncIterator
+import random
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from starlette.types import Receive, Scope, Send
 
@@ -18,15 +23,35 @@ from league.errors import InvalidInput, Unauthenticated, one_line
 from league.refs import CHAMPION, check_alias
 from serve_app.access.access_control import KEY, POLICY_VIOLATION
 from serve_app.access.api_keys import ApiKey
-from serve_app.access.connection_limit import ConnectionLimit
+from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.routes import parsing
 from serve_app.runtime.ray_serve import logger
-from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, TOO_BIG, CloseStream, StreamWebSocketProtocol
+from serve_app.runtime.uvicorn_websocket import (
+    STREAM_PROTOCOL,
+    TOO_BIG,
+    CloseStream,
+    StreamWebSocketProtocol,
+)
 
 KEY_CHECK_INTERVAL = 1.0
 """Seconds between checks of the keys of open streams."""
+
+
+class ClosingTimes(NamedTuple):
+    """When streams are closed so that they reconnect: between `first` and `last` seconds from now."""
+
+    first: float
+    last: float
+
+
+AFTER_CHANGE = ClosingTimes(10.0, 60.0)
+"""HAProxy has been reloaded by then, so that streams reconnect through the new process. A replica that stops
+deregisters up to 45 s after the reload, which cuts streams after 120 s (RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S)."""
+WHILE_DRAINING = ClosingTimes(5.0, 28.0)
+"""Within the 30 s in which a replica that stops stays reachable (RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S)."""
+RECONNECT = "the number of replicas has changed: reconnect"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,6 +63,11 @@ class OpenStream:
     protocol: StreamWebSocketProtocol | None
     """The connection, if messages are answered within the call that received them."""
 
+    def restart(self) -> None:
+        """Close the stream so that its client reconnects, with the state that it needs to continue."""
+        if self.protocol is not None:
+            self.protocol.restart(RECONNECT)
+
     async def close(self, end: CloseStream) -> None:
         """Send a close frame."""
         if self.protocol is not None:
@@ -47,14 +77,27 @@ class OpenStream:
 
 
 class StreamRoute:
-    """The endpoint as a plain ASGI application."""
+    """The endpoint as a plain ASGI application. is_draining: whether this replica is being stopped."""
 
-    def __init__(self, dependencies: StreamDependencies, replica: str) -> None:
+    def __init__(
+        self, dependencies: StreamDependencies, replica: str, is_draining: Callable[[], bool] = lambda: False
+    ) -> None:
         self._dependencies = dependencies
         self._replica = replica
+        self._is_draining = is_draining
         settings = dependencies.settings
-        self.connections = ConnectionLimit("streams", settings.max_streams, settings.max_streams_per_key)
+        limit = within_descriptors(settings.max_streams)
+        if limit < settings.max_streams:
+            logger.warning(
+                "max_streams is %d, but file descriptors suffice for %d streams: raise `ulimit -n`",
+                settings.max_streams,
+                limit,
+            )
+        self.connections = ConnectionLimit("streams", limit, settings.max_streams_per_key)
         self._accepted: set[OpenStream] = set()
+        self._closings: dict[OpenStream, asyncio.TimerHandle] = {}
+        self._replicas: int | None = None
+        """Number of replicas at the last heartbeat."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle a stream until it closes. Raises LeagueError before the handshake is accepted."""
@@ -68,24 +111,46 @@ class StreamRoute:
                 await self._exchange_messages(stream, opened, receive)
             finally:
                 self._accepted.remove(opened)
+                if (closing := self._closings.pop(opened, None)) is not None:
+                    closing.cancel()
+
+    def replicas_counted(self, number: int) -> None:
+        """Called at each heartbeat with the number of replicas. If it has changed, open streams reconnect."""
+        if self._replicas not in (None, number):
+            self._reconnect(AFTER_CHANGE)
+        self._replicas = number
 
     @asynccontextmanager
-    async def checking_keys(self) -> AsyncIterator[None]:
-        """Close the streams whose keys become invalid while the context is active."""
-        checking = asyncio.create_task(self._check_keys())
+    async def checking(self) -> AsyncIterator[None]:
+        """Close streams whose keys become invalid, or all if this replica is stopped, while the context is active."""
+        checking = asyncio.create_task(self._check())
         try:
             yield
         finally:
             checking.cancel()
 
-    async def _check_keys(self) -> None:
+    async def _check(self) -> None:
         while True:
             await asyncio.sleep(KEY_CHECK_INTERVAL)
+            if self._is_draining():
+                self._reconnect(WHILE_DRAINING)
             for stream in tuple(self._accepted):
                 try:
                     self._dependencies.access.check_key(stream.key)
                 except Unauthenticated as error:
                     await self._close(stream, CloseStream(POLICY_VIOLATION, str(error)))
+
+    def _reconnect(self, times: ClosingTimes) -> None:
+        """Close the open streams at random times, or earlier if that was decided before."""
+        loop = asyncio.get_running_loop()
+        latest = loop.time() + times.last
+        for stream in self._accepted:
+            closing = self._closings.get(stream)
+            if closing is not None and closing.when() <= latest:
+                continue
+            if closing is not None:
+                closing.cancel()
+            self._closings[stream] = loop.call_later(random.uniform(*times), stream.restart)
 
     async def _close(self, stream: OpenStream, end: CloseStream) -> None:
         """Close a stream. A stream that cannot be closed must not prevent that others are."""

@@ -45,6 +45,14 @@ def replica_id() -> str:
     return serve.get_replica_context().replica_id.unique_id
 
 
+def is_draining() -> bool:
+    """Whether Ray Serve stops the replica in this process, and HAProxy sends it no new requests."""
+    from ray._private.worker import global_worker
+
+    (actor,) = global_worker.actors.values()
+    return bool(actor._replica_impl._shutting_down)
+
+
 def request_counter() -> Callable[[str, int], None]:
     """Adds requests of a route to Ray Serve's count of the requests of this replica, which Ray's dashboard shows.
 

@@ -196,10 +196,14 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         """Send the client what it needs to continue on another replica, and close."""
         if self._stream is None or self.close_sent:
             super().shutdown()
-            return
-        if (last_message := self._stream.closing_message()) is not None:
+        else:
+            self.restart("the replica is shutting down: reconnect")
+
+    def restart(self, reason: str) -> None:
+        """Send the client what it needs to continue on another connection, and close."""
+        if self._stream is not None and (last_message := self._stream.closing_message()) is not None:
             self._queue_frame(last_message)
-        self.end(SERVICE_RESTART, "the replica is shutting down: reconnect")
+        self.end(SERVICE_RESTART, reason)
 
     def end(self, code: int, reason: str) -> None:
         """Send a close frame, and wait for the client's."""

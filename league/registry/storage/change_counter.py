@@ -10,13 +10,15 @@ from typing import Literal
 from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
-from league.registry.storage.database import increment
+from league.registry.storage.database import Database, increment
 from league.registry.storage.listener import CHANNEL
 from league.registry.storage.rows import ChangeCounts
 from league.registry.storage.tables import ChangeCounterTable
 
 ROW = 1
 """Id of the only row."""
+
+_COUNTS = select(*(ChangeCounterTable.__table__.c[name] for name in ChangeCounts._fields)).filter_by(id=ROW)
 
 Subject = Literal["aliases", "traffic", "keys"]
 
@@ -28,8 +30,7 @@ def count(session: Session, subject: Subject) -> None:
         session.execute(text(f"NOTIFY {CHANNEL}"))
 
 
-def counts(session: Session) -> ChangeCounts:
+def counts(database: Database) -> ChangeCounts:
     """Return the number of changes. Read it before what it counts."""
-    table = ChangeCounterTable
-    row = session.execute(select(table.aliases, table.traffic, table.keys).filter_by(id=ROW)).one_or_none()
-    return ChangeCounts(0, 0, 0) if row is None else ChangeCounts(*row)
+    rows = database.rows(_COUNTS)
+    return ChangeCounts(*rows[0]) if rows else ChangeCounts(0, 0, 0)

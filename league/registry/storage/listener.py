@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import Engine, event
@@ -35,6 +36,20 @@ class Listener:
             return os.dup(connection.fileno())
         except (OSError, self._engine.dialect.dbapi.Error):
             return None  # closed in the meantime
+
+    def discard(self) -> None:
+        """Discard the notifications that have arrived: what is read afterwards contains their changes.
+
+        Called in the thread of the connection.
+        """
+        connection = self._connection
+        if connection is None:
+            return
+        assert self._engine.dialect.dbapi is not None
+        with suppress(self._engine.dialect.dbapi.Error):  # the next statement reports a lost connection
+            connection.pgconn.consume_input()
+            while connection.pgconn.notifies() is not None:
+                pass
 
     def _open(self, connection: Any, _: object) -> None:
         self.opened += 1

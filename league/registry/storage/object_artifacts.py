@@ -27,6 +27,8 @@ REQUEST_TIMEOUT = timedelta(seconds=30)
 RETRY_TIMEOUT = timedelta(seconds=10)
 EXPIRED = ("ExpiredToken", "RequestExpired", "TokenRefreshRequired")
 """Error codes of S3, which obstore does not distinguish."""
+REFUSED = ("401 Unauthorized", "403 Forbidden")
+"""Statuses that obstore does not distinguish when objects are listed."""
 PROBE = ".league-probe"
 """Object that `check_writable` writes and deletes."""
 
@@ -170,11 +172,8 @@ class ObjectArtifactStore(ArtifactStore):
 
         try:
             yield
-        except (PermissionDeniedError, UnauthenticatedError) as error:
-            raise StorageError(
-                f"{self.url} refuses the credentials: renew them, or grant them access ({_cause(error)})"
-            ) from error
         except (FileNotFoundError, BaseError) as error:
+            is_refused = isinstance(error, (PermissionDeniedError, UnauthenticatedError))
             if _is_missing_bucket(error):
                 raise StorageError(
                     f"{self.url}: the bucket does not exist: create it, or correct LEAGUE_ARTIFACTS"
@@ -183,6 +182,10 @@ class ObjectArtifactStore(ArtifactStore):
                 raise
             if any(code in str(error) for code in EXPIRED):
                 raise StorageError(f"{self.url}: the credentials have expired: renew them ({_cause(error)})") from error
+            if is_refused or any(status in str(error) for status in REFUSED):
+                raise StorageError(
+                    f"{self.url} refuses the credentials: renew them, or grant them access ({_cause(error)})"
+                ) from error
             raise StorageError(f"{self.url} cannot be used: check network and credentials ({_cause(error)})") from error
 
 

@@ -2,7 +2,7 @@ from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
 import pytest
-from sqlalchemy import update
+from sqlalchemy import select, update
 
 from league.errors import UnknownLeague
 from league.registry import replicas
@@ -46,6 +46,7 @@ def test_a_silent_replica_is_listed(registry: Registry) -> None:
     silent = {row.replica: row.silence for row in registry.replicas.acknowledgements(LEAGUE)}
     assert silent["alive"] < timedelta(minutes=1) < timedelta(hours=22) < silent["silent"]
     assert [row.replica for row in registry.replicas.silent()] == ["silent"]
+    assert registry.replicas.counts() == (2, 1)
     assert [row.replica for row in registry.replicas.registered()] == ["alive", "silent"]
 
 
@@ -68,6 +69,15 @@ def test_a_replica_that_is_not_registered_cannot_acknowledge(registry: Registry)
     assert not registry.replicas.register("replica-1", {"machine": "here"})
     (row,) = registry.replicas.acknowledgements(LEAGUE)
     assert (row.replica, row.version, row.event) == ("replica-1", None, None)
+
+
+def test_a_position_is_acknowledged_by_a_replica_that_is_registered(registry: Registry) -> None:
+    assert not registry.replicas.acknowledge("replica-1", ReadPosition(7, 7, 0), {}, ())
+    registry.replicas.register("replica-1", {"machine": "here"})
+    assert registry.replicas.acknowledge("replica-1", ReadPosition(7, 7, 0), {}, ())
+    with registry.database.read() as session:
+        (row,) = session.scalars(select(ReplicaTable))
+        assert (row.changes, row.event, row.traffic, row.process) == (7, 7, 0, {"machine": "here"})
 
 
 def test_leagues_that_differ_have_a_row_until_they_are_settled(registry: Registry) -> None:

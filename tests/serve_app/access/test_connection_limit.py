@@ -1,3 +1,4 @@
+import resource
 from contextlib import ExitStack
 from datetime import UTC, datetime
 
@@ -6,7 +7,7 @@ import pytest
 from league.errors import Overloaded
 from league.registry.storage.rows import KeyRow
 from serve_app.access.api_keys import ApiKey
-from serve_app.access.connection_limit import ConnectionLimit
+from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
 
 
 def key(name: str) -> ApiKey:
@@ -40,3 +41,9 @@ def test_a_connection_that_fails_is_not_counted_any_more() -> None:
         with pytest.raises(ZeroDivisionError), limit.opened(key("one")):
             raise ZeroDivisionError
     assert limit.open == 0
+
+
+def test_connections_leave_file_descriptors_for_the_rest_of_the_process() -> None:
+    descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    assert within_descriptors(2) == 2
+    assert within_descriptors(descriptors) < descriptors

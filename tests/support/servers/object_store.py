@@ -17,20 +17,35 @@ VARIABLES = {
 
 
 @contextmanager
-def server() -> Iterator[str]:
-    """Run a server; yields its URL."""
-    running = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+def server(port: int = 0) -> Iterator[str]:
+    """Run a server, by default on a free port; yields its URL. Its objects belong to this process and outlast it."""
+    running = ThreadedMotoServer(ip_address="127.0.0.1", port=port, verbose=False)
     running.start()
     host, port = running.get_host_and_port()
+    listener = running._server
+    assert listener is not None
     try:
         yield f"http://{host}:{port}"
     finally:
         running.stop()
+        listener.server_close()
 
 
 def variables(endpoint: str) -> dict[str, str]:
     """Environment variables with which obstore uses the server."""
     return VARIABLES | {"AWS_ENDPOINT_URL": endpoint}
+
+
+@contextmanager
+def refusing_credentials(endpoint: str) -> Iterator[None]:
+    """Let the server check credentials, of which it knows none."""
+    import httpx
+
+    httpx.post(f"{endpoint}/moto-api/reset-auth", content=b"0").raise_for_status()
+    try:
+        yield
+    finally:
+        httpx.post(f"{endpoint}/moto-api/reset-auth", content=b"inf").raise_for_status()
 
 
 def create_bucket(endpoint: str) -> str:
@@ -45,6 +60,11 @@ def create_bucket(endpoint: str) -> str:
 def put(url: str, key: str, content: bytes) -> None:
     """Replace an object."""
     obstore.put(S3Store.from_url(url), key, content)
+
+
+def get(url: str, key: str) -> bytes:
+    """The content of an object."""
+    return bytes(obstore.get(S3Store.from_url(url), key).bytes())
 
 
 def delete(url: str, key: str) -> None:

@@ -112,3 +112,21 @@ def test_pooled_connections_are_closed_when_they_are_not_used(registry: Registry
     registry.database.close_unused()
     assert registry.database.engine.pool.checkedin() == 0
     assert registry.leagues.all() == []
+
+
+def test_discarded_notifications_are_not_seen_again(registry: Registry, listening: Database) -> None:
+    listener = listener_of(listening)
+    seen = list[None]()
+    listener.on_change = lambda: seen.append(None)
+    listener.discard()  # without a connection
+    registry.keys.create("bot", ["act"])
+    with listening.read() as session:
+        session.execute(text("SELECT 1"))
+    registry.keys.create("another", ["act"])
+    assert is_readable(listener, SECONDS)
+    seen.clear()
+    listener.discard()
+    assert not is_readable(listener, 0)
+    with listening.read() as session:
+        session.execute(text("SELECT 1"))
+    assert seen == []

@@ -98,6 +98,11 @@ def test_a_killed_publisher_leaves_no_version(remote: Registry, bucket: str, poi
     assert {key.split("/")[1] for key in object_store.keys(bucket)} == {"2"}
 
 
+def test_refused_credentials_are_reported(bucket: str, tmp_path: Path, s3_endpoint: str) -> None:
+    with object_store.refusing_credentials(s3_endpoint):
+        _reports(ObjectArtifactStore(bucket, tmp_path), "refuses the credentials: renew them")
+
+
 @pytest.mark.parametrize("code", object_artifacts.EXPIRED)
 def test_expired_credentials_are_reported(bucket: str, tmp_path: Path, code: str) -> None:
     from obstore.exceptions import GenericError, PermissionDeniedError

@@ -1,0 +1,93 @@
+"""A replica whose versions are in an object store: faults of the store cost no action."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from league.registry.registry import Registry
+from league.settings import Storage
+from tests.support.clients.actions import BOARD, act
+from tests.support.leagues.served_leagues import BOARD as SPACES
+from tests.support.leagues.served_leagues import promote, publish, register
+from tests.support.policies.graphs import masked_mlp
+from tests.support.servers import object_store
+from tests.support.servers.replicas import replica
+from tests.support.waiting import until
+
+
+class Store:
+    """A running store. url: of its artefacts; the environment has its credentials."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._running = ExitStack()
+        self.endpoint = self._running.enter_context(object_store.server())
+        for name, value in object_store.variables(self.endpoint).items():
+            patch.setenv(name, value)
+        self.url = object_store.create_bucket(self.endpoint)
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._running.close()
+
+    @contextmanager
+    def unreachable(self) -> Iterator[None]:
+        """Stop the server for a while."""
+        self.close()
+        yield
+        self._running.enter_context(object_store.server(int(self.endpoint.rpartition(":")[2])))
+
+    def refusing_credentials(self) -> AbstractContextManager[None]:
+        """Refuse the credentials for a while."""
+        return object_store.refusing_credentials(self.endpoint)
+
+    @contextmanager
+    def with_a_changed_file(self) -> Iterator[None]:
+        """Change the graph of version 2 for a while."""
+        graph = object_store.get(self.url, "board/2/shared.onnx")
+        object_store.put(self.url, "board/2/shared.onnx", graph[:-1])
+        yield
+        object_store.put(self.url, "board/2/shared.onnx", graph)
+
+
+@pytest.fixture
+def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    store = Store(monkeypatch)
+    yield store
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (Store.unreachable, "cannot be used: check network and credentials"),
+        (Store.refusing_credentials, "refuses the credentials: renew them"),
+        (Store.with_a_changed_file, "board/2/shared.onnx was changed"),
+    ],
+)
+def test_a_fault_of_the_store_costs_no_action(
+    store: Store,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    fault: Callable[[Store], AbstractContextManager[None]],
+    message: str,
+) -> None:
+    """The fault is in the log, in one line, and callers see that there is one."""
+    publisher = Storage(tmp_path / "home", Storage.at(tmp_path / "home").database_url, store.url)
+    registry = Registry.open(publisher)
+    register(registry, "board", {"shared": SPACES})
+    for seed in range(2):
+        publish(registry, "board", {"shared": masked_mlp(seed=seed)}, f"run/{seed}")
+    promote(registry, "board", 1)
+    with replica(Storage(tmp_path / "replica", publisher.database_url, store.url)) as client:
+        assert act(client, observation=BOARD)["version"] == 1
+        with fault(store):
+            promote(registry, "board", 2)
+            until(lambda: client.get("/v1/leagues/board").json()["faults"])
+            found = [line for line in caplog.messages if "cannot switch to version 2, version 1 stays" in line]
+            assert message in found[0]
+            assert "\n" not in found[0]
+            assert act(client, observation=BOARD)["version"] == 1
+        until(lambda: act(client, observation=BOARD)["version"] == 2)
+    registry.close()
