@@ -18,7 +18,7 @@ from evaluation.statistics.population import PopulationShare, shares
 from league.conditions import ActionSelection
 from league.refs import CHAMPION
 from league.registry.registry import Registry
-from league.registry.storage.rows import AliasEvent
+from league.registry.storage.rows import AliasEvent, VersionRow
 from league.results.records import Scoring
 from league.results.scoring import scoring
 
@@ -46,7 +46,8 @@ class LeagueReport(Document):
 
     leaderboard: best first. by_side: leaderboard of each side, empty if sides are alike or there is only one.
     payoff: of the best contestants, None before the first game. shares: of contestants that have all met, else empty.
-    versions: oldest first. verdicts, promotions: newest first. left_out: what is omitted, in sentences.
+    versions: oldest first. roles: of exploiters and mixtures, by reference. verdicts, promotions: newest first.
+    left_out: what is omitted, in sentences.
     """
 
     league: str
@@ -64,6 +65,7 @@ class LeagueReport(Document):
     payoff: Payoff | None
     shares: tuple[PopulationShare, ...]
     versions: tuple[RatedVersion, ...]
+    roles: dict[str, str]
     verdicts: tuple[VerdictEvidence, ...]
     promotions: tuple[ChampionChange, ...]
     upsets: tuple[Flipbook, ...]
@@ -74,7 +76,7 @@ def league_report(
     registry: Registry, league: str, *, pictures: bool = True, now: datetime | None = None
 ) -> LeagueReport:
     """Create the report. pictures: whether upsets include images. Raises UnknownLeague."""
-    row = registry.leagues.get(league)
+    row, versions = registry.leagues.get(league), registry.versions.all(league)
     verdicts, events = registry.verdicts.all(league), registry.aliases.history(league)
     played = CountedGames(registry, row, MAX_UPSETS)
     table = played.payoff()
@@ -96,7 +98,8 @@ def league_report(
         by_side=played.by_side(),
         payoff=table,
         shares=shares(table, played.matches) if table else (),
-        versions=tuple(rated_version(version, leaderboard, events) for version in registry.versions.all(league)),
+        versions=tuple(rated_version(version, leaderboard, events) for version in versions),
+        roles={version.ref: role for version in versions if (role := _role(version))},
         verdicts=tuple(
             verdict_evidence(registry, verdict, events) for verdict in reversed(verdicts) if verdict.id in shown
         ),
@@ -104,6 +107,12 @@ def league_report(
         upsets=flipbooks(registry, league, played.greatest_upsets(), pictures),
         left_out=tuple(_left_out(len(leaderboard), len(verdicts))),
     )
+
+
+def _role(version: VersionRow) -> str | None:
+    if version.mixture is not None:
+        return f"mixture of {version.mixture}"
+    return None if version.exploits is None else f"exploiter of {version.exploits}"
 
 
 def _promotion(event: AliasEvent) -> ChampionChange:

@@ -73,11 +73,19 @@ class QLearningConfig(OffPolicyConfig):
     double: bool = True
     """Double Q-learning: the online network selects the next action and the target network evaluates it (van Hasselt,
     Guez and Silver, 2016, arXiv 1509.06461)."""
+    recurrence: GatedRecurrenceConfig | None = None
+    """Recurrent layer; null for none. With it, `batch_size` counts sequences."""
 
     @model_validator(mode="after")
     def _probabilities(self) -> Self:
         if max(self.exploration.initial, self.exploration.final) > 1:
             raise ValueError("exploration: initial and final are probabilities of a random action, at most 1")
+        return self
+
+    @model_validator(mode="after")
+    def _sequences_fit(self) -> Self:
+        if self.recurrence is not None and (self.n_step > 1 or self.priorities is not None):
+            raise ValueError("recurrence requires n_step 1 and no priorities")
         return self
 
 
@@ -121,14 +129,6 @@ class QMIXConfig(QLearningConfig):
     """Width of the mixing network's hidden layer."""
     groups: dict[str, tuple[str, ...]] | None = None
     """Group → agents whose values are mixed, as names or patterns; null for the league's sides."""
-    recurrence: GatedRecurrenceConfig | None = None
-    """Recurrent layer; null for none. With it, `batch_size` counts sequences."""
-
-    @model_validator(mode="after")
-    def _sequences_fit(self) -> Self:
-        if self.recurrence is not None and (self.n_step > 1 or self.priorities is not None):
-            raise ValueError("recurrence requires n_step 1 and no priorities")
-        return self
 
 
 class MADDPGConfig(OffPolicyConfig):

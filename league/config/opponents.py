@@ -37,9 +37,11 @@ class LeagueOpponentsConfig(Part):
     weighting: Weighting = "squared"
     """With pfsp, the weight of an opponent. squared: (1 - x)². variance: x(1 - x). linear_capped: min(½, 1 - x)."""
     window: int = Field(default=10, ge=1)
-    """Number of newest versions that are candidates."""
+    """Number of newest versions that are candidates, exploiters not counted."""
     champions: bool = True
     """Whether all champions, past and present, are candidates."""
+    exploiters: bool = True
+    """Whether the newest exploiter of each champion, past and present, is a candidate."""
     active: int = Field(default=4, ge=1)
     """Maximum number of opponents that episodes start with between two updates."""
     forgotten: float = Field(default=0.15, ge=0, le=1)

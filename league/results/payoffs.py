@@ -53,10 +53,14 @@ def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: s
 
     Raises:
         ValueError: The method is unknown.
-        NotFound: No two contestants have played each other.
+        NotFound: There are fewer than two contestants, or no two have played each other.
     """
     if method not in METHODS:
         raise ValueError(f"method {method!r}: expected {' or '.join(METHODS)}")
+    if len(refs) < 2:
+        raise NotFound(
+            f"the league has {len(refs)} versions, expected at least two: `league train CONFIG` publishes them"
+        )
     known = set(refs)
     pairs = [each for each in results if len(set(each.contestants)) == 2 and known >= set(each.contestants)]
     playing = tuple(ref for ref in refs if any(ref in each.contestants for each in pairs))

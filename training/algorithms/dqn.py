@@ -2,7 +2,8 @@
 
 Agents of a policy share one network and one buffer. Each policy learns from its own transitions; in turn-based games,
 a transition spans from one of an agent's turns to its next. Illegal actions are never explored, chosen or bootstrapped
-from.
+from. Recurrent networks learn from sequences of an agent's transitions (Kapturowski et al., 2019, "Recurrent experience
+replay in distributed reinforcement learning", without its burn-in, n-step returns and priorities).
 """
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -42,6 +43,7 @@ def module_spec(settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
         "normalize": settings.normalize_observations,
         "dueling": settings.dueling,
         "noisy": settings.noisy,
+        "recurrence": settings.recurrence and settings.recurrence.width,
         "atoms": atoms and (atoms.atoms, atoms.low, atoms.high),
     }
     return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, QNetwork, model_config))

@@ -146,13 +146,18 @@ class LeagueOpponents:
         assert self._settings is not None
         league = self._league.league
         numbers = registry.versions.numbers(league).get(league, [])
-        mixtures = registry.versions.mixtures(league, numbers)
+        mixtures, exploiters = registry.versions.mixtures(league, numbers), registry.versions.exploiter_refs(league)
         numbers = [number for number in numbers if number not in mixtures]
-        chosen = set(numbers[-self._settings.window :])
+        chosen = {number for number in numbers if f"{league}@{number}" not in exploiters}
+        chosen = set(sorted(chosen)[-self._settings.window :])
+        champions = {event.version for event in registry.aliases.history(league)}
         if self._settings.champions:
-            for event in registry.aliases.history(league):
-                mixture = mixtures.get(event.version)
-                chosen |= {event.version} if mixture is None else set(mixture.versions)
+            for champion in champions:
+                chosen |= {champion} if champion not in mixtures else set(mixtures[champion].versions)
+        if self._settings.exploiters:
+            of_champions = registry.versions.exploiters(league, [f"{league}@{champion}" for champion in champions])
+            newest = {exploiter.exploits: exploiter.number for exploiter in of_champions}
+            chosen |= set(newest.values())
         rows = [registry.versions.get(league, number) for number in numbers if number in chosen]
         fixed = {opponent.ref for opponent in self._league.training.opponents.fixed}
         digest = self._interface.digest()

@@ -36,7 +36,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.config.league import LeagueConfig
-from league.config.off_policy import OffPolicyConfig
+from league.config.off_policy import OffPolicyConfig, QLearningConfig
 from league.config.opponents import OpponentConfig
 from league.config.training import TrainingSettings
 from league.interface import Interface
@@ -112,8 +112,10 @@ class OffPolicy(LeagueAlgorithm):
             replay.reseed(derive(self.config.seed or 0, key), steps)
 
     def draw_sample(self, replay: ReplayBuffer) -> Sample:
-        """Return the sample of one gradient step."""
+        """Return the sample of one gradient step: transitions, or sequences of them for recurrent networks."""
         settings = self.settings
+        if isinstance(settings, QLearningConfig) and (recurrence := settings.recurrence) is not None:
+            return replay.sample_sequences(settings.batch_size, recurrence.sequence, gamma=settings.gamma)
         return replay.sample(settings.batch_size, n_step=settings.n_step, gamma=settings.gamma, beta=self._beta)
 
     def save_to_path(self, path: str | Path, **kwargs: Any) -> str:

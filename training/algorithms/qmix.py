@@ -13,24 +13,11 @@ from league.config.league import LeagueConfig
 from league.config.off_policy import QMIXConfig
 from league.interface import Interface
 from league.settings import Storage
-from training.algorithms.off_policy import OffPolicy, off_policy_config
+from training.algorithms.off_policy import off_policy_config
 from training.algorithms.setup import rl_module_specs
 from training.learners.qmix import QMIXLearner, teams
 from training.modules.qmix import AgentNetwork
-from training.replay_buffer import ReplayBuffer, Sample
 from training.sampling.replay_runner import JointRunner
-
-
-class QMIX(OffPolicy):
-    """Samples sequences for agents with recurrent networks."""
-
-    def draw_sample(self, replay: ReplayBuffer) -> Sample:
-        """Return the sample of one gradient step."""
-        settings = self.settings
-        assert isinstance(settings, QMIXConfig)
-        if settings.recurrence is None:
-            return super().draw_sample(replay)
-        return replay.sample_sequences(settings.batch_size, settings.recurrence.sequence, gamma=settings.gamma)
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
@@ -43,7 +30,6 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
         modules=module_spec(league.training, interface),
         learner=QMIXLearner,
         runner=JointRunner,
-        algorithm=QMIX,
     )
 
 

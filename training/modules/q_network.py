@@ -1,8 +1,9 @@
-"""The Q-network of masked DQN, with dueling heads, noisy layers and C51's atoms."""
+"""The Q-network of masked DQN, with a recurrent layer, dueling heads, noisy layers and C51's atoms."""
 
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
@@ -10,6 +11,7 @@ from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchCategorical
 from training.modules.encoder import Encoder, linear
 from training.modules.policy_module import MASKED_LOGIT, PolicyModule
+from training.modules.recurrent import ActionGRULayer, State, state_after_best
 
 INITIAL_SIGMA = 0.5
 """σ₀ of section 3.2."""
@@ -42,10 +44,10 @@ def _scaled_noise(noise: Tensor) -> Tensor:
 
 
 class QNetwork(PolicyModule):
-    """Encoder and heads.
+    """Encoder, optional GRU and heads.
 
-    model_config: `hidden`, `convolutions`, `normalize` of the encoder; `dueling`, `noisy`; `atoms`, (number, low, high)
-    of C51's returns, or None.
+    model_config: `hidden`, `convolutions`, `normalize` of the encoder; `recurrence`, width of the GRU or None;
+    `dueling`, `noisy`; `atoms`, (number, low, high) of C51's returns, or None.
 
     ACTION_DIST_INPUTS are values, MASKED_LOGIT for illegal actions: their mode is the greedy legal action. With
     exploration they are the log-probabilities of ε-greedy actions.
@@ -62,17 +64,51 @@ class QNetwork(PolicyModule):
         atoms = config.get("atoms")
         self.register_buffer("atoms", torch.linspace(atoms[1], atoms[2], atoms[0]) if atoms else None, persistent=False)
         self.depth = atoms[0] if atoms else 1
+        recurrence = config.get("recurrence")
+        self.recurrent = ActionGRULayer(self.encoder.width, self.actions, recurrence) if recurrence else None
+        self.width = recurrence or self.encoder.width
         self.advantages = self._head(self.actions * self.depth)
         self.value = self._head(self.depth) if self.dueling else None
 
-    def head_outputs(self, observations: dict[str, Tensor], noise: bool = False) -> Tensor:
+    def get_initial_state(self) -> dict[str, NDArray]:
+        """Return the state before an episode's first step, key → (width,); empty if not recurrent."""
+        return {} if self.recurrent is None else self.recurrent.initial_state()
+
+    def hidden_states(self, observations: dict[str, Tensor], state: State, actions: Tensor, sequence: int) -> Tensor:
+        """Return the hidden states (S · T, width) at each step of S concatenated sequences of T = `sequence` steps.
+
+        Args:
+            observations: (S · T, …).
+            state: Before each step, key → (S · T, width); only those before the first steps are used.
+            actions: (S · T,), the taken actions.
+            sequence: T.
+        """
+        assert self.recurrent is not None
+
+        def in_time(column: Tensor) -> Tensor:
+            return column.unflatten(0, (-1, sequence)).transpose(0, 1)
+
+        first = {key: in_time(column)[0] for key, column in state.items()}
+        hidden = self.recurrent.unroll(in_time(self.encoder(observations)), first, in_time(actions))
+        return hidden.transpose(0, 1).flatten(0, 1)
+
+    def hidden_after(self, observations: dict[str, Tensor], actions: Tensor, hidden: Tensor) -> Tensor:
+        """Return the hidden states (B, width) at observations (B, …) that follow `actions` (B,) and hidden states."""
+        assert self.recurrent is not None
+        return self.recurrent.after(self.encoder(observations), actions, hidden)
+
+    def head_outputs(
+        self, observations: dict[str, Tensor], noise: bool = False, hidden: Tensor | None = None
+    ) -> Tensor:
         """Return values (B, n), or logits (B, n, atoms) of return distributions, without masks.
+
+        hidden: hidden states (B, width) at the observations, if the network is recurrent.
 
         Dueling: V + A − mean A (Wang et al., 2016, arXiv 1511.06581, equation 9), with the mean over legal actions:
         values of actions that are never played are never learned, and should not affect others.
         """
         noise = noise and self.noisy
-        embeddings = self.encoder(observations)
+        embeddings = self.encoder(observations) if hidden is None else hidden
         answers = self._answer(self.advantages, embeddings, noise).unflatten(-1, (self.actions, self.depth))
         if self.value is not None:
             value = self._answer(self.value, embeddings, noise).unsqueeze(-2)
@@ -85,19 +121,23 @@ class QNetwork(PolicyModule):
         return answers if self.atoms is None else (answers.softmax(-1) * self.atoms).sum(-1)
 
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
-        return {Columns.ACTION_DIST_INPUTS: self._masked(batch[Columns.OBS], noise=False)}
+        values, state = self._step(batch, noise=False)
+        return {Columns.ACTION_DIST_INPUTS: values} | state
 
     def _forward_exploration(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
-        values = self._masked(batch[Columns.OBS], noise=True)
-        return {Columns.ACTION_DIST_INPUTS: epsilon_greedy(values, self.exploration)}
+        values, state = self._step(batch, noise=True)
+        return {Columns.ACTION_DIST_INPUTS: epsilon_greedy(values, self.exploration)} | state
 
-    def _masked(self, observations: dict[str, Tensor], noise: bool) -> Tensor:
-        values = self.expected(self.head_outputs(observations, noise))
-        return mask_illegal(values, observations)
+    def _step(self, batch: dict[str, Any], noise: bool) -> tuple[Tensor, dict[str, Any]]:
+        """Return masked values, and the next state as STATE_OUT if the network is recurrent."""
+        observations, hidden = batch[Columns.OBS], None
+        if self.recurrent is not None:
+            hidden = self.recurrent.step(self.encoder(observations), batch[Columns.STATE_IN])
+        values = mask_illegal(self.expected(self.head_outputs(observations, noise, hidden)), observations)
+        return values, {} if hidden is None else {Columns.STATE_OUT: state_after_best(hidden, values)}
 
     def _head(self, outputs: int) -> nn.Module:
-        width = self.encoder.width
-        return NoisyLinear(width, outputs) if self.noisy else linear(width, outputs, gain=0.01)
+        return NoisyLinear(self.width, outputs) if self.noisy else linear(self.width, outputs, gain=0.01)
 
     def _answer(self, head: nn.Module, embeddings: Tensor, noise: bool) -> Tensor:
         return head(embeddings, noise) if isinstance(head, NoisyLinear) else head(embeddings)

@@ -7,7 +7,6 @@ paper). Only learning uses mixers.
 
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
@@ -15,9 +14,9 @@ from torch import Tensor, nn
 
 from training.modules.distributions import TorchCategorical
 from training.modules.encoder import Encoder, RunningNormalization, linear
-from training.modules.policy_module import PREVIOUS_ACTION, PolicyModule
+from training.modules.policy_module import PolicyModule
 from training.modules.q_network import epsilon_greedy, mask_illegal
-from training.modules.recurrent import HIDDEN, GRULayer
+from training.modules.recurrent import ActionGRULayer, state_after_best
 
 Observations = dict[str, Tensor]
 
@@ -41,14 +40,12 @@ class AgentNetwork(PolicyModule):
         )
         width = self.encoder.width
         recurrence = config.get("recurrence")
-        self.recurrent = GRULayer(width + self.actions, recurrence) if recurrence else None
+        self.recurrent = ActionGRULayer(width, self.actions, recurrence) if recurrence else None
         self.head = linear(recurrence or width, self.actions, gain=0.01)
 
     def get_initial_state(self) -> dict[str, NDArray]:
         """Return the state before an episode's first step, key → (width,); empty if not recurrent."""
-        if self.recurrent is None:
-            return {}
-        return {HIDDEN: np.zeros(self.recurrent.width, np.float32), PREVIOUS_ACTION: np.zeros(1, np.float32)}
+        return {} if self.recurrent is None else self.recurrent.initial_state()
 
     def values(self, observations: Observations) -> Tensor:
         """(B, …) → (B, actions), without masks; not for recurrent networks."""
@@ -69,57 +66,36 @@ class AgentNetwork(PolicyModule):
         assert self.recurrent is not None
         steps, agents = present.shape
         embeddings = self.encoder(flatten_leading(observations)).unflatten(0, (steps, agents))
-        hidden, acted = state[HIDDEN], state[PREVIOUS_ACTION].squeeze(-1)
-        hidden_states = []
-        for step in range(steps):
-            new = self.recurrent(self._recurrent_inputs(embeddings[step], acted), hidden)
-            hidden = torch.where(present[step].unsqueeze(-1), new, hidden)
-            acted = torch.where(present[step], actions[step].to(acted.dtype) + 1, acted)
-            hidden_states.append(hidden)
-        stacked = torch.stack(hidden_states)
-        return self.head(stacked), stacked
+        hidden = self.recurrent.unroll(embeddings, state, actions, present)
+        return self.head(hidden), hidden
 
     def values_after(self, observations: Observations, actions: Tensor, hidden: Tensor) -> Tensor:
         """Return the values (B, actions) of observations (B, …) that follow `actions` (B,) and the hidden state after
         them.
         """
         assert self.recurrent is not None
-        inputs = self._recurrent_inputs(self.encoder(observations), actions.to(hidden.dtype) + 1)
-        return self.head(self.recurrent(inputs, hidden))
+        return self.head(self.recurrent.after(self.encoder(observations), actions, hidden))
 
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         values, hidden = self._step(batch)
         if hidden is None:
             return {Columns.ACTION_DIST_INPUTS: values}
-        return {Columns.ACTION_DIST_INPUTS: values, Columns.STATE_OUT: _state(hidden, values)}
+        return {Columns.ACTION_DIST_INPUTS: values, Columns.STATE_OUT: state_after_best(hidden, values)}
 
     def _forward_exploration(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         values, hidden = self._step(batch)
         log_p = epsilon_greedy(values, self.exploration)
         if hidden is None:
             return {Columns.ACTION_DIST_INPUTS: log_p}
-        return {Columns.ACTION_DIST_INPUTS: log_p, Columns.STATE_OUT: _state(hidden, values)}
+        return {Columns.ACTION_DIST_INPUTS: log_p, Columns.STATE_OUT: state_after_best(hidden, values)}
 
     def _step(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor | None]:
         """Return masked values, and the next hidden state."""
         observations = batch[Columns.OBS]
         hidden, embeddings = None, self.encoder(observations)
         if self.recurrent is not None:
-            state = batch[Columns.STATE_IN]
-            embeddings = hidden = self.recurrent(
-                self._recurrent_inputs(embeddings, state[PREVIOUS_ACTION].squeeze(-1)), state[HIDDEN]
-            )
+            embeddings = hidden = self.recurrent.step(embeddings, batch[Columns.STATE_IN])
         return mask_illegal(self.head(embeddings), observations), hidden
-
-    def _recurrent_inputs(self, embeddings: Tensor, acted: Tensor) -> Tensor:
-        """Concatenate embeddings (B, width) and one-hot previous actions; acted: (B,), actions plus one, 0 for none."""
-        numbers = torch.arange(1, self.actions + 1, device=acted.device, dtype=acted.dtype)
-        return torch.cat([embeddings, (acted.unsqueeze(-1) == numbers).to(embeddings.dtype)], dim=-1)
-
-
-def _state(hidden: Tensor, values: Tensor) -> dict[str, Tensor]:
-    """Return the state after the greedy action; a caller that draws another action replaces it."""
-    return {HIDDEN: hidden, PREVIOUS_ACTION: values.argmax(-1, keepdim=True).to(hidden.dtype) + 1}
 
 
 def flatten_leading(observations: Observations) -> Observations:

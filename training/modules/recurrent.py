@@ -5,6 +5,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from training.modules.policy_module import PREVIOUS_ACTION
+
 HIDDEN, CELL = "h", "c"
 """Keys of the state, in the order of the graph's inputs."""
 
@@ -72,3 +74,61 @@ class GRULayer(nn.Module):
         reset, update = torch.sigmoid(reset_in + reset_kept), torch.sigmoid(update_in + update_kept)
         new = torch.tanh(new_in + reset * new_kept)
         return new + update * (hidden - new)
+
+
+class ActionGRULayer(GRULayer):
+    """A GRU over the steps of an agent, whose input is an embedded observation and the one-hot previous action.
+
+    State: HIDDEN (B, width) and PREVIOUS_ACTION (B, 1).
+    """
+
+    def __init__(self, inputs: int, actions: int, width: int) -> None:
+        """inputs: width of the embeddings."""
+        super().__init__(inputs + actions, width)
+        self.actions = actions
+
+    def initial_state(self) -> dict[str, NDArray]:
+        """Return the state before an episode's first step, key → (width,) float32 zeros."""
+        return {HIDDEN: np.zeros(self.width, np.float32), PREVIOUS_ACTION: np.zeros(1, np.float32)}
+
+    def step(self, embeddings: Tensor, state: State) -> Tensor:
+        """Run one step: (B, inputs) and the state before → the hidden state (B, width)."""
+        return self(self._with_action(embeddings, state[PREVIOUS_ACTION].squeeze(-1)), state[HIDDEN])
+
+    def unroll(self, embeddings: Tensor, state: State, actions: Tensor, present: Tensor | None = None) -> Tensor:
+        """Run T steps of B agents; return the hidden states, (T, B, width).
+
+        Args:
+            embeddings: (T, B, inputs).
+            state: Before the first step, key → (B, width).
+            actions: (T, B), the taken actions.
+            present: (T, B) bool; absent agents keep their state. None: all are present.
+        """
+        hidden, acted = state[HIDDEN], state[PREVIOUS_ACTION].squeeze(-1)
+        hidden_states = []
+        for step in range(len(embeddings)):
+            new = self(self._with_action(embeddings[step], acted), hidden)
+            taken = actions[step].to(acted.dtype) + 1
+            if present is None:
+                hidden, acted = new, taken
+            else:
+                hidden = torch.where(present[step].unsqueeze(-1), new, hidden)
+                acted = torch.where(present[step], taken, acted)
+            hidden_states.append(hidden)
+        return torch.stack(hidden_states)
+
+    def after(self, embeddings: Tensor, actions: Tensor, hidden: Tensor) -> Tensor:
+        """Return the hidden states (B, width) of a step that follows `actions` (B,) and the hidden states (B, width)
+        in which they were taken.
+        """
+        return self(self._with_action(embeddings, actions.to(hidden.dtype) + 1), hidden)
+
+    def _with_action(self, embeddings: Tensor, acted: Tensor) -> Tensor:
+        """Append one-hot previous actions to embeddings (B, inputs). acted: (B,), actions plus one, 0 for none."""
+        numbers = torch.arange(1, self.actions + 1, device=acted.device, dtype=acted.dtype)
+        return torch.cat([embeddings, (acted.unsqueeze(-1) == numbers).to(embeddings.dtype)], dim=-1)
+
+
+def state_after_best(hidden: Tensor, values: Tensor) -> State:
+    """Return the state after the best action by `values` (B, n); a caller that draws another action replaces it."""
+    return {HIDDEN: hidden, PREVIOUS_ACTION: values.argmax(-1, keepdim=True).to(hidden.dtype) + 1}

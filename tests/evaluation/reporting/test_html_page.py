@@ -205,6 +205,11 @@ def test_hostile_text_is_escaped_in_all_fields(report: LeagueReport) -> None:
     assert not [a for _, a, _ in page.elements if "onclick" in a]
 
 
+def test_the_leaderboard_shows_roles(report: LeagueReport) -> None:
+    page = PageParser(render_page(replace(report, roles={"tictactoe@1": "exploiter of tictactoe@3"})))
+    assert "tictactoe@1 exploiter of tictactoe@3" in [text for _, text in page.all("th")]
+
+
 def test_tables_have_headings_and_captions_and_charts_have_labels(page: PageParser) -> None:
     assert len(page.all("table")) == len(page.all("caption"))
     assert all(a.get("scope") in ("row", "col") for a, _ in page.all("th"))

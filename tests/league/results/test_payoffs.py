@@ -39,5 +39,5 @@ def test_versions_without_games_are_left_out() -> None:
 def test_a_league_without_games_has_none() -> None:
     with pytest.raises(NotFound, match="no two of the 2 versions have played each other"):
         meta_strategy(("a", "b"), [games("a", "script:x", 1.0)])
-    with pytest.raises(NotFound, match="no two of the 0 versions"):
+    with pytest.raises(NotFound, match="the league has 0 versions, expected at least two"):
         meta_strategy((), [])

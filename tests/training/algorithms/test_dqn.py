@@ -24,13 +24,14 @@ from training.algorithms.setup import algorithm_config, module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy
 from training.learners import dqn as learning
-from training.learners.off_policy import next_actions
+from training.learners.off_policy import ReplayBatch, next_actions
 from training.modules.policy_module import MASKED_LOGIT
 from training.replay_buffer import ReplayBuffer
-from training.sampling.closed_transitions import TERMINATED, TRUNCATED, PolicyTransitions
+from training.sampling.closed_transitions import REWARDS, TERMINATED, TRUNCATED, PolicyTransitions
 
 pytestmark = pytest.mark.usefixtures("ray_session")
 RETURN = 1 / (1 - 0.9)
+MEMORY = {"recurrence": {"width": 16, "sequence": 3}, "batch_size": 32}
 ALL_EXTENSIONS = {"n_step": 3, "priorities": {}, "noisy": True, "distributional": {"low": -1, "high": 5}}
 
 
@@ -70,6 +71,33 @@ def test_independent_policies_learn_opposed_tasks() -> None:
     means = train(league, 10, returns)
     assert means["a"] > 0.85 * ROUNDS
     assert means["b"] > -0.15 * ROUNDS
+
+
+@pytest.mark.slow
+def test_remembering_requires_recurrence() -> None:
+    settings = {"gamma": 0.99, "num_envs": 8, "exploration": {"steps": 8000}}
+    assert train(solvable_by_dqn("remembering", **settings, **MEMORY), 14, returns)["shared"] > 0.8
+    assert train(solvable_by_dqn("remembering", **settings), 14, returns)["shared"] < 0.5
+
+
+def test_rows_after_the_end_of_an_episode_do_not_count() -> None:
+    """Sequences of five steps in episodes of four: each sequence ends with a repeated row."""
+    sequence = ROUNDS + 1
+    league = solvable_by_dqn("discrete", recurrence={"width": 4, "sequence": sequence}, batch_size=4)
+
+    def losses(algorithm: OffPolicy, _: Any) -> tuple[Any, Any]:
+        learner, sample = algorithm.learner_group._learner, algorithm.draw_sample(algorithm.replays["shared"])
+        batch = learner.batch(sample)
+        changed = {**batch.rows, REWARDS: torch.where(batch.weights > 0, batch.rows[REWARDS], 1e6)}
+        assert (batch.weights.reshape(-1, sequence)[:, -1] == 0).all()
+        return tuple(
+            learner.losses({"shared": ReplayBatch(rows, batch.weights)}, ["shared"])["shared"]
+            for rows in (batch.rows, changed)
+        )
+
+    kept, changed = train(league, 2, losses)
+    assert kept.total == changed.total > 0
+    assert kept.statistics["error"] == changed.statistics["error"]
 
 
 def values_of(algorithm: OffPolicy, _: Any) -> NDArray:
@@ -126,9 +154,10 @@ def test_the_check_detects_targets_without_a_mask(monkeypatch: pytest.MonkeyPatc
         check_values()
 
 
-def test_a_restored_algorithm_continues_identically(tmp_path: Path) -> None:
+@pytest.mark.parametrize("settings", [ALL_EXTENSIONS, MEMORY], ids=["all extensions", "recurrent"])
+def test_a_restored_algorithm_continues_identically(settings: dict[str, Any], tmp_path: Path) -> None:
     """Compares an algorithm that continues after its checkpoint with a restored one: weights, targets and buffer."""
-    league = solvable_by_dqn("discrete", **ALL_EXTENSIONS, replay_capacity=900)
+    league = solvable_by_dqn("discrete", **settings, replay_capacity=900)
 
     def state_after(algorithm: OffPolicy) -> list[NDArray]:
         algorithm.reset_episodes(2048)
@@ -212,7 +241,7 @@ def test_the_correction_by_priorities_follows_the_time_if_only_that_is_limited()
         assert OffPolicy._beta.fget(algorithm) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("settings", [{}, ALL_EXTENSIONS], ids=["plain", "all extensions"])
+@pytest.mark.parametrize("settings", [{}, ALL_EXTENSIONS, MEMORY], ids=["plain", "all extensions", "recurrent"])
 def test_the_graph_equals_the_module_without_noise(settings: dict[str, Any], tmp_path: Path) -> None:
     league = solvable_by_dqn("masked", **settings)
     interface_of_league = interface(league)

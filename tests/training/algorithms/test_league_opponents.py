@@ -8,6 +8,7 @@ import pytest
 
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
+from league.registry.storage.manifest import EXPLOITER, Manifest
 from league.results.ledger import Ledger
 from league.results.payoffs import PRIOR_GAMES, payoff_matrix
 from league.results.records import BlockResult
@@ -31,6 +32,15 @@ def metrics(**results: tuple[float, float]) -> list[dict[str, Any]]:
     """Of one runner: version number → (games, score)."""
     played = {f"tictactoe@{ref[1:]}": {"games": games, "score": score} for ref, (games, score) in results.items()}
     return [{"opponents": played}]
+
+
+def publish_exploiter(registry: Registry, source: str, target: str) -> None:
+    build = registries.builder()
+
+    def build_exploiter(directory: Path, number: int) -> Manifest:
+        return build(directory, number).model_copy(update={"role": EXPLOITER, "exploits": target})
+
+    registry.publisher.publish("tictactoe", build_exploiter, source=source, parent=None)
 
 
 def test_an_empty_league_has_no_opponents(registry: Registry) -> None:
@@ -65,6 +75,21 @@ def test_of_a_mixture_the_members_are_candidates(registry: Registry) -> None:
     opponents = opponents_of(registry, window=2)
     opponents.refresh()
     assert opponents.candidates == tuple(f"tictactoe@{number}" for number in (1, 3, 5, 6))
+
+
+def test_the_newest_exploiters_of_champions_are_candidates(registry: Registry) -> None:
+    registries.publish(registry, "run/0")
+    for number, target in enumerate((1, 1, 2), 2):
+        publish_exploiter(registry, f"exploiter/{number}", f"tictactoe@{target}")
+    for number in (5, 6):
+        registries.publish(registry, f"run/{number}")
+    registry.aliases.set("tictactoe", "champion", 1, expected=ANY, actor="me", reason="test")
+    opponents = opponents_of(registry, window=1, champions=False)
+    opponents.refresh()
+    assert opponents.candidates == ("tictactoe@3", "tictactoe@6")
+    opponents = opponents_of(registry, window=3, champions=False, exploiters=False)
+    opponents.refresh()
+    assert opponents.candidates == ("tictactoe@1", "tictactoe@5", "tictactoe@6")
 
 
 def test_versions_with_another_interface_are_no_candidates(registry: Registry) -> None:

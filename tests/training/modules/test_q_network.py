@@ -4,8 +4,9 @@ import pytest
 import torch
 from ray.rllib.core.columns import Columns
 
-from training.modules.policy_module import MASKED_LOGIT
+from training.modules.policy_module import MASKED_LOGIT, PREVIOUS_ACTION
 from training.modules.q_network import NoisyLinear, QNetwork, epsilon_greedy
+from training.modules.recurrent import HIDDEN
 
 SPACE = gymnasium.spaces.Dict(
     {
@@ -90,3 +91,29 @@ def test_noise_is_factorized_and_disabled_in_inference() -> None:
     scaled = [e.sign() * e.abs().sqrt() for e in (outgoing, incoming)]
     expected = layer(x) + 0.25 * (x @ scaled[1]).unsqueeze(1) * scaled[0] + 0.25 * scaled[0]
     torch.testing.assert_close(noisy, expected)
+
+
+@pytest.mark.parametrize("kind", [{}, {"dueling": True, "atoms": (5, -2.0, 2.0)}], ids=str)
+def test_a_recurrent_network_learns_from_sequences_as_it_acts(kind: dict[str, object]) -> None:
+    """Compares two concatenated sequences of four steps, from stored states, with acting step by step."""
+    module, sequences, steps = network(recurrence=6, **kind), 2, 4
+    shape = sequences, steps
+    seen = {name: column.unflatten(0, shape) for name, column in batch([[1, 1, 1]] * 8)[Columns.OBS].items()}
+    actions = torch.randint(0, 3, shape)
+    stored = {HIDDEN: torch.randn(*shape, 6), PREVIOUS_ACTION: torch.randint(0, 4, (*shape, 1)).float()}
+    flat = {name: column.flatten(0, 1) for name, column in (seen | stored).items()}
+    observations = {name: flat[name] for name in seen}
+    hidden = module.hidden_states(observations, {key: flat[key] for key in stored}, actions.flatten(), steps)
+    learned = module.expected(module.head_outputs(observations, hidden=hidden)).unflatten(0, shape)
+    following = module.hidden_after(observations, actions.flatten(), hidden)
+    later = module.expected(module.head_outputs(observations, hidden=following)).unflatten(0, shape)
+
+    state = {key: column[:, 0] for key, column in stored.items()}
+    for step in range(steps):
+        inputs = {Columns.OBS: {name: column[:, step] for name, column in seen.items()}}
+        answer = module.forward_inference(inputs | {Columns.STATE_IN: state})
+        torch.testing.assert_close(learned[:, step], answer[Columns.ACTION_DIST_INPUTS])
+        assert (answer[Columns.STATE_OUT][PREVIOUS_ACTION][:, 0] == learned[:, step].argmax(-1) + 1).all()
+        state = {HIDDEN: answer[Columns.STATE_OUT][HIDDEN], PREVIOUS_ACTION: actions[:, step, np.newaxis].float() + 1}
+        again = module.forward_inference(inputs | {Columns.STATE_IN: state})
+        torch.testing.assert_close(later[:, step], again[Columns.ACTION_DIST_INPUTS])

@@ -1,0 +1,127 @@
+"""Connect four with opponents from the league, compared with self-play alone."""
+
+import io
+import math
+import statistics
+import tempfile
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.training.learned import report_target
+from evaluation.gating.exploitability import exploitability
+from evaluation.matches.worker import MatchWorker
+from evaluation.results import ExploiterScore
+from evaluation.schedules.builders import gauntlet
+from evaluation.statistics.payoff import score_interval
+from league.config.league import LeagueConfig
+from league.environments.building import interface
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.settings import Storage
+from training.runs.train import train
+
+CONFIG = Path(__file__).parent.parent.parent / "configs" / "connect_four.yaml"
+SEEDS = range(3)
+MINUTES, VERSIONS, BLOCKS = 28.0, 7, 200
+EXPLOITER = 0.15
+"""Share of the budget for the exploiter of the last version."""
+GAIN = 0.10
+"""By how much the lowest score against own past versions must be higher."""
+INFERIOR = -50.0
+"""Elo below which a policy is inferior."""
+SELF_PLAY, LEAGUE = "self-play", "league"
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """A training: its last version and the actions until it, its lowest score against an earlier version of the
+    same training, and the score of its exploiter."""
+
+    last: str
+    steps: int
+    lowest: float
+    exploiter: ExploiterScore
+
+
+def compare_arms(quick: bool) -> bool:
+    """Print the results of all seeds, and whether the league's means meet the targets."""
+    minutes = MINUTES / 10 if quick else MINUTES
+    arms: dict[str, list[Arm]] = {SELF_PLAY: [], LEAGUE: []}
+    scores: list[float] = []
+    for seed in SEEDS:
+        with tempfile.TemporaryDirectory() as home, closing(Registry.open(Storage.at(Path(home)))) as registry:
+            # The league's arm comes first, so that its opponents are its own versions.
+            own = {name: train_arm(registry, _config(name, seed, minutes)) for name in (LEAGUE, SELF_PLAY)}
+            for name, arm in own.items():
+                arms[name].append(arm)
+                best = arm.exploiter
+                print(
+                    f"connect four, {name}, seed {seed}: {arm.steps:,} actions; lowest score against its past"
+                    f" {arm.lowest:.3f}; exploiter {best.score:.3f} [{best.low:.3f}, {best.high:.3f}]",
+                    flush=True,
+                )
+            scores += _scores(registry, _config(LEAGUE, seed, minutes), own[LEAGUE].last, [own[SELF_PLAY].last])[0]
+    return _targets(arms, scores)
+
+
+def _targets(arms: dict[str, list[Arm]], scores: list[float]) -> bool:
+    past = {name: statistics.mean(arm.lowest for arm in found) for name, found in arms.items()}
+    exploited = {name: statistics.mean(arm.exploiter.score for arm in found) for name, found in arms.items()}
+    score, low, high = score_interval(scores)
+    gain = past[LEAGUE] - past[SELF_PLAY]
+    goals = [
+        report_target(f"connect four, lowest score against its past: {gain:+.3f}", f"+{GAIN:g}", gain >= GAIN),
+        report_target(
+            f"connect four, score of the exploiter: {exploited[LEAGUE]:.3f}",
+            f"below {exploited[SELF_PLAY]:.3f}",
+            exploited[LEAGUE] < exploited[SELF_PLAY],
+        ),
+        report_target(
+            f"connect four, strength against self-play: {elo(score):+.0f} Elo [{elo(low):+.0f}, {elo(high):+.0f}]",
+            f"not below {INFERIOR:g}",
+            elo(low) >= INFERIOR,
+        ),
+    ]
+    return all(goals)
+
+
+def train_arm(registry: Registry, config: LeagueConfig) -> Arm:
+    """Train, play the last version against the earlier ones, and train and play its exploiter."""
+    quiet = Console(file=io.StringIO())
+    versions = train(config, registry=registry, console=quiet)
+    last, target = versions[-1], CheckpointRef(config.league, versions[-1].number)
+    lowest = min(map(statistics.mean, _scores(registry, config, last.ref, [each.ref for each in versions[:-1]])))
+    settings = config.of_exploiter(config.training.seed, None, config.training.minutes, EXPLOITER)
+    train(settings, registry=registry, parent=target, role="exploiter", target=target, console=quiet)
+    found = exploitability(target, registry=registry, blocks=BLOCKS)
+    return Arm(last.ref, last.steps, lowest, found.exploiters[0])
+
+
+def elo(score: float) -> float:
+    """Return the difference in Elo of an expected score."""
+    return -math.inf if score <= 0 else math.inf if score >= 1 else 400 * math.log10(score / (1 - score))
+
+
+def _config(arm: str, seed: int, minutes: float) -> LeagueConfig:
+    """Return the configuration of an arm. Both have the fixed opponents of a night."""
+    config = LeagueConfig.load(CONFIG)
+    assert config.nightly.opponents is not None
+    opponents = config.nightly.opponents.model_dump(by_alias=True)
+    if arm == SELF_PLAY:
+        opponents["league"] = None
+    return config.with_training(
+        seed=seed, minutes=minutes, checkpoint_minutes=minutes / VERSIONS, opponents=opponents, strength=None
+    )
+
+
+def _scores(registry: Registry, config: LeagueConfig, version: str, opponents: list[str]) -> list[list[float]]:
+    """Play a version against others, without recording the matches; return its scores against each one."""
+    schedule = gauntlet(config, interface(config), [version], opponents, BLOCKS)
+    found: dict[str, list[float]] = {ref: [] for ref in opponents}
+    for match in MatchWorker(config, registry).play(schedule, range(schedule.length)):
+        number = match.contestants.index(version)
+        found[match.contestants[1 - number]].append(match.score(number))
+    return list(found.values())
