@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 LEAGUE = "connect_four"
 OPPONENT = "script:one_ply"
+TEACHER = {"ref": "script:minimax_4", "weight": {"initial": 1.0, "final": 0.1}}
+"""As in the league's configuration, but the weight decreases over the time of the demo."""
 VERSIONS = 4
 """Number of versions that the demo publishes, regardless of the speed of the machine."""
 MARKS = ("●", "○")
@@ -63,9 +65,9 @@ def _train(config: "LeagueConfig", minutes: float) -> None:
     from training.runs.train import train
 
     _step(1, f"Train for {minutes:g} minutes by masked PPO (RLlib, Ray Tune): self-play, and games against {OPPONENT}.")
-    say("The policy also imitates script:minimax_4, a search to a depth of four moves, most of all at first.")
+    say(f"The policy also imitates {TEACHER['ref']}, a search to a depth of four moves, most of all at first.")
     say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
-    paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS)
+    paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS, teacher=TEACHER)
     registry = open_registry()
     with strength_process(registry.storage) as measure:
         train(paced, registry=registry, config_path=find(LEAGUE), console=console, measure=measure)
