@@ -6,8 +6,8 @@ answers with a constant; the same handler and model on uvicorn alone; FastAPI wi
 serving a policy, which reads a flat board and answers with the arg max. Servers run one at a time, in rounds; ratios
 are computed within a round, and the medians over the rounds are reported. One replica each, unless stated otherwise. By
 default Serve sends 5 concurrent requests to a replica and backs off beyond that: RLlib's example is measured with 5
-connections, too, and its better rate counts. Processor time per request is that of all processes of a server; unlike
-rates it says nothing about waiting, but it hardly depends on what else runs on the machine.
+connections, too, and its better rate counts. Processor time per answered request is that of all processes of a server;
+it says nothing about waiting, but hardly depends on what else runs on the machine.
 
 --peers compares with LitServe, MLServer and BentoML instead, one worker each, next to FastAPI. They run our graph with
 ONNX Runtime, answer with the action only, and are installed into a cache folder.
@@ -80,7 +80,7 @@ class ServerUnderTest:
                 spent = sum(after - before.get(pid, after) for pid, after in _processor_seconds().items())
                 rates[connections] = load.rate
                 self.failed += load.failed
-            self.costs.append(1e6 * spent / load.requests)
+            self.costs.append(1e6 * spent / (load.requests - load.failed))
             one = measure(url, self.body, connections=1, seconds=seconds, warm_up=0.5)
         self.rates.append(rates)
         self.failed += one.failed

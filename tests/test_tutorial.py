@@ -72,9 +72,9 @@ def test_the_programs_call_the_server(url: str, tmp_path: Path, suffix: str, pro
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_person_plays_against_the_champion(url: str) -> None:
+def test_a_person_plays_against_the_version(url: str) -> None:
     """The code of the game is found, although the server was started in another directory."""
-    game = answer("POST", f"{url}/v1/leagues/nim/play", {"opponent": "nim@champion", "agent": "first", "actions": [1]})
+    game = answer("POST", f"{url}/v1/leagues/nim/play", {"opponent": "nim@1", "agent": "first", "actions": [1]})
     moves = [(move["agent"], move["ref"]) for step in game["steps"] for move in step["moves"]]
     assert moves[:2] == [("first", "person"), ("second", "nim@1")]
     assert game["picture"].startswith("data:image/png")
@@ -83,8 +83,8 @@ def test_a_person_plays_against_the_champion(url: str) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_line_of_the_crontab_trains_a_night(folder: Path) -> None:
-    with (folder / "nim.yaml").open("a") as file:
-        file.write("nightly: {steps: 1000, exploiter: 0}\n")
+    short = blocks("yaml")[0].replace("gate:\n", "gate:\n  max_blocks: 50\n")
+    (folder / "nim.yaml").write_text(f"{short}nightly: {{steps: 1000, exploiter: 0}}\n")
     command = crontab_command(folder, league=Path(sys.executable).with_name("league"))
     done = subprocess.run(["/bin/sh", "-c", command], cwd="/", env={"PATH": "/usr/bin:/bin"}, check=False)
     log = (folder / "nightly.log").read_text()

@@ -34,7 +34,7 @@ def compare(
 
 def _show(found: "RunComparison") -> None:
     first, second = found.runs
-    columns = ("", first.run, second.run)
+    columns = ("", "first", "second")
     table(columns, _summary(found), prose=columns[1:])
     if found.settings:
         say("\nSettings that differ:")
@@ -55,6 +55,7 @@ def _show(found: "RunComparison") -> None:
 
 def _summary(found: "RunComparison") -> list[tuple[str, ...]]:
     rows = {
+        "run": [run.run for run in found.runs],
         "league": [run.league for run in found.runs],
         "algorithm": [run.algorithm for run in found.runs],
         "state": [run.state for run in found.runs],

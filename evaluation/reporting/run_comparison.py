@@ -9,6 +9,7 @@ from typing import Any
 
 from evaluation.results import Document
 from evaluation.statistics.payoff import score_interval
+from league.errors import InvalidInput
 from league.registry.registry import Registry
 from league.registry.storage.rows import RunRow
 from league.results.ledger import Ledger
@@ -72,8 +73,11 @@ def compare_runs(registry: Registry, first: str, second: str) -> RunComparison:
     Raises:
         UnknownRun: There is no such run.
         InvalidReference: Several ids begin so.
+        InvalidInput: Both are the same run.
     """
     rows = registry.runs.find(first), registry.runs.find(second)
+    if (rows[0].league, rows[0].id) == (rows[1].league, rows[1].id):
+        raise InvalidInput(f"{first} and {second} are the same run, {rows[0].league}/{rows[0].id}: name two runs")
     runs = _compared(registry, rows[0]), _compared(registry, rows[1])
     settings = [dict(_flat(row.settings)) for row in rows]
     values = {name: (settings[0].get(name), settings[1].get(name)) for name in settings[0] | settings[1]}

@@ -17,7 +17,12 @@ def runs(registry: Registry) -> tuple[str, str]:
         settings = {"lr": lr, "gamma": 0.99}
         registry.runs.begin(tictactoe.LEAGUE, run, algorithm="ppo", settings=settings, seed=1, target=9000)
         at = registry.runs.get(tictactoe.LEAGUE, run).began_at
-        registry.runs.record(tictactoe.LEAGUE, run, RunPoint(600_000, {"shared/return": lr}, at), seconds=120.0)
+        registry.runs.record(
+            tictactoe.LEAGUE,
+            run,
+            RunPoint(600_000, {"shared/return": lr, "opponents/script:nim_bot:act/score": 0.5}, at),
+            seconds=120.0,
+        )
     return RUNS
 
 
@@ -26,6 +31,8 @@ def test_runs_are_compared_by_short_ids(league: League, monkeypatch: pytest.Monk
     monkeypatch.setattr(output.console, "width", 80)
     out = league("compare", "20261124", "20261125").out
     rows = {line.split()[0]: line.split()[1:] for line in out.splitlines() if line.strip()}
+    assert rows["run"] == list(RUNS)
+    assert out.count("shared/return") == out.count("opponents/") == 1, "both runs are side by side"
     assert rows["lr"] == ["0.001", "0.0005"]
     assert rows["actions"] == ["600,000", "600,000"]
     assert rows["actions/s"] == ["5,000", "5,000"]
@@ -39,7 +46,12 @@ def test_runs_are_compared_by_short_ids(league: League, monkeypatch: pytest.Monk
 
 @pytest.mark.usefixtures("runs")
 def test_unknown_and_ambiguous_runs_are_usage_errors(league: League) -> None:
-    for name, message in (("2026", "is ambiguous"), ("chess/1", "there is no training run 'chess/1'"), ("x", RUNS[1])):
+    for name, message in (
+        ("2026", "is ambiguous"),
+        ("chess/1", "there is no training run 'chess/1'"),
+        ("x", RUNS[1]),
+        ("20261124", f"are the same run, tictactoe/{RUNS[0]}"),
+    ):
         result = league("compare", RUNS[0], name)
         assert (result.code, result.err.count("\n")) == (2, 1)
         assert message in result.err
