@@ -2,8 +2,8 @@
 
 idle       10,000 idle streams on a replica without HAProxy, which needs 2.5 file descriptors for each: memory of a
            stream, and the rate of actions with these streams and without, in turn
-reconnect  2,000 streams through HAProxy to three replicas, one of which is removed: all reconnect within two minutes;
-           how many in the busiest second, and how many without a close frame
+reconnect  streams through HAProxy to several replicas, one of which is removed: all reconnect within two minutes; how
+           many in the busiest second, and how many without a close frame
 """
 
 import argparse
@@ -28,12 +28,12 @@ from tests.support.servers.scaling import scale
 from tests.support.servers.under_load import RayServer
 from tests.support.waiting import until
 
-STREAMS, RECONNECTING = 10_000, 2000
+STREAMS, RECONNECTING, REPLICAS = 10_000, 2000, 3
 PAIRS, CONNECTIONS, SECONDS = 5, 8, 4.0
 CUT = 130.0
 """Seconds after which HAProxy has ended all streams that were opened before a change of the replicas."""
-REMOVED = 300.0
-"""Seconds for a replica to be removed on a busy machine."""
+STARTED, REMOVED = 400.0, 300.0
+"""Seconds for the replicas to start, and for one to be removed, on a busy machine."""
 MEMORY, RATE = 30.0, 0.9
 """Targets: kB per stream, rate of actions relative to that without streams."""
 WARM_UP = 100
@@ -46,12 +46,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="smoke test: few streams, one pair of rates")
     parser.add_argument("--only", choices=PARTS, help="measure this part")
+    parser.add_argument("--streams", type=int, default=RECONNECTING, help="streams that reconnect")
+    parser.add_argument("--replicas", type=int, default=REPLICAS, help="replicas of which one is removed")
     options = parser.parse_args()
     met = True
     if options.only != "reconnect":
         met = _idle(*(500, 1) if options.quick else (STREAMS, PAIRS))
     if options.only != "idle":
-        met &= _reconnect(100 if options.quick else RECONNECTING)
+        met &= _reconnect(100 if options.quick else options.streams, options.replicas)
     return int(not met)
 
 
@@ -77,19 +79,19 @@ def _idle(number: int, pairs: int) -> bool:
     return memory <= MEMORY and rate >= RATE
 
 
-def _reconnect(number: int) -> bool:
-    with _served(replicas=3) as server, holding(f"{server.url}/v1/policies/{LEAGUE}/stream", number) as seen:
-        scale(server, 2)
-        until(lambda: len(server.registry.replicas.registered()) == 2, REMOVED)
+def _reconnect(number: int, replicas: int) -> bool:
+    with _served(replicas) as server, holding(f"{server.url}/v1/policies/{LEAGUE}/stream", number) as seen:
+        scale(server, replicas - 1)
+        until(lambda: len(server.registry.replicas.registered()) == replicas - 1, REMOVED)
         time.sleep(CUT)
-    _print_reconnections(number, seen)
+    _print_reconnections(number, replicas, seen)
     return seen.codes.get("none", 0) == 0
 
 
-def _print_reconnections(number: int, seen: IdleStreams) -> None:
+def _print_reconnections(number: int, replicas: int, seen: IdleStreams) -> None:
     per_second = Counter(int(at) for at in seen.closed)
     busiest = max(per_second.values(), default=0)
-    print(f"one of three replicas removed, {number:,} streams: {len(seen.closed):,} closed", end="")
+    print(f"one of {replicas} replicas removed, {number:,} streams: {len(seen.closed):,} closed", end="")
     if seen.closed:
         print(f" between {min(seen.closed):.0f} and {max(seen.closed):.0f} s", end="")
     print(
@@ -111,7 +113,7 @@ def _published() -> Iterator[Registry]:
 
 @contextmanager
 def _served(replicas: int) -> Iterator[RayServer]:
-    with _published() as registry, running(registry.storage, replicas=replicas) as url:
+    with _published() as registry, running(registry.storage, replicas=replicas, timeout=STARTED) as url:
         yield RayServer(url, "", registry, DEPLOY_YAML)
 
 
