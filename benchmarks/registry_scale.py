@@ -54,12 +54,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="smoke test: few replicas, promotions and seconds")
     parser.add_argument("--only", choices=PARTS, action="append", help="measure this part; may be repeated")
+    parser.add_argument("--watchers", type=int, default=WATCHERS, help="number of replicas of this part")
+    parser.add_argument("--promotions", type=int, default=PROMOTIONS, help="of the same part")
     options = parser.parse_args()
-    met = [_measured(part, options.quick) for part in options.only or PARTS]
+    watched = (10, 10) if options.quick else (options.watchers, options.promotions)
+    met = [_measured(part, options.quick, *watched) for part in options.only or PARTS]
     return int(not all(met))
 
 
-def _measured(part: str, quick: bool) -> bool:
+def _measured(part: str, quick: bool, watchers: int, promotions: int) -> bool:
     core = server_load.on_one_core() if part == "watchers" else None
     with _registry() as (registry, socket):
         if part == "idle":
@@ -68,7 +71,7 @@ def _measured(part: str, quick: bool) -> bool:
             return _acknowledgement(registry, 50 if quick else LEAGUES)
         if part == "follower-check":
             return _follower_check(registry, socket, 50 if quick else REPLICAS)
-        return _watchers(registry, socket, core, *(10, 10) if quick else (WATCHERS, PROMOTIONS))
+        return _watchers(registry, socket, core, watchers, promotions)
 
 
 @contextmanager

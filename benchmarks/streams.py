@@ -1,10 +1,9 @@
 """Many WebSocket streams: memory of an idle one, actions next to them, reconnections when a replica is removed.
 
-memory     10,000 idle streams, connected to a replica without HAProxy, which needs two file descriptors for each; the
-           memory of HAProxy for a stream is measured with fewer
-actions    rate of actions through HAProxy, with these streams and without, in turn
-reconnect  2,000 streams through HAProxy to three replicas, one of which is removed: all reconnect within two minutes;
-           how many in the busiest second, and how many without a close frame
+idle       10,000 idle streams on a replica without HAProxy, which needs 2.5 file descriptors for each: memory of a
+           stream, and the rate of actions with these streams and without, in turn
+reconnect  streams through HAProxy to several replicas, one of which is removed: all reconnect within two minutes; how
+           many in the busiest second, and how many without a close frame
 """
 
 import argparse
@@ -19,29 +18,27 @@ from statistics import median
 
 import psutil
 
+from benchmarks.attacks.postgresql_leagues import standalone_replica
 from benchmarks.leagues.served_league import BODY, LEAGUE, publish
 from benchmarks.load import http
 from benchmarks.load.idle_streams import IdleStreams, holding
-from benchmarks.processes import haproxy_processes, replica_processes
 from league.registry.registry import Registry
 from serve_app.runtime.launch import DEPLOY_YAML, running
 from tests.support.servers.scaling import scale
 from tests.support.servers.under_load import RayServer
 from tests.support.waiting import until
 
-STREAMS, THROUGH_HAPROXY, RECONNECTING = 10_000, 4000, 2000
+STREAMS, RECONNECTING, REPLICAS = 10_000, 2000, 3
 PAIRS, CONNECTIONS, SECONDS = 5, 8, 4.0
 CUT = 130.0
 """Seconds after which HAProxy has ended all streams that were opened before a change of the replicas."""
-REMOVED = 300.0
-"""Seconds for a replica to be removed on a busy machine."""
+STARTED, REMOVED = 400.0, 300.0
+"""Seconds for the replicas to start, and for one to be removed, on a busy machine."""
 MEMORY, RATE = 30.0, 0.9
 """Targets: kB per stream, rate of actions relative to that without streams."""
-REPLICA_PORTS = range(30_000, 31_001)
-"""Ports of replicas without HAProxy (RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT)."""
 WARM_UP = 100
 """Streams that are opened and closed first, so that code is loaded before memory is measured."""
-PARTS = ("memory", "reconnect")
+PARTS = ("idle", "reconnect")
 
 
 def main() -> int:
@@ -49,55 +46,52 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="smoke test: few streams, one pair of rates")
     parser.add_argument("--only", choices=PARTS, help="measure this part")
+    parser.add_argument("--streams", type=int, default=RECONNECTING, help="streams that reconnect")
+    parser.add_argument("--replicas", type=int, default=REPLICAS, help="replicas of which one is removed")
     options = parser.parse_args()
     met = True
     if options.only != "reconnect":
-        met = _idle(*(500, 200, 1) if options.quick else (STREAMS, THROUGH_HAPROXY, PAIRS))
-    if options.only != "memory":
-        met &= _reconnect(100 if options.quick else RECONNECTING)
+        met = _idle(*(500, 1) if options.quick else (STREAMS, PAIRS))
+    if options.only != "idle":
+        met &= _reconnect(100 if options.quick else options.streams, options.replicas)
     return int(not met)
 
 
-def _idle(number: int, through_haproxy: int, pairs: int) -> bool:
-    with _served(replicas=1) as server:
-        path = f"/v1/policies/{LEAGUE}"
-        (replica,) = replica_processes()
-        direct, action = f"{_own_url(replica)}{path}/stream", f"{server.url}{path}/action"
-        with holding(direct, WARM_UP):
+def _idle(number: int, pairs: int) -> bool:
+    with _published() as registry, standalone_replica(registry.storage, "idle") as replica:
+        path = f"{replica.url}/v1/policies/{LEAGUE}"
+        stream, action = f"{path}/stream", f"{path}/action"
+        process = psutil.Process(replica.process.pid)
+        with holding(stream, WARM_UP):
             pass
-        with holding(f"{server.url}{path}/stream", WARM_UP):
-            before = _resident(_haproxy())
-            with holding(f"{server.url}{path}/stream", through_haproxy):
-                haproxy = (_resident(_haproxy()) - before) / through_haproxy
-        sizes, ratios = [], []
+        sizes, ratios = list[float](), list[float]()
         for _ in range(pairs):
-            alone, resident = _rate(action), _resident([replica])
-            with holding(direct, number) as seen:
-                sizes.append((_resident([replica]) - resident) / number)
+            alone, resident = _rate(action), process.memory_info().rss
+            with holding(stream, number) as seen:
+                sizes.append((process.memory_info().rss - resident) / number / 1e3)
                 beside = _rate(action)
             assert not seen.codes, f"idle streams were closed: {seen.codes}"
             ratios.append(beside / ((alone + _rate(action)) / 2))
-    memory, rate = sizes[0] / 1e3, median(ratios)
-    print(f"{number:,} idle streams on a replica: {memory:.1f} kB each   (at most {MEMORY:g});", end="")
-    print(f" in HAProxy {haproxy / 1e3:.1f} kB each, of {through_haproxy:,}")
+    memory, rate = max(sizes), median(ratios)
+    print(f"{number:,} idle streams on a replica: {memory:.1f} kB each   (at most {MEMORY:g})")
     print(f"rate of actions next to them: {rate:.2f} times that without   (at least {RATE:g}); pairs ", end="")
     print(", ".join(f"{ratio:.2f}" for ratio in ratios), flush=True)
     return memory <= MEMORY and rate >= RATE
 
 
-def _reconnect(number: int) -> bool:
-    with _served(replicas=3) as server, holding(f"{server.url}/v1/policies/{LEAGUE}/stream", number) as seen:
-        scale(server, 2)
-        until(lambda: len(server.registry.replicas.registered()) == 2, REMOVED)
+def _reconnect(number: int, replicas: int) -> bool:
+    with _served(replicas) as server, holding(f"{server.url}/v1/policies/{LEAGUE}/stream", number) as seen:
+        scale(server, replicas - 1)
+        until(lambda: len(server.registry.replicas.registered()) == replicas - 1, REMOVED)
         time.sleep(CUT)
-    _print_reconnections(number, seen)
+    _print_reconnections(number, replicas, seen)
     return seen.codes.get("none", 0) == 0
 
 
-def _print_reconnections(number: int, seen: IdleStreams) -> None:
+def _print_reconnections(number: int, replicas: int, seen: IdleStreams) -> None:
     per_second = Counter(int(at) for at in seen.closed)
     busiest = max(per_second.values(), default=0)
-    print(f"one of three replicas removed, {number:,} streams: {len(seen.closed):,} closed", end="")
+    print(f"one of {replicas} replicas removed, {number:,} streams: {len(seen.closed):,} closed", end="")
     if seen.closed:
         print(f" between {min(seen.closed):.0f} and {max(seen.closed):.0f} s", end="")
     print(
@@ -109,28 +103,18 @@ def _rate(url: str) -> float:
     return http.measure(url, BODY, connections=CONNECTIONS, seconds=SECONDS).rate
 
 
-def _own_url(replica: psutil.Process) -> str:
-    """The URL of a replica without HAProxy."""
-    listening = (found.laddr for found in replica.net_connections("tcp") if found.status == psutil.CONN_LISTEN)
-    (port,) = {address.port for address in listening if address.port in REPLICA_PORTS}
-    return f"http://127.0.0.1:{port}"
-
-
-def _haproxy() -> list[psutil.Process]:
-    return [psutil.Process(pid) for pid in haproxy_processes()]
-
-
-def _resident(processes: list[psutil.Process]) -> int:
-    return sum(process.memory_info().rss for process in processes)
+@contextmanager
+def _published() -> Iterator[Registry]:
+    with tempfile.TemporaryDirectory() as scratch:
+        registry: Registry = publish(Path(scratch) / "home", versions=1)
+        yield registry
+        registry.close()
 
 
 @contextmanager
 def _served(replicas: int) -> Iterator[RayServer]:
-    with tempfile.TemporaryDirectory() as scratch:
-        registry: Registry = publish(Path(scratch) / "home", versions=1)
-        with running(registry.storage, replicas=replicas) as url:
-            yield RayServer(url, "", registry, DEPLOY_YAML)
-        registry.close()
+    with _published() as registry, running(registry.storage, replicas=replicas, timeout=STARTED) as url:
+        yield RayServer(url, "", registry, DEPLOY_YAML)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""One replica in a process of its own, without Ray, whose clock may be wrong.
+"""One replica in a process of its own, without Ray but with its event loop and protocols, whose clock may be wrong.
 
 `python -m benchmarks.attacks.replica NAME HOME DATABASE_URL ARTIFACTS [--hours 1]` prints its port as soon as it is
 ready. Its log is the standard error.
@@ -22,7 +22,9 @@ def main() -> None:
     parser.add_argument("artifacts", type=Path)
     parser.add_argument("--hours", type=float, default=0.0, help="how far the clock is ahead")
     options = parser.parse_args()
-    asyncio.run(_serve(options))
+    import uvloop
+
+    uvloop.run(_serve(options))
 
 
 def _set_clock(hours: float) -> None:
@@ -47,12 +49,17 @@ async def _serve(options: argparse.Namespace) -> None:
     from league.registry.registry import Registry
     from league.settings import Storage
     from serve_app.app import Replica
+    from serve_app.runtime import uvicorn_http, uvicorn_websocket
     from serve_app.settings import ServeSettings
 
     if options.hours:
         _set_clock(options.hours)
     registry = Registry.open(Storage(options.home, options.database_url, options.artifacts), create=False)
-    application = Replica(registry, ServeSettings(), options.name).application()
+    settings = ServeSettings()
+    replica = Replica(registry, settings, options.name)
+    application = replica.application()
+    uvicorn_http.install(replica.events.end)
+    uvicorn_websocket.install(settings.max_body, settings.max_incomplete)
     server = uvicorn.Server(uvicorn.Config(application, host="127.0.0.1", port=0, log_level="error"))
     serving = asyncio.create_task(server.serve())
     while not server.started:

@@ -49,8 +49,8 @@ def is_draining() -> bool:
     """Whether Ray Serve stops the replica in this process, and HAProxy sends it no new requests."""
     from ray._private.worker import global_worker
 
-    (actor,) = global_worker.actors.values()
-    return bool(actor._replica_impl._shutting_down)
+    replicas = (getattr(actor, "_replica_impl", None) for actor in global_worker.actors.values())
+    return any(getattr(replica, "_shutting_down", False) for replica in replicas)
 
 
 def request_counter() -> Callable[[str, int], None]:

@@ -13,12 +13,14 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from time import monotonic, sleep
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import psutil
 import pytest
 import uvicorn
+from ray._private.worker import global_worker
 from ray.serve._private import common, grpc_util, http_util, replica
 from ray.serve._private.common import RequestProtocol
 from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
@@ -471,3 +473,15 @@ def test_statistics_of_a_replica_replace_those_of_serve() -> None:
     counter = re.search(r'"serve_deployment_request_counter".*?tag_keys=(\(.*?\))', inspect.getsource(replica), re.S)
     assert counter is not None
     assert ast.literal_eval(counter[1]) == ("route",)
+
+
+def test_a_replica_knows_that_it_is_being_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray keeps the actor of a process, and Serve's actor notes in its replica that a stop has begun."""
+    assert "self._replica_impl" in inspect.getsource(replica.ReplicaActor), "see ray_serve.is_draining"
+    stopping = inspect.getsource(replica.Replica._perform_graceful_shutdown)
+    assert stopping.index("self._shutting_down = True") < stopping.index("_drain_behind_haproxy")
+    actor = SimpleNamespace(_replica_impl=SimpleNamespace(_shutting_down=False))
+    monkeypatch.setitem(global_worker.actors, "actor", actor)
+    assert not ray_serve.is_draining()
+    actor._replica_impl._shutting_down = True
+    assert ray_serve.is_draining()
