@@ -99,7 +99,7 @@ def shared_encoder(scale: float) -> bool:
     """Five seeds with a shared encoder, five with separate networks."""
     settings = {"shared": {"shared_encoder": True}, "separate": {"shared_encoder": False}}
     jobs = [LearningJob("shared_encoder", own | {"seed": s}, 90 * scale) for own in settings.values() for s in SEEDS]
-    learned = two_at_once(work, jobs)
+    learned = list(two_at_once(work, jobs))
     means = {}
     for label, part in zip(settings, (learned[:5], learned[5:]), strict=True):
         means[label] = np.array([each.greedy.mean() for each in part])
@@ -123,7 +123,7 @@ def simple_spread(scale: float) -> bool:
         for ablated in (False, True)
         for seed in SEEDS
     ]
-    learned = two_at_once(work, jobs)
+    learned = list(two_at_once(work, jobs))
     met = True
     print(
         f"{'truncation':>12} {'seed':>5} {'actions':>11} {'seconds':>8} {'return':>8} {'random':>8} {'better by':>10}"

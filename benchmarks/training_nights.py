@@ -78,7 +78,7 @@ def measure(config: Path, home: Path, count: int) -> bool:
 
 def run_night(config: Path, home: Path) -> dict[str, Any]:
     """Run `league nightly --train`. Raises CalledProcessError if it reports a fault."""
-    command = [sys.executable, "-m", "cli.main", "nightly", str(config), "--train", "--json"]
+    command = [sys.executable, "-c", "from cli.main import run; run()", "nightly", str(config), "--train", "--json"]
     environment = os.environ | {"LEAGUE_HOME": str(home)}
     document = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
     night: dict[str, Any] = json.loads(document)["nights"][0]

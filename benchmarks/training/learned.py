@@ -132,11 +132,11 @@ def _parameters(algorithm: Algorithm) -> int:
     return sum(unique.values())
 
 
-def two_at_once(work: Callable[[Work], Result], jobs: Sequence[Work]) -> list[Result]:
-    """Run each job in a subprocess, two at a time; returns the results in the order of the jobs."""
+def two_at_once(work: Callable[[Work], Result], jobs: Sequence[Work]) -> Iterator[Result]:
+    """Run each job in a subprocess, two at a time; yields the results in the order of the jobs."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
-        return list(pool.map(work, jobs))
+        yield from pool.map(work, jobs)
 
 
 def one_thread() -> None:
