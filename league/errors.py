@@ -213,7 +213,7 @@ class ParityError(LeagueError, code="parity_failed"):
 
 
 class NotReady(LeagueError, code="not_ready"):
-    """A policy exists but is not served yet."""
+    """A policy exists but is not served yet, or what serves and trains did not start."""
 
 
 class NoEvaluationService(NotReady, code="no_evaluation_service"):

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from league.errors import ConfigError, one_line
+from league.errors import ConfigError, NotReady, one_line
 from league.settings import Storage
 from league.stack import difference, installed_with_this
 
@@ -80,22 +80,26 @@ def _cpu_quota() -> float:
 def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
     """Start a local Ray and return the address of its dashboard, if it has one.
 
-    options: further arguments of `ray.init`. Raises ConfigError if the dashboard is not installed.
+    options: further arguments of `ray.init`. Raises ConfigError if the dashboard is not installed, and NotReady if Ray
+    does not start.
     """
     import ray
 
     if local.dashboard:
         _check_dashboard()
     os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # inherited by all processes of Ray
-    context = ray.init(
-        address="local",
-        num_cpus=local.cpus,
-        object_store_memory=None if local.object_store is None else local.object_store * 10**6,
-        include_dashboard=local.dashboard,
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-        **options,
-    )
+    try:
+        context = ray.init(
+            address="local",
+            num_cpus=local.cpus,
+            object_store_memory=None if local.object_store is None else local.object_store * 10**6,
+            include_dashboard=local.dashboard,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+            **options,
+        )
+    except Exception as error:  # what Ray raises when its processes take too long to start
+        raise NotReady(f"Ray did not start: {one_line(error)}") from error
     return context.dashboard_url
 
 

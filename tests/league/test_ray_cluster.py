@@ -8,8 +8,8 @@ import pytest
 import ray
 
 from league import ray_cluster
-from league.errors import ConfigError
-from league.ray_cluster import LocalRay, connected, join
+from league.errors import ConfigError, NotReady
+from league.ray_cluster import LocalRay, connected, join, start_local
 from league.settings import Storage
 
 DEADLINE = 120
@@ -90,6 +90,15 @@ def test_an_object_store_that_is_too_small_is_rejected(tmp_path: Path) -> None:
 def test_an_unreachable_cluster_is_reported_at_once() -> None:
     with pytest.raises(ConfigError, match=r"no Ray cluster at '127\.0\.0\.1:1'"):
         join("127.0.0.1:1")
+
+
+def test_a_ray_that_does_not_start_is_reported_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**_: object) -> None:
+        raise Exception("The current node timed out\nduring startup.")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(NotReady, match=r"^Ray did not start: The current node timed out during startup\.$"):
+        start_local(LocalRay(cpus=1))
 
 
 def test_only_one_module_initializes_ray() -> None:
