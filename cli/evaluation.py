@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import CORES, AsJson, EvaluationCluster, LeagueName, Workers, open_registry
+from cli.options import AsJson, ClusterWorkers, EvaluationCluster, LeagueName, open_registry, workers_for
 from cli.output import GameProgress, complain, difference, emit, say, show_leaderboard, table
 from league.refs import check_slug
 from league.settings import Storage
@@ -66,7 +66,7 @@ def evaluate(
     minutes: Minutes = None,
     precision: Precision = None,
     seed: Seed = 0,
-    workers: Workers = CORES,
+    workers: ClusterWorkers = None,
     address: EvaluationCluster = None,
     as_json: AsJson = False,
 ) -> None:
@@ -90,7 +90,7 @@ def evaluate(
             against=against or (),
             blocks=blocks,
             budget=Budget(games, minutes, precision),
-            workers=workers,
+            workers=workers_for(workers, address),
             seed=seed,
             listener=listener,
         )

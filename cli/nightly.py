@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.options import CORES, AsJson, EvaluationCluster, Workers, open_registry
+from cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
 from cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
 from cli.training import exit_on_interrupt
 from configs import find, names
@@ -43,7 +43,7 @@ def nightly(
             "--train", help="First train from the champion; afterwards train and measure an exploiter of the new one."
         ),
     ] = False,
-    workers: Workers = CORES,
+    workers: ClusterWorkers = None,
     webhook: Annotated[
         str | None,
         typer.Option(envvar="LEAGUE_WEBHOOK", help="URL to which a summary and the reports are posted as JSON."),
@@ -68,16 +68,16 @@ def nightly(
     from evaluation.reporting.webhook import deliver
     from league.ray_cluster import ray_session
 
-    configs = _configs(leagues or ())
+    configs, at_once = _configs(leagues or ()), workers_for(workers, address)
     reports, nights, faults, invalid, busy = [], [], list[str](), list[str](), False
     for config in configs:
         try:
             with ray_session(address):
                 if train:
-                    night, report = run_training_night(config, workers, quiet=as_json)
+                    night, report = run_training_night(config, at_once, quiet=as_json)
                     nights.append(night)
                 else:
-                    report = run_nightly(config, workers, quiet=as_json)
+                    report = run_nightly(config, at_once, quiet=as_json)
         except LeagueError as error:
             # The remaining leagues are still processed.
             sentence = f"{config.league}: {one_line(error)}"
@@ -106,7 +106,7 @@ def nightly(
         sys.exit(FAULTS if faults else INVALID if invalid else BUSY)
 
 
-def run_nightly(config: "LeagueConfig", workers: int = CORES, quiet: bool = False) -> "NightlyReport":
+def run_nightly(config: "LeagueConfig", workers: int | None = CORES, quiet: bool = False) -> "NightlyReport":
     """Run one league's nightly run, print the results, and write the league's report to LEAGUE_HOME/reports."""
     from evaluation.gating.nightly import nightly as run
     from league.ray_cluster import connected
@@ -151,7 +151,7 @@ def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig",
 
 
 def run_training_night(
-    config: "LeagueConfig", workers: int = CORES, quiet: bool = False
+    config: "LeagueConfig", workers: int | None = CORES, quiet: bool = False
 ) -> "tuple[TrainingNightRow, NightlyReport | None]":
     """Run one league's night of training, print the results, and write the league's report.
 

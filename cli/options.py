@@ -29,10 +29,23 @@ Timeout = Annotated[float, typer.Option(min=0, help="Maximum time for --wait, in
 Workers = Annotated[
     int, typer.Option(min=0, help="Number of Ray tasks that play games in parallel; 0 plays in this process.")
 ]
+ClusterWorkers = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        help="Number of Ray tasks that play games in parallel; 0 plays in this process. Default: one per CPU, with "
+        "--address of the cluster, also of nodes that join.",
+    ),
+]
 EvaluationCluster = Annotated[
     str | None,
     typer.Option(metavar="HOST:PORT", help="Ray cluster to play on; `auto` selects the one running on this machine."),
 ]
+
+
+def workers_for(workers: int | None, address: str | None) -> int | None:
+    """Return the number of workers: by default the CPUs of this machine, or on a cluster None, all that it has."""
+    return CORES if workers is None and address is None else workers
 
 
 def open_registry() -> "Registry":

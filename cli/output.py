@@ -206,10 +206,11 @@ class GameProgress:
 
 
 def _note(event: "Games") -> str:
-    """`25,000 moves/s  LLR +1.20`"""
+    """`2 nodes, 8 CPUs  25,000 moves/s  LLR +1.20`"""
+    places = None if event.nodes is None else f"{counted(event.nodes, 'node')}, {counted(event.cpus or 0, 'CPU')}"
     speed = None if event.moves_per_second is None else f"{event.moves_per_second:,.0f} moves/s"
     llr = None if event.llr is None else f"LLR {event.llr:+.2f}"
-    return "  ".join(filter(None, (speed, llr)))
+    return "  ".join(filter(None, (places, speed, llr)))
 
 
 def show_leaderboard(leaderboard: "tuple[Standing, ...]") -> None:

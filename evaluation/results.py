@@ -334,6 +334,7 @@ class Progress(Document):
     played, of: matches (blocks) so far and at most.
     moves_per_second: actions of all games since the start of the schedule in this process; None before the first match.
     llr, bounds: state of the sequential test, for verdicts.
+    nodes, cpus: of the Ray cluster that play now; None if this process plays, and before the first match.
     """
 
     what: str
@@ -342,6 +343,8 @@ class Progress(Document):
     moves_per_second: float | None = None
     llr: float | None = None
     bounds: tuple[float, float] | None = None
+    nodes: int | None = None
+    cpus: int | None = None
 
 
 Listener = Callable[[Progress | VerdictReport], None]

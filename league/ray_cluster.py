@@ -7,7 +7,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -25,6 +25,9 @@ NODE_TIMEOUT = 60.0
 """Seconds for a node to start a process and answer."""
 CONNECT_TIMEOUT = 10.0
 """Seconds for a TCP connection to a cluster. Ray itself would retry for minutes."""
+DRAINING = "DRAINING"
+NO_AUTOSCALER = (None, "0")
+"""Versions of the state of an autoscaler that does not run."""
 SAME_VERSIONS = "install the same versions on all machines (constraints.txt)"
 MIN_OBJECT_STORE = 80
 """MB. Ray refuses less than 75 MiB."""
@@ -165,8 +168,7 @@ def connected(address: str | None, storage: Storage, local: LocalRay = UNLIMITED
         url = None
         if not is_connected:
             url = start_local(local) if address is None else join(address)
-        storage.check_reach(node_addresses())
-        check_stacks()
+        check_nodes(storage)
         yield f"http://{url}" if url else None
 
 
@@ -180,6 +182,42 @@ def alive_nodes() -> list[dict[str, Any]]:
     import ray
 
     return [node for node in ray.nodes() if node["Alive"]]
+
+
+def draining_nodes() -> set[str]:
+    """Return Ray's ids of the nodes that are about to leave: they finish what they do, and Ray starts nothing on them.
+
+    Nodes are drained by Ray's autoscaler, by `ray drain-node`, and by the SIGTERM that a preempted pod receives.
+    """
+    return {node.node_id for node in _cluster_status().active_nodes if node.node_status == DRAINING}
+
+
+def has_autoscaler() -> bool:
+    """Return whether Ray's autoscaler (version 2) adds nodes for what is requested."""
+    return _cluster_status().stats.autoscaler_version not in NO_AUTOSCALER
+
+
+def _cluster_status() -> Any:
+    import ray
+    from ray.autoscaler.v2.sdk import get_cluster_status
+
+    return get_cluster_status(ray.get_runtime_context().gcs_address)
+
+
+def usable_nodes() -> list[dict[str, Any]]:
+    """Return Ray's descriptions of the nodes on which it starts processes: alive, and not drained."""
+    draining = draining_nodes()
+    return [node for node in alive_nodes() if node["NodeID"] not in draining]
+
+
+def cluster_cpus() -> int:
+    """Return the number of CPUs of the nodes on which Ray starts processes."""
+    return int(sum(node.get("CPU", 0.0) for node in node_resources()))
+
+
+def node_cpus(nodes: Collection[str]) -> dict[str, float]:
+    """Return the CPUs of those of the nodes that are alive. nodes: Ray's ids."""
+    return {node["NodeID"]: node["Resources"].get("CPU", 0.0) for node in alive_nodes() if node["NodeID"] in nodes}
 
 
 def node_ids() -> set[str]:
@@ -196,8 +234,14 @@ def lost_nodes(before: set[str], seconds: float) -> set[str]:
 
 
 def node_resources() -> list[dict[str, float]]:
-    """Return the resources of each node that is alive, whether used or not: `CPU`, `GPU` and others."""
-    return [node["Resources"] for node in alive_nodes()]
+    """Return the resources of each node on which Ray starts processes, whether used or not: `CPU`, `GPU` and others."""
+    return [node["Resources"] for node in usable_nodes()]
+
+
+def check_nodes(storage: Storage) -> None:
+    """Raise ConfigError if the nodes do not share `storage`, or have other versions of this program or of packages."""
+    storage.check_reach(node_addresses())
+    check_stacks()
 
 
 def check_stacks() -> None:
@@ -207,7 +251,7 @@ def check_stacks() -> None:
 
     here, others = ray.get_runtime_context().get_node_id(), []
     read = ray.remote(num_cpus=0, max_retries=0)(installed_with_this)
-    for node in alive_nodes():
+    for node in usable_nodes():
         if node["NodeID"] != here:
             there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
             others.append(
@@ -216,8 +260,10 @@ def check_stacks() -> None:
     for node_id, address, ref in others:
         try:
             found = ray.get(ref, timeout=NODE_TIMEOUT)
+        except ray.exceptions.TaskUnschedulableError:  # it is drained, or has left
+            continue
         except ray.exceptions.RayError as error:
-            if node_id not in node_ids():  # it has left meanwhile
+            if node_id not in node_ids():
                 continue
             raise ConfigError(f"node {address} does not run this program: {one_line(error)}") from error
         check_stack(found, address)

@@ -109,16 +109,30 @@ OBJECTS = [
     for file in ("kuberay.yaml", "nightly/cronjob.yaml", "nightly/training-cronjob.yaml")
     for document in yaml.safe_load_all((ROOT / "deploy" / file).read_text())
 ]
+ELASTIC = yaml.safe_load((ROOT / "deploy/kuberay-training.yaml").read_text())
+ELASTIC_HEAD = ELASTIC["spec"]["headGroupSpec"]["template"]["spec"]
+(ELASTIC_WORKERS,) = ELASTIC["spec"]["workerGroupSpecs"]
+ELASTIC_PODS = [ELASTIC_HEAD, ELASTIC_WORKERS["template"]["spec"]]
+
+
+def schema_of(kind: str) -> Any:
+    """A RayCluster has the fields of the cluster of a RayService."""
+    kinds = KUBERNETES["kinds"]
+    if kind != "RayCluster":
+        return kinds[kind]
+    service = kinds["RayService"]
+    cluster = service["properties"]["spec"]["properties"]["rayClusterConfig"]
+    return service | {"properties": service["properties"] | {"spec": cluster}}
 
 
 def faults(document: Any) -> list[str]:
     """Where a Kubernetes object differs from the schema of its kind. Unknown fields are faults."""
-    schema = KUBERNETES["kinds"][document["kind"]] | {"$defs": KUBERNETES["$defs"]}
+    schema = schema_of(document["kind"]) | {"$defs": KUBERNETES["$defs"]}
     found = jsonschema.Draft202012Validator(schema).iter_errors(document)
     return [f"{error.json_path}: {error.message}" for error in found]
 
 
-@pytest.mark.parametrize("document", OBJECTS, ids=lambda each: f"{each['kind']} {each['metadata']['name']}")
+@pytest.mark.parametrize("document", [*OBJECTS, ELASTIC], ids=lambda each: f"{each['kind']} {each['metadata']['name']}")
 def test_kubernetes_accepts_the_objects(document: Any) -> None:
     assert faults(document) == []
 
@@ -135,10 +149,13 @@ POD_SPECS = [
     HEAD["spec"],
     WORKERS["template"]["spec"],
     *(o["spec"]["jobTemplate"]["spec"]["template"]["spec"] for o in OBJECTS[2:]),
+    *ELASTIC_PODS,
 ]
 
 
-@pytest.mark.parametrize("spec", POD_SPECS, ids=["head", "workers", "nightly", "training night"])
+@pytest.mark.parametrize(
+    "spec", POD_SPECS, ids=["head", "workers", "nightly", "training night", "elastic head", "elastic workers"]
+)
 def test_pods_run_as_the_user_of_the_image(spec: Any) -> None:
     (uid, gid) = re.findall(r"^USER (\d+):(\d+)$", (ROOT / "Dockerfile").read_text(), flags=re.M)[0]
     context = spec["securityContext"]
@@ -182,8 +199,31 @@ def test_draining_evicts_one_pod_at_a_time_after_its_requests() -> None:
     assert BUDGET["spec"]["maxUnavailable"] < WORKERS["replicas"] == WORKERS["minReplicas"]
     deployment = SERVED["applications"][0]["deployments"][0]
     spec = WORKERS["template"]["spec"]
-    assert spec["terminationGracePeriodSeconds"] > deployment["graceful_shutdown_timeout_s"]
+    drain = float(exports()["RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S"])
+    assert spec["terminationGracePeriodSeconds"] > drain > deployment["graceful_shutdown_timeout_s"]
     assert spec["containers"][0]["readinessProbe"]["httpGet"]["path"] == "/v1/health/ready"
+
+
+def test_the_autoscaler_adds_and_removes_nodes_for_training() -> None:
+    """`league` recognises version 2 of the autoscaler only."""
+    spec = ELASTIC["spec"]
+    assert spec["enableInTreeAutoscaling"]
+    assert spec["autoscalerOptions"]["version"] == "v2"
+    assert spec["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
+    assert ELASTIC_WORKERS["minReplicas"] == 0 < ELASTIC_WORKERS["maxReplicas"]
+    assert f"ray=={spec['rayVersion']}\n" in (ROOT / "constraints.txt").read_text()
+
+
+@pytest.mark.parametrize("pod", ELASTIC_PODS, ids=["head", "workers"])
+def test_the_nodes_for_training_share_storage_and_finish_when_they_are_preempted(pod: Any) -> None:
+    (container,) = pod["containers"]
+    assert container["image"] == f"policy-league-trainer:{PROJECT['version']}"
+    storage_of(container).check_reach({"10.0.0.1", "10.0.0.2"})
+    assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
+    assert not any(mount.get("readOnly") for mount in container["volumeMounts"])
+    environment = {entry["name"]: entry.get("value") for entry in container["env"]}
+    grace = ELASTIC_WORKERS["template"]["spec"]["terminationGracePeriodSeconds"]
+    assert float(str(environment["RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S"])) < grace
 
 
 def queries() -> list[tuple[str, str]]:

@@ -204,14 +204,14 @@ def _drive(scratch: Path, address: str) -> None:
     log = str(scratch / "starts")
 
     @ray.remote(num_cpus=1, max_retries=tournament.RETRIES)
-    def record_and_play(job: tuple[Schedule, Storage, str], chunk: range) -> list[Match]:
+    def record_and_play(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> tuple[str, list[Match]]:
         # One short line, appended in a single write: complete or absent.
         descriptor = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         os.write(descriptor, f"{chunk.start} {os.getpid()}\n".encode())
         os.close(descriptor)
         time.sleep(HOLD)
-        schedule, storage, config = job
-        return match_worker(storage, config).play(schedule, chunk)
+        schedule, storage, config, _ = job
+        return ray.get_runtime_context().get_node_id(), match_worker(storage, config).play(schedule, chunk)
 
     tournament._play_chunk = record_and_play  # type: ignore[assignment]
     tournament.play_schedule(schedule, registry=registry, workers=NODES, enough=lambda _: _stop(scratch).exists())

@@ -65,7 +65,7 @@ def nightly(
     *,
     registry: Registry,
     train: Trainer | None = None,
-    workers: int = 0,
+    workers: int | None = 0,
     listener: Listener | None = None,
 ) -> NightlyReport:
     """Gate all versions without a verdict, oldest first, each against the current champion.
@@ -77,7 +77,7 @@ def nightly(
         config: Configuration of the league.
         registry: Registry of the league.
         train: Trains the exploiters that `gate.exploiters` requires. Without it, verdicts that need them stay open.
-        workers: Parallel Ray tasks; 0 plays in this process.
+        workers: Parallel Ray tasks, as in `play_schedule`.
         listener: Receives progress and verdicts.
 
     Raises:
@@ -114,7 +114,12 @@ def nightly(
 
 class _NightlyRun:
     def __init__(
-        self, registry: Registry, league: LeagueRow, train: Trainer | None, workers: int, listener: Listener | None
+        self,
+        registry: Registry,
+        league: LeagueRow,
+        train: Trainer | None,
+        workers: int | None,
+        listener: Listener | None,
     ) -> None:
         self._registry, self._league, self._train = registry, league, train
         self._workers, self._listener = workers, listener

@@ -30,7 +30,7 @@ class _Night:
     registry: Registry
     row: TrainingNightRow
     train: Trainer
-    workers: int
+    workers: int | None
     listener: Listener | None
     gate_report: NightlyReport | None = field(default=None)
 
@@ -52,7 +52,7 @@ def training_night(
     *,
     registry: Registry,
     train: Trainer,
-    workers: int = 0,
+    workers: int | None = 0,
     listener: Listener | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> tuple[TrainingNightRow, NightlyReport | None]:
@@ -64,7 +64,7 @@ def training_night(
         config: Configuration of the league.
         registry: Registry of the league.
         train: Trains a run.
-        workers: Parallel Ray tasks; 0 plays in this process.
+        workers: Parallel Ray tasks, as in `play_schedule`.
         listener: Receives progress and verdicts.
         announce: Receives a sentence at the beginning of each step.
 

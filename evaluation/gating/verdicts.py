@@ -122,7 +122,7 @@ def conclude(
     verdict: VerdictRow,
     *,
     train: Trainer | None = None,
-    workers: int = 0,
+    workers: int | None = 0,
     listener: Listener | None = None,
 ) -> VerdictReport:
     """Play an open verdict to its end, move the champion if it was beaten, and close the verdict.
@@ -133,7 +133,7 @@ def conclude(
         registry: The registry of the verdict.
         verdict: The verdict.
         train: Trains the exploiters that `gate.exploiters` requires. Without it, a verdict that needs them stays open.
-        workers: Parallel Ray tasks; 0 plays in this process.
+        workers: Parallel Ray tasks, as in `play_schedule`.
         listener: Receives progress.
 
     Raises:
@@ -196,7 +196,7 @@ def _play(
     verdict: VerdictRow,
     schedule: Schedule,
     watch: SequentialMonitor,
-    workers: int,
+    workers: int | None,
     listener: Listener | None,
 ) -> None:
     """Play one of its tests until it is decided or the verdict is closed by another process."""
@@ -259,7 +259,7 @@ def _close(registry: Registry, verdict: VerdictRow, outcome: str, seen: GateResu
 
 
 def confirm(
-    registry: Registry, verdict: VerdictRow, *, workers: int = 0, listener: Listener | None = None
+    registry: Registry, verdict: VerdictRow, *, workers: int | None = 0, listener: Listener | None = None
 ) -> Confirmation | None:
     """Play the confirmation match of a promotion to its end and return the measured improvement.
 

@@ -12,11 +12,12 @@ ledger and do not count (evaluation/gating/gate.py), so chunks influence no deci
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice, pairwise
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Generic, TypeVar, get_args
 
 import ray
@@ -41,7 +42,17 @@ from evaluation.statistics.payoff import cross_play_table, tabulate
 from evaluation.statistics.population import population
 from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
 from league.policies.loading import baselines, check_anchors, check_eligible, check_plays, eligible, pinned
-from league.ray_cluster import check_stack, check_stacks, ensure_local, node_addresses, node_ids, ray_session
+from league.ray_cluster import (
+    check_stack,
+    check_stacks,
+    cluster_cpus,
+    ensure_local,
+    node_addresses,
+    node_cpus,
+    node_ids,
+    ray_session,
+    usable_cpus,
+)
 from league.refs import CHAMPION, ScriptRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow
@@ -87,6 +98,8 @@ RETRIES = 5
 """How often a chunk is retried after its worker died."""
 NODE_CHECK = 5.0
 """Seconds without a result after which lost nodes are looked for."""
+NODE_COUNT = 1.0
+"""Seconds between two counts of the cluster's CPUs."""
 
 StopCondition = Callable[[Sequence[Match]], bool]
 """All matches of a schedule so far, in order → whether to stop."""
@@ -96,7 +109,7 @@ def play_schedule(
     schedule: Schedule,
     *,
     registry: Registry,
-    workers: int = 0,
+    workers: int | None = 0,
     enough: StopCondition | None = None,
     until: int | None = None,
     listener: Listener | None = None,
@@ -106,8 +119,8 @@ def play_schedule(
     Args:
         schedule: The schedule; stored in the ledger if it is new.
         registry: Registry of the league.
-        workers: Parallel Ray tasks; 0 plays in this process. A local Ray is started if none is connected, and left
-            running: `ray_session` owns it.
+        workers: Parallel Ray tasks; 0 plays in this process. None: one for each CPU of the cluster, also of nodes that
+            join. A local Ray is started if none is connected, and left running: `ray_session` owns it.
         enough: Ends the schedule early; called before the first chunk and after each.
         until: Maximum number of matches. The ledger may contain more, which are returned as well.
         listener: Receives progress.
@@ -124,10 +137,11 @@ def play_schedule(
     end = schedule.length if until is None else min(until, schedule.length)
     chunks = chunks_of(end, len(matches), num_envs(config))
     document = config.model_dump_json(by_alias=True)
+    places = _Places(workers)
     played = (
-        _in_ray(schedule, chunks, registry.storage, document, workers)
-        if workers and chunks
-        else _here(schedule, chunks, registry.storage, document)
+        _here(schedule, chunks, registry.storage, document)
+        if workers == 0 or not chunks
+        else _in_ray(schedule, chunks, registry.storage, document, places)
     )
     began, moves = perf_counter(), 0
     with closing(played):
@@ -135,7 +149,8 @@ def play_schedule(
             ended = enough is not None and enough(matches)
             if listener:
                 speed = moves / (perf_counter() - began) if moves else None
-                listener(Progress(_describe(schedule), len(matches), schedule.length, speed))
+                progress = Progress(_describe(schedule), len(matches), schedule.length, speed)
+                listener(replace(progress, nodes=places.nodes, cpus=places.cpus))
             chunk = None if ended else next(played, None)
             if chunk is None:
                 return matches
@@ -153,7 +168,7 @@ def evaluate(
     against: Sequence[str] = (),
     blocks: int | None = None,
     budget: Budget = UNLIMITED,
-    workers: int = 0,
+    workers: int | None = 0,
     seed: int = 0,
     listener: Listener | None = None,
 ) -> EvaluationReport:
@@ -169,7 +184,7 @@ def evaluate(
         against: Opponents in a gauntlet; by default the champion and the baselines.
         blocks: Matches per pair; by default 32, or as many as the budget allows.
         budget: Limits of games, minutes or precision.
-        workers: Parallel Ray tasks; 0 plays in this process.
+        workers: Parallel Ray tasks, as in `play_schedule`.
         seed: Selects other games. Repeating a call with equal arguments finds its matches in the ledger.
         listener: Receives progress.
 
@@ -222,7 +237,7 @@ def fixed_baselines(registry: Registry, row: LeagueRow) -> list[str]:
 
 
 def _play_plan(
-    plan: TournamentPlan, budget: Budget, registry: Registry, workers: int, listener: Listener | None
+    plan: TournamentPlan, budget: Budget, registry: Registry, workers: int | None, listener: Listener | None
 ) -> tuple[list[Match], StoppedBy]:
     """Play the schedules of a plan until its end or the limit of the budget."""
     limit, matches = StoppingRule(budget, plan), list[Match]()
@@ -300,32 +315,74 @@ def _here(schedule: Schedule, chunks: Sequence[range], storage: Storage, config:
         yield match_worker(storage, config).play(schedule, chunk)
 
 
+class _Places:
+    """The nodes and CPUs of a cluster on which chunks are played.
+
+    workers: the number of chunks that are played at once; None for one on each CPU, which are counted from time to
+    time, as nodes come and go.
+    """
+
+    def __init__(self, workers: int | None) -> None:
+        self.fixed = workers
+        self.at_once = workers or 0
+        self.nodes: int | None = None
+        self.cpus: int | None = None
+        self._latest: deque[str] = deque()
+        self._next_count = 0.0
+
+    def count(self, storage: Storage) -> None:
+        """Update the number of chunks that are played at once.
+
+        Raises ConfigError if a node has joined that does not share `storage`.
+        """
+        if monotonic() >= self._next_count:
+            self._next_count = monotonic() + NODE_COUNT
+            storage.check_reach(node_addresses())
+            if self.fixed is None:
+                self.at_once = max(1, cluster_cpus())
+
+    def played(self, node: str) -> None:
+        """Note where a chunk was played. As many of the latest ones as are played at once say what is in use."""
+        self._latest.append(node)
+        cpus = node_cpus(set(self._latest))
+        alive = [each for each in self._latest if each in cpus]
+        self._latest = deque(alive, maxlen=self.at_once)
+        if alive:
+            used = set(self._latest)
+            self.nodes, self.cpus = len(used), min(self.at_once, int(sum(cpus[each] for each in used)))
+
+
 def _in_ray(
-    schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str, workers: int
+    schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str, places: _Places
 ) -> Generator[list[Match]]:
     """The chunks in order. A chunk starts when an earlier one has been taken.
 
     Raises ConfigError if the nodes of the cluster do not share `storage`.
     """
-    ensure_local(workers)
-    storage.check_reach(node_addresses())
+    ensure_local(places.at_once or usable_cpus())
+    places.count(storage)
     check_stacks()
     job = ray.put((schedule, storage, config, installed_with_this()))
     waiting = enumerate(chunks)
     flying: dict[ray.ObjectRef, int] = {}
     done: ReorderBuffer[list[Match]] = ReorderBuffer()
-    nodes = node_ids()
+    nodes, latest = node_ids(), monotonic()
     while done.due < len(chunks):
-        room = workers - len(flying) - len(done)
+        places.count(storage)
+        room = max(0, places.at_once - len(flying) - len(done))
         flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
         if (chunk := done.take()) is not None:
             yield chunk
             continue
-        finished, _ = ray.wait(list(flying), timeout=NODE_CHECK)
+        finished, _ = ray.wait(list(flying), timeout=NODE_COUNT)
         for ref in finished:
             index = flying.pop(ref)
-            done.put(index, _result(ref, schedule, chunks[index]))
-        if not finished:
+            node, matches = _result(ref, schedule, chunks[index])
+            done.put(index, matches)
+            places.played(node)
+            latest = monotonic()
+        if monotonic() - latest >= NODE_CHECK:
+            latest = monotonic()
             before, nodes = nodes, node_ids()
             if before - nodes:
                 # Ray repeats a task of a machine that vanished once its connection has been silent for minutes. The
@@ -334,15 +391,17 @@ def _in_ray(
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
-def _play_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
+def _play_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> tuple[str, list[Match]]:
+    """The id of the node that played, and the matches."""
     schedule, storage, config, stack = job
     check_stack(stack, "of the driver")  # this node may have joined the cluster later
-    return match_worker(storage, config).play(schedule, chunk, expendable=True)
+    matches = match_worker(storage, config).play(schedule, chunk, expendable=True)
+    return ray.get_runtime_context().get_node_id(), matches
 
 
-def _result(ref: ray.ObjectRef, schedule: Schedule, chunk: range) -> list[Match]:
+def _result(ref: ray.ObjectRef, schedule: Schedule, chunk: range) -> tuple[str, list[Match]]:
     try:
-        matches: list[Match] = ray.get(ref)
+        played: tuple[str, list[Match]] = ray.get(ref)
     except RayTaskError as error:
         # Ray wraps exceptions of tasks.
         if isinstance(error.cause, LeagueError):
@@ -354,4 +413,4 @@ def _result(ref: ray.ObjectRef, schedule: Schedule, chunk: range) -> list[Match]
             f"workers died {RETRIES + 1} times over matches {chunk.start} to {chunk.stop - 1} of {schedule.id}, of"
             f" {players}; see the logs of the workers: {one_line(error)}"
         ) from error
-    return matches
+    return played

@@ -72,7 +72,7 @@ def test_nightly_tests_promotes_and_rates_and_the_next_run_has_nothing_to_do(
 def test_a_verdict_is_verified_and_a_modified_one_fails(league: League, registry: Registry, config: str) -> None:
     verdict = league("nightly", config, "--workers", "0", "--json").json["leagues"][0]["verdicts"][0]["verdict"]
     result = league("verify", verdict, "--replays", "3")
-    assert (result.code, "3 games were replayed" in result.out) == (0, True)
+    assert (result.code, "3 games replayed" in result.out) == (0, True)
     with registry.database.write() as session:
         row = session.get_one(VerdictTable, verdict)
         row.evidence = {**row.evidence, "llr": 99.0}  # type: ignore[dict-item]

@@ -20,9 +20,11 @@ def test_outside_a_terminal_progress_is_printed_as_lines(printed: StringIO) -> N
     with output.GameProgress(quiet=False) as listener:
         listener(Progress("a against b", 0, 16))
         listener(Progress("a against b", 8, 16, moves_per_second=123456.7, llr=1.2))
+        listener(Progress("a against b", 16, 16, nodes=1, cpus=2))
     assert printed.getvalue().splitlines() == [
         "a against b: 0/16 matches",
         "a against b: 8/16 matches  123,457 moves/s  LLR +1.20",
+        "a against b: 16/16 matches  1 node, 2 CPUs",
     ]
 
 

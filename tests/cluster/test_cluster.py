@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 
 from league.stack import VERIFIED
-from tests.support.cluster import scenarios
+from tests.support.cluster import scenarios, serving_scenarios
 from tests.support.cluster.league_cluster import LeagueCluster
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
-BLOCKS = 400
+BLOCKS = 300
+"""Matches of each of two versions against a slow bot."""
+HTTP_BLOCKS = 4
 OUTAGE = 30.0
 """Seconds without a head, and without the database."""
 
@@ -25,14 +27,17 @@ def test_a_learner_runs_where_there_are_cpus(cluster: LeagueCluster, directory: 
     assert f"Published {scenarios.LEAGUE}@2" in output
 
 
-def test_training_continues_after_the_loss_of_a_worker(cluster: LeagueCluster, directory: Path) -> None:
-    scenarios.lose_worker_while_training(cluster, directory)
+def test_training_uses_the_nodes_that_there_are(cluster: LeagueCluster, directory: Path) -> None:
+    """A worker is lost, joins and is drained: the run continues each time, and no version is published twice."""
+    _, steps = scenarios.change_nodes_while_training(cluster, directory)
+    assert steps == sorted(set(steps))
 
 
-def test_a_tournament_is_the_same_after_the_loss_of_a_worker(cluster: LeagueCluster) -> None:
-    disturbed, undisturbed = scenarios.lose_worker_during_tournament(cluster, BLOCKS)
+def test_a_tournament_is_the_same_while_nodes_come_and_go(cluster: LeagueCluster) -> None:
+    """A worker is lost, joins and is drained: no match is lost or played twice."""
+    _, disturbed, undisturbed = scenarios.change_nodes_during_tournament(cluster, BLOCKS)
     assert disturbed == undisturbed
-    assert disturbed.count("\n") >= BLOCKS
+    assert disturbed.count("\n") == 2 * BLOCKS
 
 
 def test_a_node_with_another_version_is_refused(cluster: LeagueCluster, directory: Path) -> None:
@@ -43,26 +48,35 @@ def test_a_node_with_another_version_is_refused(cluster: LeagueCluster, director
 @pytest.fixture(scope="module")
 def key(cluster: LeagueCluster) -> Iterator[str]:
     cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "test")
-    with scenarios.serving(cluster) as token:
+    with serving_scenarios.serving(cluster) as token:
         yield token
 
 
+def test_evaluations_over_http_are_played(cluster: LeagueCluster, key: str) -> None:
+    """Through a node that need not have the evaluation service."""
+    ended = serving_scenarios.evaluate_over_http(cluster, key, HTTP_BLOCKS)
+    assert (ended["state"], ended["error"]) == ("done", None)
+    assert {f"{scenarios.LEAGUE}@1", f"{scenarios.LEAGUE}@2"} <= {
+        each["ref"] for each in ended["result"]["leaderboard"]
+    }
+
+
 def test_no_call_is_lost_with_a_worker(cluster: LeagueCluster, key: str) -> None:
-    calls, killed = scenarios.lose_worker_while_serving(cluster, key)
+    calls, killed = serving_scenarios.lose_worker_while_serving(cluster, key)
     assert calls.lost == []
-    assert len(calls.attempts_lost) <= scenarios.THREADS, "no more than those in flight"
+    assert len(calls.attempts_lost) <= serving_scenarios.THREADS, "no more than those in flight"
     assert calls.new_replicas(killed), "others are started elsewhere"
 
 
 def test_no_call_is_lost_with_the_database(cluster: LeagueCluster, key: str) -> None:
-    calls, _ = scenarios.cut_off_database(cluster, key, 2, OUTAGE)
+    calls, _ = serving_scenarios.cut_off_database(cluster, key, 2, OUTAGE)
     assert calls.lost == []
     assert calls.attempts_lost == []
     assert calls.versions() == ["1", "2"], "promoted meanwhile, followed afterwards"
 
 
 def test_no_call_is_lost_with_the_head(cluster: LeagueCluster, key: str) -> None:
-    calls, killed, _ = scenarios.lose_head(cluster, key, 1, OUTAGE)
+    calls, killed, _ = serving_scenarios.lose_head(cluster, key, 1, OUTAGE)
     assert calls.lost == []
     assert calls.attempts_lost == []
     assert calls.versions() == ["2", "1"], "promoted meanwhile"

@@ -131,6 +131,15 @@ def test_a_container_uses_no_more_cpus_than_its_limit(
     assert ray_cluster.usable_cpus() == expected
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_a_local_ray_has_neither_an_autoscaler_nor_nodes_that_leave() -> None:
+    """Tests have one node with two CPUs."""
+    assert (ray_cluster.has_autoscaler(), ray_cluster.draining_nodes()) == (False, set())
+    (node,) = ray_cluster.usable_nodes()
+    assert ray_cluster.cluster_cpus() == 2
+    assert ray_cluster.node_cpus({node["NodeID"], "left"}) == {node["NodeID"]: 2.0}
+
+
 def test_a_machine_with_another_version_is_refused() -> None:
     ours = ray_cluster.installed_with_this()
     ray_cluster.check_stack(ours, "10.0.0.2")

@@ -16,7 +16,7 @@ import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from league.files import files_in, move_durably
-from league.ray_cluster import alive_nodes
+from league.ray_cluster import alive_nodes, has_autoscaler
 
 CHUNK = 8 * 2**20
 """Bytes of a file that are sent at once. Ray's object store has at least 75 MiB."""
@@ -153,8 +153,8 @@ class DriverMachine:
 
 
 def driver_machine() -> DriverMachine | None:
-    """Return this machine, None if it is the only one of its cluster."""
-    if len(alive_nodes()) == 1:
+    """Return this machine, None if it is the only one of its cluster and stays so."""
+    if len(alive_nodes()) == 1 and not has_autoscaler():
         return None
     node = ray.get_runtime_context().get_node_id()
     here = NodeAffinitySchedulingStrategy(node, soft=False)

@@ -75,7 +75,8 @@ class RunReporter:
         self._newest: RunPoint | None = None
         self._reported: RunPoint | None = None
         self._end: tuple[RunState, str | None] | None = None
-        self._is_registered = self._is_over = False
+        self._attempt = self._registered_attempt = 0
+        self._is_over = False
         self._is_reachable = True
         self._lock = threading.Lock()
         self._has_news = threading.Event()
@@ -92,9 +93,13 @@ class RunReporter:
             self._is_over = True
 
     def begin(self, steps: int, seconds: float) -> None:
-        """Start reporting, after `steps` of this run and `seconds` of training."""
-        self._start_steps, self._seconds = steps, seconds
-        self._thread.start()
+        """Report an attempt that starts after `steps` of this run and `seconds` of training."""
+        with self._lock:
+            self._start_steps, self._seconds = steps, seconds
+            self._newest = self._reported = None
+            self._attempt += 1
+        if not self._thread.is_alive():
+            self._thread.start()
 
     def report(self, metrics: Mapping[str, Any]) -> None:
         """Report a trial's latest metrics. Reports that arrive faster than the registry accepts them are merged."""
@@ -126,8 +131,9 @@ class RunReporter:
 
     def _report_newest(self) -> None:
         league = self._run.record.config.league
-        if not self._is_registered:
+        if self._registered_attempt != (attempt := self._attempt):
             self._begin()
+            self._registered_attempt = attempt
         with self._lock:
             point, seconds = self._newest, self._seconds
         self._registry.runs.record(league, self._run.id, None if point is self._reported else point, seconds)
@@ -146,7 +152,6 @@ class RunReporter:
             exploits=self._run.record.exploits,
             steps=self._start_steps,
         )
-        self._is_registered = True
 
 
 def _ending(error: BaseException | None) -> tuple[RunState, str | None]:

@@ -3,7 +3,7 @@
 import shutil
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter
 from ray import tune
@@ -18,7 +18,7 @@ from league.environments.implementation import implementation
 from league.errors import ConfigError, InterfaceChanged, LeagueError, UnknownRun, one_line
 from league.interface import Interface
 from league.policies.loading import check_contestants, check_eligible
-from league.ray_cluster import UNLIMITED, LocalRay, connected, lost_nodes, node_ids
+from league.ray_cluster import UNLIMITED, LocalRay, check_nodes, cluster_cpus, connected, lost_nodes, node_ids
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, TRAINING, Role
@@ -29,6 +29,7 @@ from training.export.publish import git_commit
 from training.rllib_compat import NotPickled, silence_tune
 from training.runs.driver_files import driver_machine
 from training.runs.error_messages import is_process_lost, training_error
+from training.runs.node_watch import NodeWatch
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
 from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, against, pin_opponents
@@ -67,7 +68,8 @@ def train(
     Registers the league, runs one Ray Tune trial, shows its progress, records it in the registry, writes TensorBoard
     files to `<home>/runs/<league>/<run>`, and publishes a version at each checkpoint.
 
-    If a node of the cluster is lost, the run continues on the others from its newest version.
+    If a node of the cluster is lost, the run continues on the others from its newest version. If one is drained, or
+    nodes join that make it faster, its state is published and it continues from there.
 
     The first SIGINT or SIGTERM saves and publishes the current state, and raises Interrupted. A second one raises
     KeyboardInterrupt immediately. The run can be resumed in both cases.
@@ -238,6 +240,7 @@ def check_network(version: VersionRow, config: LeagueConfig) -> None:
 
 def _publish_remaining(run: RunDirectory, publisher: PublishQueue) -> None:
     """Publish the checkpoints of earlier attempts, then delete them."""
+    publisher.join()  # those that are in its queue are removed when they are published
     for checkpoint in run.checkpoints():
         publisher.add(checkpoint)
     publisher.join()
@@ -269,17 +272,19 @@ def _attempt(
     progress: TrainingProgress,
     reporter: RunReporter,
 ) -> bool:
-    """Train until the budget is spent or a stop is requested; returns which. Continues after the loss of a node."""
+    """Train until the budget is spent or a stop is requested; returns which. Continues when nodes come and go."""
     while True:
         nodes = node_ids()
         try:
-            return _tune(run, interface, registry, publisher, progress, reporter)
+            end = _tune(run, interface, registry, publisher, progress, reporter)
+            if end != "moved":
+                return end == "spent"
         except LeagueError as error:
             lost = lost_nodes(nodes, NODE_LOSS_TIMEOUT if is_process_lost(error) and len(nodes) > 1 else 0)
             if not lost:
                 raise
             progress.say(f"{len(lost)} of {len(nodes)} nodes were lost ({one_line(error)}). Training continues.")
-            _publish_remaining(run, publisher)
+        _publish_remaining(run, publisher)
 
 
 def _tune(
@@ -289,11 +294,14 @@ def _tune(
     publisher: PublishQueue,
     progress: TrainingProgress,
     reporter: RunReporter,
-) -> bool:
-    """Run one attempt as a Tune experiment of one trial. Returns whether the budget is spent."""
+) -> Literal["spent", "stopped", "moved"]:
+    """Run one attempt as a Tune experiment of one trial. Returns why it ended; `moved`: to continue on other nodes."""
     config, attempt = run.record.config, run.next_attempt()
     (attempt / CHECKPOINTS).mkdir(parents=True)
+    check_nodes(registry.storage)  # some may have joined meanwhile
     share = cpu_share(config.training.runners)
+    if (cpus := share * (1 + config.training.runners)) > (available := cluster_cpus()):
+        progress.say(f"Ray's autoscaler is asked for {cpus:g} CPUs; the cluster has {available}.")
     start = _start(run, registry, attempt / CHECKPOINTS / START)
     if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
         progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
@@ -309,10 +317,15 @@ def _tune(
     )
     reporter.begin(start.steps - start.steps_before_run, start.seconds)
 
+    is_stop_requested = False
+
     def request_stop() -> None:
+        nonlocal is_stop_requested
+        is_stop_requested = True
         plan.stop_file.touch()
         progress.say("Ending after this update, then publishing. Press Ctrl-C again to end immediately.")
 
+    watch = NodeWatch(config.training.runners, share, progress.say, plan.stop_file.touch)
     tuner = tune.Tuner(
         tune.with_resources(Trial, placement(config.training, share)),
         param_space={
@@ -322,7 +335,7 @@ def _tune(
         },
         tune_config=tune.TuneConfig(trial_dirname_creator=lambda _: attempt.name),
         run_config=run_config(
-            run.path, [_ResultCallback(publisher, progress, reporter)], _StopOnPublishError(publisher)
+            run.path, [_ResultCallback(publisher, progress, reporter), watch], _StopOnPublishError(publisher)
         ),
     )
     try:
@@ -331,7 +344,12 @@ def _tune(
         shutil.rmtree(attempt / CHECKPOINTS / START, ignore_errors=True)
     if result.error is not None:
         raise training_error(result.error, config.league, attempt / "error.txt") from result.error
-    return bool((result.metrics or {}).get("spent"))
+    if (result.metrics or {}).get("spent"):
+        return "spent"
+    if watch.reason is None or is_stop_requested or publisher.error is not None:
+        return "stopped"
+    progress.say(f"{watch.reason[0].upper()}{watch.reason[1:]}. Training continues.")
+    return "moved"
 
 
 class _ResultCallback(NotPickled, tune.Callback):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import ray
 import torch
 from ray import tune
 from ray.rllib.algorithms.algorithm import Algorithm
@@ -88,7 +89,8 @@ class TrialPlan:
 class Trial(tune.Trainable):
     """Trains until the budget is spent or a stop is requested. config: dumped `league` and `interface`, and a `plan`.
 
-    A result contains the path of the checkpoint, if one was saved, and whether the budget is `spent`.
+    A result contains the path of the checkpoint, if one was saved, whether the budget is `spent`, and Ray's ids of the
+    `nodes` of the learner and the runners.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
@@ -106,6 +108,7 @@ class Trial(tune.Trainable):
         else:
             self.algorithm.opponents.drop_removed()
         self.algorithm.reset_episodes(start.steps)
+        self.nodes = nodes_of(self.algorithm)
         self.steps = self.saved_steps = start.steps
         self.seconds = start.seconds
         self._plan_checkpoint()
@@ -138,6 +141,7 @@ class Trial(tune.Trainable):
             "seconds": self.seconds,
             "spent": self._spent(),
             "done": done,
+            "nodes": self.nodes,
         }
 
     def cleanup(self) -> None:
@@ -204,6 +208,16 @@ def build_algorithm(
         wait_for_runners(algorithm)
         algorithm.restore_from_path(str(checkpoint))
     return algorithm
+
+
+def nodes_of(algorithm: Algorithm) -> list[str]:
+    """Return Ray's ids of the nodes of the learner and the runners."""
+    runners = algorithm.env_runner_group.foreach_env_runner(_node_id, local_env_runner=False)
+    return sorted({_node_id(), *runners})
+
+
+def _node_id(*_: Any) -> str:
+    return str(ray.get_runtime_context().get_node_id())
 
 
 def read_progress(checkpoint: Path) -> tuple[int, float]:

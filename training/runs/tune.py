@@ -12,7 +12,7 @@ from ray import tune
 
 from league.config.training import TrainingSettings
 from league.errors import ConfigError
-from league.ray_cluster import node_resources
+from league.ray_cluster import has_autoscaler, node_resources
 from training.rllib_compat import restored_sigusr1
 from training.runs.run_reporter import TensorBoard
 
@@ -24,8 +24,10 @@ def cpu_share(runners: int, at_once: int = 1) -> float:
     """Return the CPUs of the learner and of each runner: one, or less if there are fewer.
 
     They take turns, so that a few more of them than CPUs do not overload a machine. at_once: number of concurrent
-    trials. Raises ConfigError if there are far too many.
+    trials. Raises ConfigError if there are far too many. If Ray's autoscaler adds nodes, each gets one.
     """
+    if has_autoscaler():
+        return 1.0
     nodes, count = [node.get("CPU", 0.0) for node in node_resources()], at_once * (1 + runners)
     # The largest share of which the nodes have enough is a whole part of one of them.
     shares = {math.floor(100 * min(1.0, cpus / parts)) for cpus in nodes for parts in range(1, count + 1)}
@@ -38,17 +40,19 @@ def cpu_share(runners: int, at_once: int = 1) -> float:
 def placement(settings: TrainingSettings, cpus: float) -> tune.PlacementGroupFactory:
     """Place the learner and each runner on any node that has what they need.
 
-    cpus: of each. Raises ConfigError if no nodes have it, which Ray would wait for forever.
+    cpus: of each. Raises ConfigError if no nodes have it, which Ray would wait for forever, unless its autoscaler adds
+    nodes.
     """
     learner = settings.gpus + (settings.runner_gpus if settings.runners == 0 else 0)
     requested = learner + settings.runners * settings.runner_gpus
     available = sum(node.get("GPU", 0.0) for node in node_resources())
-    if requested > available:
+    if requested > available and not has_autoscaler():
         raise ConfigError(
             f"training.gpus, training.runner_gpus: {requested:g} GPUs requested in total, but Ray has {available:g}"
         )
     first, runner = ({"CPU": cpus} | _gpus(gpus) for gpus in (learner, settings.runner_gpus))
-    _check_nodes(first, runner, settings.runners)
+    if not has_autoscaler():
+        _check_nodes(first, runner, settings.runners)
     return tune.PlacementGroupFactory([first] + [runner] * settings.runners)
 
 

@@ -127,13 +127,24 @@ def test_ray_plays_the_same_matches(registry: Registry) -> None:
 
 
 @pytest.mark.usefixtures("ray_session")
+def test_without_a_number_of_workers_all_cpus_of_the_cluster_play(registry: Registry) -> None:
+    """Tests have one node with two CPUs."""
+    events: list[Progress | VerdictReport] = []
+    schedule = tournament_schedule(registry)
+    play_schedule(schedule, registry=registry, workers=None, listener=events.append)
+    reports = [event for event in events if isinstance(event, Progress)]
+    assert (reports[0].nodes, reports[0].cpus) == (None, None), "nothing was played"
+    assert (reports[-1].nodes, reports[-1].cpus) == (1, 2)
+
+
+@pytest.mark.usefixtures("ray_session")
 def test_chunks_that_finish_out_of_order_are_stored_in_order(
     registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     schedule, reached = tournament_schedule(registry), tmp_path / "reached"
 
     @ray.remote(num_cpus=1)
-    def delay_first_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
+    def delay_first_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> tuple[str, list[Match]]:
         """The first chunk does not end before the second one."""
         from tests.support.waiting import until
 
@@ -143,7 +154,7 @@ def test_chunks_that_finish_out_of_order_are_stored_in_order(
             until(reached.exists)
         else:
             reached.touch()
-        return matches
+        return "node", matches
 
     monkeypatch.setattr(tournament, "_play_chunk", delay_first_chunk)
     seen: list[list[int]] = []
@@ -165,7 +176,7 @@ def test_a_worker_killed_during_a_chunk_is_replaced(
     schedule, died = tournament_schedule(registry), tmp_path / "died"
 
     @ray.remote(num_cpus=1, max_retries=tournament.RETRIES)
-    def play_or_die(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
+    def play_or_die(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> tuple[str, list[Match]]:
         schedule, storage, config, _ = job
         here = match_worker(storage, config)
         for position in chunk:
@@ -173,7 +184,7 @@ def test_a_worker_killed_during_a_chunk_is_replaced(
                 died.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             here.play(schedule, [position])
-        return here.play(schedule, chunk)
+        return "node", here.play(schedule, chunk)
 
     monkeypatch.setattr(tournament, "_play_chunk", play_or_die)
     assert play_schedule(schedule, registry=registry, workers=2) == play_locally(registry, schedule)
@@ -190,10 +201,10 @@ def test_the_number_of_open_chunks_is_limited(
     most_open: list[int] = []
 
     @ray.remote(num_cpus=1)
-    def play_and_record(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> list[Match]:
+    def play_and_record(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> tuple[str, list[Match]]:
         (started / str(chunk.start)).touch()
         schedule, storage, config, _ = job
-        return match_worker(storage, config).play(schedule, chunk)
+        return "node", match_worker(storage, config).play(schedule, chunk)
 
     def count_open_chunks(matches: Sequence[Match]) -> bool:
         most_open.append(sum(int(path.name) >= len(matches) for path in started.iterdir()))

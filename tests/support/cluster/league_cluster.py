@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tests.support.cluster import slow_bot
 from tests.support.cluster.machines import ROOT, Machine, network
 from tests.support.servers import postgresql
 from tests.support.waiting import until
@@ -20,6 +21,7 @@ RAY = str(Path(sys.executable).with_name("ray"))
 OBJECT_STORE = 80_000_000
 START_TIMEOUT = 240.0
 """Seconds for a node to join, on a busy machine."""
+DRAIN_SECONDS = 60
 QUICK_HEALTH_CHECKS = {
     "RAY_health_check_initial_delay_ms": "2000",
     "RAY_health_check_period_ms": "1000",
@@ -71,6 +73,22 @@ class LeagueCluster:
         options = ("--address", self.address, "--num-cpus", str(self.cpus))
         self._start_node(self.machines[name], options, environment or {})
 
+    def drain(self, name: str) -> None:
+        """Ask a worker's Ray to finish what it does and then to end, as before the machine is taken away."""
+        reason = ("--reason", "DRAIN_NODE_REASON_PREEMPTION", "--reason-message", "test")
+        options = (*reason, "--deadline-remaining-seconds", str(DRAIN_SECONDS))
+        self.machines[name].check_run(RAY, "drain-node", *options, environment=self.environment)
+
+    @contextmanager
+    def slow_bots(self) -> Iterator[None]:
+        """While the context lasts, `slow_bot` plays slowly."""
+        file = Path(self.environment[slow_bot.FILE])
+        file.touch()
+        try:
+            yield
+        finally:
+            file.unlink()
+
     def league(self, machine: Machine, *arguments: str, timeout: float = START_TIMEOUT) -> str:
         """Run a `league` command that must succeed; returns its output."""
         return machine.check_run(LEAGUE, *arguments, environment=self.environment, timeout=timeout)
@@ -100,7 +118,8 @@ class LeagueCluster:
         command = (RAY, "start", *options, *common, "--disable-usage-stats")
         deadline = time.monotonic() + START_TIMEOUT
         # `ray start` gives up after 30 s, which a busy machine may exceed.
-        while (done := machine.run(*command, environment={**self.environment, **environment})).returncode:
+        environment = {**self.environment, **environment}
+        while (done := machine.run(*command, environment=environment, timeout=START_TIMEOUT)).returncode:
             assert time.monotonic() < deadline, done.stdout + machine.log.read_text()[-3000:]
 
 
@@ -129,6 +148,7 @@ def _environment(database: Machine, directory: Path) -> dict[str, str]:
         "RAY_SERVE_HAPROXY_BINARY_PATH": str(Path(sys.executable).with_name("league-haproxy")),
         "RAY_AUTH_TOKEN": secrets.token_hex(16),
         "PYTHONPATH": str(ROOT),
+        slow_bot.FILE: str(directory / "slow"),
         "RAY_DISABLE_DOCKER_CPU_WARNING": "1",
         "NO_COLOR": "1",
         "COLUMNS": "200",

@@ -16,7 +16,7 @@ from pathlib import Path
 from subprocess import DEVNULL, PIPE, STDOUT
 from typing import IO, Any
 
-PROGRAMS = ("ip", "unshare", "nsenter", "setpriv")
+PROGRAMS = ("ip", "unshare", "nsenter", "setpriv", "pgrep")
 NETWORK = "10.57.0"
 """Nobody else sees these addresses."""
 ROOT = Path(__file__).parents[3]
@@ -32,7 +32,7 @@ mount --move /mnt /tmp && hostname "$NAME" && ip link set lo up && echo ready &&
 def obstacle() -> str | None:
     """Why there can be no machines here, None if there can."""
     if missing := [name for name in PROGRAMS if shutil.which(name) is None]:
-        return f"a cluster needs the program {missing[0]}: install iproute2 and util-linux"
+        return f"a cluster needs the program {missing[0]}: install iproute2, util-linux and procps"
     if subprocess.run(["unshare", *NAMESPACES, "--fork", "true"], stderr=DEVNULL).returncode:
         return "a cluster needs network namespaces: run the tests as root, in a container with CAP_SYS_ADMIN"
     return None
@@ -128,6 +128,10 @@ class Machine:
         done = self.run(*command, environment=environment, timeout=timeout)
         assert done.returncode == 0, f"{self.name}: {' '.join(command)}: {done.stdout}\n{self.log.read_text()[-3000:]}"
         return done.stdout
+
+    def runs(self, pattern: str) -> bool:
+        """Whether a program runs on the machine whose command line matches."""
+        return self.run("pgrep", "--full", pattern).returncode == 0
 
     @property
     def _pid(self) -> int:

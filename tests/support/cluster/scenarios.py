@@ -3,11 +3,8 @@
 The slow tests assert the results, and `benchmarks/cluster.py` prints them.
 """
 
-import json
-import sys
+import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,61 +16,26 @@ from tests.support.cluster.machines import Machine, end
 from tests.support.waiting import until
 
 LEAGUE = "tictactoe"
-REPLICAS = 4
-THREADS = 2
-AFTERWARDS = 20.0
-"""Seconds of load after the head is back: it must not replace replicas."""
-SETTLED = 3.0
-"""Seconds after which all replicas have answered many calls."""
 TRAINING = {"steps": 4096, "runners": 2, "train_batch_size": 512, "minibatch_size": 256, "epochs": 1, "num_envs": 4}
 SETTINGS = {"hidden": [16], "seed": 5, "checkpoint_every": 2048}
-PORT = 8000
-CONTESTANTS = (f"{LEAGUE}@1", f"{LEAGUE}@2", "script:random")
+SLOW_BOT = "script:tests.support.cluster.slow_bot:act"
+TOURNAMENT = (LEAGUE, f"{LEAGUE}@1", f"{LEAGUE}@2", "--schedule", "gauntlet", "--against", SLOW_BOT, "--seed", "7")
 LOST, SURVIVOR = WORKERS
+BOTH = "Training on 2 of 2 nodes, 3 of 4 CPUs."
+ONE = "Training on 1 of 1 nodes, 1.98 of 2 CPUs."
 
 
 @dataclass(frozen=True)
-class Load:
-    """What callers see while something happens. Times are seconds since the epoch."""
+class Changes:
+    """What happened when nodes came and went. Times are seconds.
 
-    file: Path
+    continued: from the loss of a worker until work went on. used: from when the worker had joined again until it was
+    used. drained: from the request to drain it until its Ray had ended.
+    """
 
-    @property
-    def report(self) -> dict[str, Any]:
-        """The report of `caller.py` so far."""
-        return dict(json.loads(self.file.read_text())) if self.file.exists() else {"replicas": {}, "versions": {}}
-
-    @property
-    def lost(self) -> list[str]:
-        """Calls of the client that failed in spite of its retries."""
-        return list(self.report["lost"])
-
-    @property
-    def attempts_lost(self) -> list[str]:
-        """Single attempts that failed."""
-        return list(self.report["attempts_lost"])
-
-    def versions(self) -> list[str]:
-        """The versions that answered, in the order of their first answers."""
-        found = self.report["versions"]
-        return sorted(found, key=lambda version: float(found[version][0]))
-
-    def followed(self, version: int) -> float:
-        """When a version other than this one answered for the last time."""
-        return max(float(last) for other, (_, last) in self.report["versions"].items() if other != str(version))
-
-    def new_replicas(self, since: float) -> list[float]:
-        """When replicas that had not answered before `since` answered first."""
-        return sorted(first for first, _ in self.report["replicas"].values() if first > since)
-
-    def wait_for_replicas(self, since: float = 0) -> None:
-        """Wait until REPLICAS have answered since a time."""
-        until(lambda: sum(last > since for _, last in self.report["replicas"].values()) >= REPLICAS, START_TIMEOUT)
-
-    def wait_for_version(self, version: int) -> None:
-        """Wait until a version answers, and no other has for SETTLED seconds."""
-        until(lambda: str(version) in self.report["versions"], START_TIMEOUT)
-        until(lambda: time.time() > self.followed(version) + SETTLED, START_TIMEOUT)
+    continued: float
+    used: float
+    drained: float
 
 
 def write_config(directory: Path, **training: Any) -> Path:
@@ -82,6 +44,7 @@ def write_config(directory: Path, **training: Any) -> Path:
     document = {
         "league": LEAGUE,
         "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
+        "play": {"num_envs": 4},  # chunks of at most 16 games
         "training": TRAINING | SETTINGS | training,
     }
     path.write_text(yaml.safe_dump(document))
@@ -94,24 +57,46 @@ def train(cluster: LeagueCluster, directory: Path) -> str:
     return cluster.league(cluster.head, "train", config, "--address", cluster.address, timeout=2 * START_TIMEOUT)
 
 
-def lose_worker_while_training(cluster: LeagueCluster, directory: Path) -> float:
-    """Kill a worker during training; returns the seconds until the next version is published."""
-    config = str(write_config(directory, steps=10**7))
-    before = _published(cluster.head)
+def change_nodes_while_training(cluster: LeagueCluster, directory: Path) -> tuple[Changes, list[int]]:
+    """Kill a worker, let it join again and drain it; returns also the steps of all versions of the run."""
+    config, log = str(write_config(directory, steps=10**7, checkpoint_every=8192)), Log(cluster.head)
     training = cluster.start_league(cluster.head, "train", config, "--address", cluster.address)
-    until(lambda: _published(cluster.head) > before, 2 * START_TIMEOUT)
+    log.wait_for(BOTH)
+    log.wait_for("Published ")
     cluster.machines[LOST].kill()
-    killed, before = time.monotonic(), _published(cluster.head)
-    log = cluster.head.log
-    until(lambda: "Training continues." in log.read_text() and _published(cluster.head) > before, START_TIMEOUT)
-    seconds = time.monotonic() - killed
+    killed = time.monotonic()
+    log.wait_for("nodes were lost")
+    log.wait_for(ONE)
+    continued = time.monotonic() - killed
+    restart(cluster, LOST)
+    joined = time.monotonic()
+    log.wait_for("Nodes have joined. Training continues.")
+    log.wait_for(BOTH)
+    used = time.monotonic() - joined
+    drained = drain(cluster, LOST)
+    log.wait_for("1 of 2 nodes are drained. Training continues.")
+    log.wait_for(ONE)
     end(training, START_TIMEOUT)
     restart(cluster, LOST)
-    return seconds
+    published = log.found(r"Published \S+ after ([\d,]+) steps")
+    return Changes(continued, used, drained), [int(steps.replace(",", "")) for steps in published]
 
 
-def _published(machine: Machine) -> int:
-    return machine.log.read_text().count(f"Published {LEAGUE}@")
+class Log:
+    """What a machine's programs print from now on."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._file = machine.log
+        self._begin = self._seen = len(self._file.read_text())
+
+    def wait_for(self, sentence: str) -> None:
+        """Wait for a sentence after those that were waited for before."""
+        until(lambda: sentence in self._file.read_text()[self._seen :], 2 * START_TIMEOUT)
+        self._seen = self._file.read_text().index(sentence, self._seen) + len(sentence)
+
+    def found(self, pattern: str) -> list[str]:
+        """All matches of a pattern."""
+        return re.findall(pattern, self._file.read_text()[self._begin :])
 
 
 def restart(cluster: LeagueCluster, name: str) -> None:
@@ -124,106 +109,58 @@ def restart(cluster: LeagueCluster, name: str) -> None:
         cluster.start_worker(name)
 
 
-def evaluate(cluster: LeagueCluster, machine: Machine, blocks: int, *options: str, database: str = "postgres") -> None:
-    """Play a tournament."""
-    command = ("evaluate", LEAGUE, *CONTESTANTS, "--blocks", str(blocks), "--seed", "7", *options)
-    cluster.with_database(database).league(machine, *command, timeout=2 * START_TIMEOUT)
+def drain(cluster: LeagueCluster, name: str) -> float:
+    """Drain a worker, as before a preemption, and turn it off; returns how long its Ray needed to end."""
+    machine, began = cluster.machines[name], time.monotonic()
+    cluster.drain(name)
+    until(lambda: not machine.runs("raylet/raylet"), START_TIMEOUT)
+    seconds = time.monotonic() - began
+    machine.kill()
+    return seconds
+
+
+def change_nodes_during_tournament(cluster: LeagueCluster, blocks: int) -> tuple[Changes, str, str]:
+    """Kill a worker, let it join again and drain it during a tournament.
+
+    Returns also the tournament's ledger and that of an undisturbed one.
+    """
+    cluster.sql("CREATE DATABASE undisturbed TEMPLATE postgres", "template1")
+    command = ("evaluate", *TOURNAMENT, "--blocks", str(blocks))
+    with cluster.slow_bots():
+        tournament = cluster.start_league(cluster.head, *command, "--address", cluster.address)
+        until(lambda: _played(cluster) > 0, 2 * START_TIMEOUT)
+        until(lambda: _plays(cluster, LOST), START_TIMEOUT)
+        cluster.machines[LOST].kill()
+        killed, before = time.monotonic(), _played(cluster)
+        until(lambda: _played(cluster) > before, START_TIMEOUT)
+        continued = time.monotonic() - killed
+        restart(cluster, LOST)
+        joined, log = time.monotonic(), Log(cluster.head)
+        until(lambda: _plays(cluster, LOST), START_TIMEOUT)
+        used = time.monotonic() - joined
+        log.wait_for("2 nodes, 4 CPUs")
+        drained = drain(cluster, LOST)
+        log.wait_for("1 node, 2 CPUs")
+        assert tournament.poll() is None, "the tournament was too short"
+    assert tournament.wait(2 * START_TIMEOUT) == 0, cluster.head.log.read_text()[-3000:]
+    cluster.with_database("undisturbed").league(cluster.machines[SURVIVOR], *command, "--workers", "0")
+    restart(cluster, LOST)
+    return Changes(continued, used, drained), ledger(cluster), ledger(cluster, "undisturbed")
+
+
+def _played(cluster: LeagueCluster) -> int:
+    return int(cluster.sql("SELECT count(*) FROM matches"))
+
+
+def _plays(cluster: LeagueCluster, name: str) -> bool:
+    """Whether a worker plays a chunk of a tournament."""
+    return cluster.machines[name].runs("ray::_play_chunk")
 
 
 def ledger(cluster: LeagueCluster, database: str = "postgres") -> str:
     """All matches of a database, without their times."""
     columns = "schedule, position, first, second, games, scores, returns, moves"
     return cluster.sql(f"SELECT {columns} FROM matches ORDER BY schedule, position", database)
-
-
-def lose_worker_during_tournament(cluster: LeagueCluster, blocks: int) -> tuple[str, str]:
-    """Kill a worker during a tournament; returns its ledger and that of an undisturbed tournament."""
-    cluster.sql("CREATE DATABASE undisturbed TEMPLATE postgres", "template1")
-    tournament = cluster.start_league(
-        cluster.head,
-        *("evaluate", LEAGUE, *CONTESTANTS, "--blocks", str(blocks), "--seed", "7"),
-        *("--workers", "3", "--address", cluster.address),
-    )
-    count = "SELECT count(*) FROM matches"
-    until(lambda: int(cluster.sql(count)) > 0, 2 * START_TIMEOUT)
-    cluster.machines[LOST].kill()
-    assert tournament.wait(2 * START_TIMEOUT) == 0, cluster.head.log.read_text()[-3000:]
-    evaluate(cluster, cluster.machines[SURVIVOR], blocks, "--workers", "0", database="undisturbed")
-    restart(cluster, LOST)
-    return ledger(cluster), ledger(cluster, "undisturbed")
-
-
-@contextmanager
-def serving(cluster: LeagueCluster) -> Iterator[str]:
-    """Serve on all nodes; yields an API key."""
-    scopes = ("--scope", "act", "--scope", "read")
-    token = json.loads(cluster.league(cluster.head, "keys", "create", "clients", *scopes, "--json"))["key"]
-    options = ("--host", "0.0.0.0", "--replicas", str(REPLICAS), "--address", cluster.address)
-    server = cluster.start_league(cluster.head, "serve", *options)
-    try:
-        until(lambda: "Serving" in cluster.head.log.read_text() or server.poll() is not None, 2 * START_TIMEOUT)
-        assert server.poll() is None, cluster.head.log.read_text()[-3000:]
-        yield token
-    finally:
-        end(server, 60)
-
-
-@contextmanager
-def load(cluster: LeagueCluster, key: str, through: str = SURVIVOR) -> Iterator[Load]:
-    """Call the server through one machine's HAProxy while the context lasts, from when all replicas have answered."""
-    client = cluster.machines["client"]
-    found = Load(client.log.with_name(f"caller-{time.time_ns()}.json"))
-    url = f"http://{cluster.machines[through].address}:{PORT}"
-    program = (sys.executable, "-m", "tests.support.cluster.caller", url, key, LEAGUE, str(THREADS), str(found.file))
-    process = client.start(*program, environment=cluster.environment)
-    try:
-        found.wait_for_replicas()
-        yield found
-    finally:
-        end(process, 120)
-
-
-def lose_worker_while_serving(cluster: LeagueCluster, key: str) -> tuple[Load, float]:
-    """Kill a worker under load until as many replicas answer again; returns the load and when it was killed."""
-    with load(cluster, key) as calls:
-        cluster.machines[LOST].kill()
-        killed = time.time()
-        calls.wait_for_replicas(since=killed)
-    restart(cluster, LOST)
-    return calls, killed
-
-
-def lose_head(cluster: LeagueCluster, key: str, version: int, seconds: float) -> tuple[Load, float, float]:
-    """Kill the head, promote a version meanwhile, start it again; returns the load, the kill and the promotion."""
-    with load(cluster, key) as calls:
-        cluster.head.kill()
-        killed = time.time()
-        promoted = promote(cluster, cluster.machines[SURVIVOR], version)
-        calls.wait_for_version(version)
-        until(lambda: time.time() >= killed + seconds, seconds + START_TIMEOUT)
-        restart(cluster, HEAD)
-        returned = time.time()
-        until(lambda: time.time() >= returned + AFTERWARDS, 2 * AFTERWARDS)
-    return calls, killed, promoted
-
-
-def cut_off_database(cluster: LeagueCluster, key: str, version: int, seconds: float) -> tuple[Load, float]:
-    """Cut the database off, and promote on its machine meanwhile; returns the load and the end of the partition."""
-    database = cluster.machines["database"]
-    with load(cluster, key) as calls:
-        began = time.time()
-        with database.unplugged():
-            promote(cluster, database, version)
-            until(lambda: time.time() >= began + seconds, seconds + START_TIMEOUT)
-        restored = time.time()
-        calls.wait_for_version(version)
-    return calls, restored
-
-
-def promote(cluster: LeagueCluster, machine: Machine, version: int) -> float:
-    """Promote a version by a command on a machine; returns when it took effect."""
-    cluster.league(machine, "promote", f"{LEAGUE}@{version}", "--reason", "test")
-    return float(cluster.sql("SELECT extract(epoch FROM max(at)) FROM alias_events"))
 
 
 def join_with_another_version(cluster: LeagueCluster, directory: Path, package: str, version: str) -> str:
@@ -233,7 +170,7 @@ def join_with_another_version(cluster: LeagueCluster, directory: Path, package: 
     metadata.parent.mkdir(parents=True)
     metadata.write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")
     cluster.start_worker("client", {"PYTHONPATH": f"{stack}:{cluster.environment['PYTHONPATH']}"})
-    command = ("evaluate", LEAGUE, *CONTESTANTS, "--blocks", "2", "--workers", "2", "--address", cluster.address)
+    command = ("evaluate", *TOURNAMENT, "--blocks", "2", "--workers", "2", "--address", cluster.address)
     refused = cluster.run_league(cluster.head, *command)
     machine.kill()
     machine.boot(machine.switch)

@@ -68,6 +68,18 @@ def drive(registry: Registry, run: RunDirectory, reports: list[int], end: BaseEx
         raise end
 
 
+def test_a_second_attempt_continues_the_record(registry: Registry, run: RunDirectory) -> None:
+    """The first one got further than the version from which the second one continues."""
+    with RunReporter(registry, run) as reporter:
+        for start, reached in ((0, 300), (200, 250)):
+            reporter.begin(start, start / 10)
+            until(lambda start=start: registry.runs.counts() and recorded(registry, run).steps == start)
+            reporter.report(result(reached, loss=1.0))
+            until(lambda reached=reached: recorded(registry, run).steps == reached)
+    found = recorded(registry, run)
+    assert (found.attempts, found.steps, found.state) == (2, 250, "ended")
+
+
 def test_settings_and_curves_are_recorded(registry: Registry, run: RunDirectory) -> None:
     with RunReporter(registry, run) as reporter:
         reporter.begin(0, 0.0)
@@ -170,7 +182,7 @@ def test_training_survives_an_unreachable_registry(
         reporter.report(result(100, loss=1.0))
         until(lambda: "cannot report training run" in caplog.text)
         moved.rename(database)
-        until(lambda: registry.runs.counts() == {"tictactoe": 1})
+        until(lambda: registry.runs.counts() and recorded(registry, run).steps == 100)
         moved = database.rename(database.with_name("away.db"))
         reporter.report(result(200, loss=0.5))
         until(lambda: caplog.text.count("cannot report") == 2)

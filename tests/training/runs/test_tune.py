@@ -1,8 +1,10 @@
 import pytest
 import ray
 
+from league import ray_cluster
 from league.config.ppo import PPOConfig
 from league.errors import ConfigError
+from training.runs import tune
 from training.runs.tune import cpu_share, placement
 
 
@@ -15,7 +17,10 @@ def test_learner_and_runners_share_the_available_cpus() -> None:
 
 
 def machines(monkeypatch: pytest.MonkeyPatch, *resources: dict[str, float]) -> None:
-    monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": True, "Resources": each} for each in resources])
+    nodes = [{"Alive": True, "NodeID": str(place), "Resources": each} for place, each in enumerate(resources)]
+    monkeypatch.setattr(ray, "nodes", lambda: nodes)
+    monkeypatch.setattr(ray_cluster, "draining_nodes", set)
+    monkeypatch.setattr(tune, "has_autoscaler", lambda: False)
 
 
 def test_a_trial_requests_its_learner_and_its_runners_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,84 @@
+"""When a run shows its nodes, and when it moves to others."""
+
+import pytest
+import ray
+from ray.exceptions import RpcError
+
+from league import ray_cluster
+from training.runs import node_watch, tune
+from training.runs.node_watch import NodeWatch
+
+
+class Nodes:
+    """A cluster whose nodes are named by letters, with two CPUs each but for the head, and a run with two runners."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+        self.alive, self.draining = "ab", set[str]()
+        self.said: list[str] = []
+        self.moves = 0
+        self.watch = NodeWatch(2, share, self.said.append, self._move)
+        monkeypatch.setattr(ray, "nodes", self._nodes)
+        monkeypatch.setattr(ray_cluster, "draining_nodes", lambda: self.draining)
+        monkeypatch.setattr(node_watch, "draining_nodes", lambda: self.draining)
+        monkeypatch.setattr(tune, "has_autoscaler", lambda: False)
+        monkeypatch.setattr(node_watch, "NODE_POLL", 0.0)
+
+    def _nodes(self) -> list[dict[str, object]]:
+        head = {"NodeID": "head", "Alive": True, "Resources": {"memory": 1.0}}
+        return [head, *({"NodeID": name, "Alive": True, "Resources": {"CPU": 2.0}} for name in self.alive)]
+
+    def _move(self) -> None:
+        self.moves += 1
+
+    def run_on(self, nodes: str) -> None:
+        self.watch.on_trial_result(result={"nodes": list(nodes)})
+        self.look()
+
+    def look(self) -> None:
+        self.watch.on_step_begin()
+
+
+def test_the_nodes_are_shown_as_they_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = Nodes(monkeypatch, share=1.0)
+    nodes.look()
+    assert nodes.said == [], "nothing runs yet"
+    nodes.run_on("ab")
+    nodes.look()
+    nodes.alive = "abc"
+    nodes.look()
+    assert nodes.said == ["Training on 2 of 2 nodes, 3 of 4 CPUs.", "Training on 2 of 3 nodes, 3 of 6 CPUs."]
+    assert (nodes.moves, nodes.watch.reason) == (0, None)
+
+
+def test_a_run_leaves_a_node_that_is_drained(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = Nodes(monkeypatch, share=1.0)
+    nodes.alive = "abc"
+    nodes.run_on("ab")
+    nodes.draining = {"c"}
+    nodes.look()
+    assert nodes.moves == 0, "it is not on that node"
+    nodes.draining = {"b"}
+    nodes.look()
+    nodes.look()
+    assert (nodes.moves, nodes.watch.reason) == (1, "1 of 2 nodes are drained")
+
+
+def test_a_run_moves_if_its_processes_get_more_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = Nodes(monkeypatch, share=0.66)
+    nodes.alive = "a"
+    nodes.run_on("a")
+    assert nodes.said == ["Training on 1 of 1 nodes, 1.98 of 2 CPUs."]
+    nodes.alive = "ab"
+    nodes.look()
+    assert (nodes.moves, nodes.watch.reason) == (1, "nodes have joined")
+
+
+def test_nothing_happens_while_the_head_restarts(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = Nodes(monkeypatch, share=0.66)
+
+    def fail() -> set[str]:
+        raise RpcError("the head does not answer")
+
+    monkeypatch.setattr(ray_cluster, "draining_nodes", fail)
+    nodes.run_on("ab")
+    assert (nodes.said, nodes.moves) == ([], 0)

@@ -1,0 +1,65 @@
+"""Watches the nodes of a cluster during a run: shows which of them it uses, and when it should move to others.
+
+A run moves if a node that it uses is drained, or if nodes have joined with which its processes get more CPUs each. It
+saves its state, which is published as a version, and continues from it: no step is repeated.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from ray import tune
+from ray.exceptions import RpcError
+
+from league.ray_cluster import draining_nodes, node_resources
+from training.rllib_compat import NotPickled
+from training.runs.tune import cpu_share
+
+NODE_POLL = 1.0
+"""Seconds."""
+
+
+class NodeWatch(NotPickled, tune.Callback):
+    """Watches during one attempt.
+
+    runners, share: the number of runners; the CPUs of each of them and of the learner. say: prints a line.
+    request_move: asks the trial to save and end; `reason` then says why.
+    """
+
+    def __init__(
+        self, runners: int, share: float, say: Callable[[str], None], request_move: Callable[[], None]
+    ) -> None:
+        self.reason: str | None = None
+        self._runners, self._share = runners, share
+        self._say, self._request_move = say, request_move
+        self._nodes: frozenset[str] = frozenset()
+        self._shown = ""
+        self._next_look = 0.0
+
+    def on_trial_result(self, *, result: dict[str, Any], **_: Any) -> None:
+        self._nodes = frozenset(result["nodes"])
+
+    def on_step_begin(self, **_: Any) -> None:
+        if not self._nodes or time.monotonic() < self._next_look:
+            return
+        self._next_look = time.monotonic() + NODE_POLL
+        try:
+            self._look()
+        except RpcError:  # the head is restarting
+            return
+
+    def _look(self) -> None:
+        cpus = [node["CPU"] for node in node_resources() if node.get("CPU")]
+        used = self._share * (1 + self._runners)
+        shown = f"Training on {len(self._nodes)} of {len(cpus)} nodes, {used:g} of {sum(cpus):g} CPUs."
+        if self.reason is None and (reason := self._reason_to_move()) is not None:
+            self.reason = reason
+            self._request_move()
+        elif self.reason is None and shown != self._shown:
+            self._shown = shown
+            self._say(shown)
+
+    def _reason_to_move(self) -> str | None:
+        if leaving := self._nodes & draining_nodes():
+            return f"{len(leaving)} of {len(self._nodes)} nodes are drained"
+        return "nodes have joined" if cpu_share(self._runners) > self._share else None
