@@ -11,6 +11,7 @@ from typing import Any
 from ray import tune
 from ray.exceptions import RpcError
 
+from league.errors import ConfigError
 from league.ray_cluster import draining_nodes, node_resources
 from training.rllib_compat import NotPickled
 from training.runs.tune import cpu_share
@@ -62,4 +63,7 @@ class NodeWatch(NotPickled, tune.Callback):
     def _reason_to_move(self) -> str | None:
         if leaving := self._nodes & draining_nodes():
             return f"{len(leaving)} of {len(self._nodes)} nodes are drained"
-        return "nodes have joined" if cpu_share(self._runners) > self._share else None
+        try:
+            return "nodes have joined" if cpu_share(self._runners) > self._share else None
+        except ConfigError:  # nodes have left: Ray reports what was lost with them
+            return None

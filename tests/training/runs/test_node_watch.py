@@ -82,3 +82,10 @@ def test_nothing_happens_while_the_head_restarts(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(ray_cluster, "draining_nodes", fail)
     nodes.run_on("ab")
     assert (nodes.said, nodes.moves) == ([], 0)
+
+
+def test_a_run_stays_while_all_nodes_with_cpus_have_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = Nodes(monkeypatch, share=0.66)
+    nodes.alive = ""
+    nodes.run_on("a")
+    assert nodes.moves == 0
