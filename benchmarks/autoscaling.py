@@ -86,13 +86,13 @@ def follow(steady: float) -> Following:
     """
     with _served() as (url, registry):
         with stepping(url) as load:
-            cost = _cost(load, steady)
+            cost = _cost(registry, load, steady)
             rate = FIRST / cost
             load.set_rate(rate)
             _hold(registry, 1, steady)
             up = time.monotonic()
             load.set_rate(FACTOR * rate)
-            _await(lambda: len(replica_processes()), 2)
+            _await(lambda: len(replica_processes(registry.storage.home)), 2)
             started = time.monotonic() - up
             _await(lambda: _replicas(registry), 2)
             _hold(registry, 2, steady)
@@ -120,9 +120,9 @@ def _served() -> Iterator[tuple[str, Registry]]:
         registry.close()
 
 
-def _cost(load: StepLoad, seconds: float) -> float:
+def _cost(registry: Registry, load: StepLoad, seconds: float) -> float:
     """Processor time of a request in seconds."""
-    (replica,) = replica_processes()
+    (replica,) = replica_processes(registry.storage.home)
     idle = _busy(replica.cpu_times, seconds)
     load.set_rate(SAMPLE)
     return (_busy(replica.cpu_times, seconds) - idle) / SAMPLE

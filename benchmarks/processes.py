@@ -1,5 +1,7 @@
 """The server processes that a benchmark has started."""
 
+from pathlib import Path
+
 import psutil
 
 
@@ -8,9 +10,9 @@ def haproxy_processes() -> set[int]:
     return {process.pid for process in _below() if _name(process) == "haproxy"}
 
 
-def replica_processes() -> list[psutil.Process]:
-    """The replicas of Ray Serve below this process."""
-    return [process for process in _below() if _is_replica(process)]
+def replica_processes(home: Path | None = None) -> list[psutil.Process]:
+    """The replicas of Ray Serve below this process. home: only those of the server with this LEAGUE_HOME."""
+    return [process for process in _below() if _is_replica(process) and (home is None or _home(process) == str(home))]
 
 
 def _below() -> list[psutil.Process]:
@@ -22,6 +24,13 @@ def _is_replica(process: psutil.Process) -> bool:
         return "PolicyServer" in process.cmdline()[0]
     except (psutil.NoSuchProcess, IndexError):
         return False
+
+
+def _home(process: psutil.Process) -> str | None:
+    try:
+        return process.environ().get("LEAGUE_HOME")
+    except psutil.NoSuchProcess:
+        return None
 
 
 def _name(process: psutil.Process) -> str:
