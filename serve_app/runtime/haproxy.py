@@ -11,7 +11,6 @@ time to send a request, and Ray takes seconds to replace HAProxy after a crash. 
 import fcntl
 import os
 import random
-import resource
 import secrets
 import shutil
 import signal
@@ -41,11 +40,8 @@ SOFT_STOP_TIMEOUT = 1.0
 HARD_STOP_TIMEOUT = 5.0
 """Seconds for killed processes to exit and free their ports."""
 CONNECTIONS = 16_384
-"""Open connections of clients: the streams of a replica, and others. Those beyond it wait to be accepted."""
-DESCRIPTORS_PER_CONNECTION = 2.5
-"""Two sockets, and a pipe for a quarter of the connections (`maxpipes`)."""
-RESERVED_DESCRIPTORS = 200
-"""For listeners, threads and health checks."""
+"""Open connections of clients: the streams of a replica, and others. Those beyond it wait to be accepted. The wrapper
+script lowers it to what the file descriptors suffice for."""
 IDLE_CLIENT_TIMEOUT = 60
 """Seconds in which a client must send or receive data of a request in progress."""
 
@@ -59,7 +55,7 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
         "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
         "RAY_SERVE_HAPROXY_TUNE_BUFSIZE": str(64 * 1024),
-        "RAY_SERVE_HAPROXY_MAXCONN": str(_max_connections()),
+        "RAY_SERVE_HAPROXY_MAXCONN": str(CONNECTIONS),
         "RAY_SERVE_HAPROXY_NBTHREAD": str(usable_cpus()),
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S": "5",
@@ -121,14 +117,6 @@ def _install_script(directory: Path, stats: int, metrics: int) -> dict[str, str]
     if found is None:
         return {}
     return {haproxy_script.BINARY_PATH: str(haproxy_script.install(directory, found, stats, metrics))}
-
-
-def _max_connections() -> int:
-    """CONNECTIONS, or as many as file descriptors suffice for: HAProxy does not start without."""
-    _, descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if descriptors == resource.RLIM_INFINITY:
-        return CONNECTIONS
-    return max(1, min(CONNECTIONS, int((descriptors - RESERVED_DESCRIPTORS) / DESCRIPTORS_PER_CONNECTION)))
 
 
 def free_ports(count: int, host: str = "") -> list[int]:

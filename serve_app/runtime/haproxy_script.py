@@ -27,6 +27,9 @@ REQUEST_TIMEOUT = 10
 """Seconds for a client to send the head of a request, and as much of the body as fits into HAProxy's buffer."""
 TUNNEL_TIMEOUT = 3600
 """Seconds for which a WebSocket may be idle."""
+RESERVED_DESCRIPTORS = 200
+"""File descriptors of HAProxy for listeners, threads and health checks. Each connection needs 2.5: two sockets, and a
+pipe for a quarter of the connections (`maxpipes`)."""
 RAY_PORTS = {"STATS": "8404", "METRICS": "9101"}
 """HAProxy's own ports, unless Ray's environment variables change them."""
 SCRIPT = """#!/bin/sh
@@ -38,6 +41,13 @@ amend() {{  # Ray's configuration
         -e 's/^defaults$/&\\n    timeout http-request {head}s\\n    timeout tunnel {tunnel}s/' \\
         -e 's/^frontend http_frontend$/&\\n    option http-buffer-request/' \\
         "$1"
+    descriptors=$(ulimit -Hn)
+    [ "$descriptors" = unlimited ] && return
+    most=$(( (descriptors - {reserved}) * 2 / 5 ))
+    connections=$(sed -n 's/^ *maxconn \\([0-9]*\\)$/\\1/p' "$1")
+    if [ "${{connections:-0}}" -gt "$most" ]; then
+        sed -i "s/^\\( *maxconn \\)$connections\\$/\\1$most/" "$1"
+    fi
 }}
 
 without_control() {{  # a configuration without the ports and sockets by which Ray knows its HAProxy
@@ -85,9 +95,10 @@ if [ -n "$config" ]; then
 fi
 exec '{haproxy}' "$@"
 """
-"""Restricts the statistics to this machine. Limits the time to send a request, and sets the idle timeout of WebSockets,
-to which the request timeouts would apply otherwise. A request is forwarded once its body has arrived or fills the
-buffer, so that slow clients occupy no replica."""
+"""Restricts the statistics to this machine. Limits the number of connections to those for which there are file
+descriptors: HAProxy does not start otherwise. Limits the time to send a request, and sets the idle timeout of
+WebSockets, to which the request timeouts would apply otherwise. A request is forwarded once its body has arrived or
+fills the buffer, so that slow clients occupy no replica."""
 
 
 def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
@@ -99,6 +110,7 @@ def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
         metrics=metrics,
         head=REQUEST_TIMEOUT,
         tunnel=TUNNEL_TIMEOUT,
+        reserved=RESERVED_DESCRIPTORS,
         stopped=STOPPED,
         stand_in=STAND_IN,
     )

@@ -39,6 +39,7 @@ class NodeWatch(NotPickled, tune.Callback):
 
     def on_trial_result(self, *, result: dict[str, Any], **_: Any) -> None:
         self._nodes = frozenset(result["nodes"])
+        self.on_step_begin()  # a short run may have no further step
 
     def on_step_begin(self, **_: Any) -> None:
         if not self._nodes or time.monotonic() < self._next_look:
