@@ -28,7 +28,8 @@ def test_a_disk_that_does_not_respond_has_no_samples(tmp_path: Path, monkeypatch
     answers, asked = Event(), []
 
     def statvfs(path: Path) -> os.statvfs_result:
-        asked.append(path)
+        if path.is_relative_to(tmp_path):  # a server of other tests measures its disks as well
+            asked.append(path)
         answers.wait(60)
         raise OSError
 
