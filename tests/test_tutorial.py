@@ -89,7 +89,7 @@ def test_the_line_of_the_crontab_trains_a_night(folder: Path) -> None:
     done = subprocess.run(["/bin/sh", "-c", command], cwd="/", env={"PATH": "/usr/bin:/bin"}, check=False)
     log = (folder / "nightly.log").read_text()
     assert done.returncode == 0, log
-    assert re.search(r"the champion is (still|now) nim@\d", log)
+    assert re.search(r"nim: night 1 trained nim@\d", log)
     assert "nim@2" in log
 
 

@@ -21,6 +21,7 @@ def main() -> None:
     request = {"contestants": [f"{league}@1", f"{league}@2"], "blocks": int(blocks)}
     headers = {"x-api-key": key, "idempotency-key": "cluster"}
     with httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False) as client:
+        until(lambda: _is_ready(client), DEADLINE)  # HAProxy may start later on this node than on the others
         started = client.post(f"/v1/leagues/{league}/evaluations", json=request)
         assert started.status_code == 202, started.text
         path = f"/v1/leagues/{league}/evaluations/{started.json()['evaluation']}"
@@ -35,6 +36,13 @@ def main() -> None:
 
         until(has_ended, DEADLINE)
         print(client.get(path).text)
+
+
+def _is_ready(client: httpx.Client) -> bool:
+    try:
+        return client.get("/v1/health/ready").status_code == 200
+    except httpx.TransportError:
+        return False
 
 
 if __name__ == "__main__":
