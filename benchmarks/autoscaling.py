@@ -2,8 +2,8 @@
 
 Printed: the time from the step up to the first answer of a second replica, the time from the step down until one is
 gone, and the calls that were lost. Settings are those of deploy.yaml, except for a shorter `downscale_delay_s`. The
-cost of a request is measured first; the first load needs a fifth of a core, and four times as much exceeds the target
-of one replica.
+cost of a request is measured first; the first load needs a third of the target of one replica, and four times as much
+exceeds it.
 """
 
 import argparse
@@ -25,8 +25,10 @@ from serve_app.runtime.launch import DEPLOY_YAML, running
 
 APPEARED, LOST = 10.0, 0
 """Targets: seconds, calls of our client."""
-FIRST, FACTOR = 0.2, 4
-"""Share of a core that the first load needs, and the step."""
+FIRST, FACTOR = 1 / 3, 4
+"""The first load as a share of the target load of a replica, and the step."""
+TARGET = 0.6
+"""As in deploy.yaml."""
 DOWNSCALE_DELAY = 10.0
 HIDDEN = (2048, 2048)
 """Units of the network. Inference dominates the cost of a request, which hence does not depend on the rate."""
@@ -78,16 +80,18 @@ def main() -> int:
     return int(found.appeared > APPEARED or len(seen.lost) > LOST)
 
 
-def follow(steady: float) -> Following:
-    """Serve, and step the load up and down. steady: seconds of each constant load.
+def follow(steady: float, target: float = TARGET) -> Following:
+    """Serve, and step the load up and down.
+
+    steady: seconds of each constant load. target: load that a replica should have, as a share of a core.
 
     Raises AssertionError if the number of replicas changes under a constant load, and TimeoutError if it does not
     follow a step.
     """
-    with _served() as (url, registry):
+    with _served(target) as (url, registry):
         with stepping(url) as load:
             cost = _cost(registry, load, steady)
-            rate = FIRST / cost
+            rate = FIRST * target / cost
             load.set_rate(rate)
             _hold(registry, 1, steady)
             up = time.monotonic()
@@ -107,10 +111,12 @@ def follow(steady: float) -> Following:
 
 
 @contextmanager
-def _served() -> Iterator[tuple[str, Registry]]:
+def _served(target: float) -> Iterator[tuple[str, Registry]]:
     """The URL of one or two replicas, and their registry."""
     document = yaml.safe_load(DEPLOY_YAML.read_text())
-    document["applications"][0]["deployments"][0]["autoscaling_config"]["downscale_delay_s"] = DOWNSCALE_DELAY
+    autoscaling = document["applications"][0]["deployments"][0]["autoscaling_config"]
+    autoscaling["downscale_delay_s"] = DOWNSCALE_DELAY
+    autoscaling["policy"]["policy_kwargs"]["target"] = target
     with tempfile.TemporaryDirectory() as scratch:
         registry = publish(Path(scratch) / "home", versions=1, hidden=HIDDEN)
         deploy = Path(scratch) / "deploy.yaml"
