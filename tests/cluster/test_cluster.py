@@ -78,5 +78,6 @@ def test_no_call_is_lost_with_the_database(cluster: LeagueCluster, key: str) -> 
 def test_no_call_is_lost_with_the_head(cluster: LeagueCluster, key: str) -> None:
     calls, killed, _ = serving_scenarios.lose_head(cluster, key, 1, OUTAGE)
     assert calls.lost == []
+    assert calls.attempts_lost == []
     assert calls.versions() == ["2", "1"], "promoted meanwhile"
     assert calls.new_replicas(killed) == [], "replicas continue"
