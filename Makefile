@@ -38,9 +38,15 @@ test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: setup
 	$(BIN)/python -m pytest -m "not slow" -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
 
-# Learning to a level, every environment, kills and clusters.
+# Learning to a level, every environment, kills and clusters. The machines of a cluster share the cores: its tests run
+# alone.
 test-slow: setup
+ifdef TESTS
 	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
+else
+	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) --ignore tests/cluster
+	$(BIN)/python -m pytest -m slow $(PYTEST) tests/cluster
+endif
 
 check: setup
 	$(BIN)/ruff format --check .

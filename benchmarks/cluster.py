@@ -74,7 +74,8 @@ def _losses(calls: serving_scenarios.Load) -> str:
     report = calls.report
     return (
         f"{len(calls.lost)} of {report['calls']:,} calls of the client and {len(calls.attempts_lost)} of"
-        f" {report['attempts']:,} single attempts lost, longest call {report['longest']:.1f} s"
+        f" {report['attempts']:,} single attempts lost, {len(calls.attempts_shed)} refused"
+        f" with 429, longest call {report['longest']:.1f} s"
     )
 
 

@@ -220,8 +220,16 @@ class NoEvaluationService(NotReady, code="no_evaluation_service"):
     """The server was deployed without an evaluation service, or the service is unreachable."""
 
 
+class NoReplica(NotReady, code="no_replica"):
+    """No replica of a policy server accepts requests."""
+
+
 class RemoteError(LeagueError, code="remote_error"):
     """A policy server is unreachable or failed."""
+
+
+class ReplicaLost(RemoteError, code="replica_lost"):
+    """A replica of a policy server ended before it responded."""
 
 
 class StorageError(LeagueError, code="storage_error"):

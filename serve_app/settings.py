@@ -43,7 +43,7 @@ class ServeSettings(BaseModel):
     """Maximum observations in one request."""
     timeout: float = Field(default=4.5, gt=0)
     """Timeout of a request, from its head to its response: 504, or 408 if the body did not arrive. Must be less than
-    RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy responds with 500. Clients can request a shorter timeout
+    RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy responds itself. Clients can request a shorter timeout
     with `x-request-timeout-ms`."""
     max_waiting: int = Field(default=256, ge=1)
     """Inference requests that may wait on the event loop, including those on connections that are not accepted yet. If

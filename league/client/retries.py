@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import orjson
 
-from league.errors import BY_CODE, InvalidInput, LeagueError, RateLimited, RemoteError
+from league.errors import BY_CODE, InvalidInput, LeagueError, NoReplica, RateLimited, RemoteError
 
 INITIAL_DELAY = 0.01
 """Seconds before the second attempt; doubled before each further attempt."""
@@ -58,9 +58,12 @@ def retry_deadline(outcome: Outcome) -> float:
     """Return the seconds for which a failure is worth retrying: 0, a few, or infinity."""
     if not isinstance(outcome, httpx.Response) or outcome.status_code in BUSY_STATUSES:
         return float("inf")
-    if parse_object(outcome) is None:
-        # HAProxy's own responses: no replica accepted the request (500, 503), or none is known yet (404).
+    body = parse_object(outcome)
+    if body is None:
+        # Responses of a proxy that is not configured by this project, or knows no replica yet (404).
         return float("inf") if outcome.status_code >= 500 else NOT_READY_DEADLINE * (outcome.status_code == 404)
+    if body.get("code") == NoReplica.code:
+        return float("inf")
     return NOT_READY_DEADLINE * (outcome.status_code == 503)
 
 

@@ -8,6 +8,7 @@ the port. An HAProxy without routes does not listen for requests, because it wou
 While the server starts, serve_app.runtime.starting_page responds in place of a stand-in, until a replica is known.
 """
 
+import json
 import os
 import shutil
 import sys
@@ -23,22 +24,29 @@ STOPPED = "stopped"
 """File in HAProxy's directory: no stand-in starts any more."""
 STAND_IN = "standin"
 """File in HAProxy's directory: the process that responds in place of Ray's HAProxy."""
-REQUEST_TIMEOUT = 10
-"""Seconds for a client to send the head of a request, and as much of the body as fits into HAProxy's buffer."""
-TUNNEL_TIMEOUT = 3600
-"""Seconds for which a WebSocket may be idle."""
+TIMEOUTS = {"http-request": 10, "tunnel": 3600, "check": 5}
+"""Seconds for a client to send the head of a request, and as much of the body as fits into HAProxy's buffer; for which
+a WebSocket may be idle; and for a connected replica to answer a health check. The time to connect is limited
+separately: a node that is gone is noticed sooner than a replica that is busy."""
 RESERVED_DESCRIPTORS = 200
 """File descriptors of HAProxy for listeners, threads and health checks. Each connection needs 2.5: two sockets, and a
 pipe for a quarter of the connections (`maxpipes`)."""
 RAY_PORTS = {"STATS": "8404", "METRICS": "9101"}
 """HAProxy's own ports, unless Ray's environment variables change them."""
+ERRORS = {
+    502: ("Bad Gateway", "replica_lost", "the replica ended before it responded: repeat the request"),
+    503: ("Service Unavailable", "no_replica", "no replica accepts the request: repeat it"),
+    504: ("Gateway Timeout", "deadline_exceeded", "the replica did not respond in time"),
+}
+"""HAProxy's own responses: status → reason, code and message. Ray would send 500 and a text."""
 SCRIPT = """#!/bin/sh
 here='{here}'
 
 amend() {{  # Ray's configuration
     sed -i \\
         -e 's/^\\( *bind \\)[*]\\{{0,1\\}}:\\({stats}\\|{metrics}\\)$/\\1127.0.0.1:\\2/' \\
-        -e 's/^defaults$/&\\n    timeout http-request {head}s\\n    timeout tunnel {tunnel}s/' \\
+        -e 's/^defaults$/&{timeouts}/' \\
+        -e 's|^\\( *\\)errorfile \\([0-9]*\\) .*$|\\1errorfile \\2 {here}/error.\\2|' \\
         -e 's/^frontend http_frontend$/&\\n    option http-buffer-request/' \\
         "$1"
     descriptors=$(ulimit -Hn)
@@ -98,7 +106,7 @@ exec '{haproxy}' "$@"
 """Restricts the statistics to this machine. Limits the number of connections to those for which there are file
 descriptors: HAProxy does not start otherwise. Limits the time to send a request, and sets the idle timeout of
 WebSockets, to which the request timeouts would apply otherwise. A request is forwarded once its body has arrived or
-fills the buffer, so that slow clients occupy no replica."""
+fills the buffer, so that slow clients occupy no replica. HAProxy's own errors are those of the API, with their code."""
 
 
 def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
@@ -108,8 +116,7 @@ def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
         haproxy=binary,
         stats=stats,
         metrics=metrics,
-        head=REQUEST_TIMEOUT,
-        tunnel=TUNNEL_TIMEOUT,
+        timeouts="".join(f"\\n    timeout {name} {seconds}s" for name, seconds in TIMEOUTS.items()),
         reserved=RESERVED_DESCRIPTORS,
         stopped=STOPPED,
         stand_in=STAND_IN,
@@ -130,13 +137,29 @@ def find_haproxy() -> str | None:
 
 
 def install(directory: Path, binary: str, stats: int, metrics: int) -> Path:
-    """Write the script into HAProxy's directory; returns its path. Arguments as of `script`."""
-    path = directory / "haproxy"
-    draft = path.with_suffix(f".{os.getpid()}")
-    draft.write_text(script(directory, binary, stats, metrics))
-    draft.chmod(0o700)
-    draft.rename(path)  # a shell may be reading the former one
-    return path
+    """Write the script and the error responses into HAProxy's directory; returns the script's path.
+
+    Arguments as of `script`.
+    """
+    for status in ERRORS:
+        _replace(directory / f"error.{status}", error_response(status), 0o600)
+    return _replace(directory / "haproxy", script(directory, binary, stats, metrics), 0o700)
+
+
+def _replace(path: Path, text: str, mode: int) -> Path:
+    """Write a file of which another process may be reading the former content."""
+    draft = path.with_name(f"{path.name}.{os.getpid()}")
+    draft.write_text(text)
+    draft.chmod(mode)
+    return draft.rename(path)
+
+
+def error_response(status: int) -> str:
+    """HAProxy's own response, in the formats of both protocols: the body of /v2 has `error`, others have `code`."""
+    reason, code, message = ERRORS[status]
+    body = json.dumps({"code": code, "message": message, "error": message})
+    headers = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\nRetry-After: 1\r\n"
+    return f"HTTP/1.1 {status} {reason}\r\n{headers}\r\n{body}"
 
 
 def main() -> NoReturn:

@@ -176,6 +176,13 @@ def test_which_outcomes_are_retried(outcome: Any, is_repeated: bool) -> None:
     assert Retries(0).next_delay(outcome) is None
 
 
+def test_a_request_waits_longer_for_a_replica_than_for_a_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retries, "INITIAL_DELAY", 2 * retries.NOT_READY_DEADLINE)
+    monkeypatch.setattr(retries, "JITTER", 0.0)
+    assert Retries(10).next_delay(reply(503, "not_ready")) is None
+    assert Retries(10).next_delay(reply(503, "no_replica")) is not None
+
+
 def test_delays_grow_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retries, "INITIAL_DELAY", 0.01)
     attempts = Retries(1e9)

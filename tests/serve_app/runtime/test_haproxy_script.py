@@ -1,13 +1,19 @@
 """A node of a cluster starts HAProxy by `league-haproxy`, with the same limits as `league serve`."""
 
 import os
+import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import httpx
 import pytest
 
-from serve_app.runtime import haproxy_script
+from serve_app.runtime import haproxy, haproxy_script
+from tests.support.waiting import until
 
 COMMAND = str(Path(sys.executable).with_name(haproxy_script.COMMAND))
 NODE = os.environ | {haproxy_script.BINARY_PATH: COMMAND}
@@ -51,6 +57,7 @@ def test_a_node_has_the_limits(environment: dict[str, str], stats: int, metrics:
     assert "timeout tunnel 3600s" in amended, "idle WebSockets would end with the timeout of a request"
     assert "timeout http-request 10s" in amended
     assert "option http-buffer-request" in amended
+    assert "timeout check 5s" in amended, "a busy replica has more time than the interval of health checks"
     assert f"bind 127.0.0.1:{stats}" in amended, "statistics are for this machine only"
     assert f"bind 127.0.0.1:{metrics}" in amended
 
@@ -75,3 +82,72 @@ def test_options_without_a_configuration_are_passed_on() -> None:
     shown = subprocess.run([COMMAND, "-v"], env=NODE, capture_output=True, text=True, timeout=60)
     assert shown.returncode == 0
     assert shown.stdout.startswith("HAProxy version")
+
+
+PROXY = """defaults
+    mode http
+    timeout connect 1s
+    timeout client 10s
+    timeout server 500ms
+    errorfile 502 {directory}/500.http
+    errorfile 503 {directory}/500.http
+    errorfile 504 {directory}/500.http
+frontend http_frontend
+    bind 127.0.0.1:{port}
+    use_backend replicas if TRUE
+backend replicas
+    server one 127.0.0.1:{replica} check inter 1h
+"""
+"""As Ray writes it: its own page for all errors."""
+
+
+@contextmanager
+def proxy(directory: Path, replica: int) -> Iterator[str]:
+    """HAProxy in front of a replica's port, started as Ray starts it. Yields its URL."""
+    (port,) = haproxy.free_ports(1, "127.0.0.1")
+    configuration = directory / "haproxy.cfg"
+    configuration.write_text(PROXY.format(directory=directory, port=port, replica=replica))
+    with subprocess.Popen([COMMAND, "-db", "-f", str(configuration)], env=NODE, stderr=subprocess.DEVNULL) as process:
+        try:
+            until(lambda: not haproxy.is_free("127.0.0.1", port))
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            (directory / haproxy_script.STOPPED).touch()  # no stand-in
+            process.kill()
+
+
+def refused(directory: Path, path: str, replica: int) -> dict[str, str]:
+    """HAProxy's own response to a request, which is an error."""
+    with proxy(directory, replica) as url, httpx.Client(base_url=url, trust_env=False) as client:
+        response = client.post(path, json={})
+    assert (response.headers["content-type"], response.headers["retry-after"]) == ("application/json", "1")
+    document: dict[str, str] = response.json()
+    assert document["error"] == document["message"], "the field of /v2 is that of /v1"
+    return {"status": str(response.status_code), "code": document["code"]}
+
+
+@pytest.mark.parametrize("path", ["/v1/policies/board/action", "/v2/models/board/infer"])
+def test_errors_of_haproxy_are_those_of_the_api(path: str, tmp_path: Path) -> None:
+    with socket.socket() as replica:
+        replica.bind(("127.0.0.1", 0))
+        port = replica.getsockname()[1]
+        assert refused(tmp_path, path, port) == {"status": "503", "code": "no_replica"}, "nobody listens"
+        replica.listen()
+        assert refused(tmp_path, path, port) == {"status": "504", "code": "deadline_exceeded"}, "it does not respond"
+
+
+def test_a_replica_that_ends_before_it_responds_is_reported(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as replica:
+
+        def begin_a_response() -> None:
+            with suppress(OSError):  # closed by the test
+                while True:
+                    connection, _ = replica.accept()
+                    with connection:
+                        if connection.recv(10_000):  # nothing from a health check
+                            connection.sendall(b"HTTP/1.1 200")
+
+        threading.Thread(target=begin_a_response, daemon=True).start()
+        found = refused(tmp_path, "/v1/leagues", replica.getsockname()[1])
+        replica.shutdown(socket.SHUT_RDWR)
+    assert found == {"status": "502", "code": "replica_lost"}

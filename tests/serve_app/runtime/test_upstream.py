@@ -92,11 +92,10 @@ class TestHAProxyConfiguration:
 
     def start(self, directory: Path) -> None:
         """Run the script as Ray does, with FAKE in place of HAProxy."""
-        binary, script = directory / "binary", directory / "haproxy"
+        binary = directory / "binary"
         binary.write_text(FAKE)
-        script.write_text(haproxy_script.script(directory, str(binary), STATS, METRICS))
-        for path in (binary, script):
-            path.chmod(0o700)
+        binary.chmod(0o700)
+        script = haproxy_script.install(directory, str(binary), STATS, METRICS)
         subprocess.run([script, "-db", "-f", directory / "haproxy.cfg"], check=True, timeout=20, cwd=directory)
 
     def start_with_stand_in(self, directory: Path) -> None:
@@ -141,11 +140,17 @@ class TestHAProxyConfiguration:
         self.start_with_stand_in(directory)
         text = (directory / "haproxy.cfg").read_text()
         for line in (
-            f"defaults\n    timeout http-request {haproxy_script.REQUEST_TIMEOUT}s\n"
-            f"    timeout tunnel {haproxy_script.TUNNEL_TIMEOUT}s\n",
+            "defaults\n    timeout http-request 10s\n    timeout tunnel 3600s\n    timeout check 5s\n",
             "frontend http_frontend\n    option http-buffer-request\n",
         ):
             assert line in text, "haproxy_script.py no longer adds this to Ray's configuration"
+
+    def test_errors_are_replaced(self, directory: Path) -> None:
+        self.start_with_stand_in(directory)
+        lines = [line.split() for line in (directory / "haproxy.cfg").read_text().splitlines() if "errorfile" in line]
+        assert lines == [
+            ["errorfile", str(status), str(directory / f"error.{status}")] for status in haproxy_script.ERRORS
+        ], "haproxy_script.py replaces each of Ray's error pages"
 
     def test_the_stand_in_keeps_the_routes_only(self, directory: Path) -> None:
         self.start_with_stand_in(directory)
@@ -198,9 +203,7 @@ class TestHAProxyConfiguration:
         for port, free in ports.items():
             text = re.sub(rf":{port}\b", f":{free}", text)
         path.write_text(text)
-        script = directory / "haproxy"
-        script.write_text(haproxy_script.script(directory, binary, ports[STATS], ports[METRICS]))
-        script.chmod(0o700)
+        script = haproxy_script.install(directory, binary, ports[STATS], ports[METRICS])
         replica = ThreadingHTTPServer(("127.0.0.1", ports[40000]), Replica)
         threading.Thread(target=replica.serve_forever, daemon=True).start()
         url, answered = f"http://127.0.0.1:{ports[HTTP]}/v1/health/ready", list[int]()

@@ -32,7 +32,7 @@ class Caller:
         self.url, self.key, self.league, self.file = url, key, league, file
         self.stop = threading.Event()
         self.report: dict[str, Any] = {"calls": 0, "lost": [], "attempts": 0, "attempts_lost": [], "longest": 0.0}
-        self.report |= {"versions": {}, "replicas": {}}
+        self.report |= {"attempts_shed": [], "versions": {}, "replicas": {}}
         self._lock = threading.Lock()
 
     def wait_until_ready(self) -> None:
@@ -65,14 +65,16 @@ class Caller:
         path, headers = f"{self.url}/v1/policies/{self.league}/action", {"x-api-key": self.key}
         with httpx.Client(timeout=TIMEOUT, headers=headers, trust_env=False) as client:
             while not self.stop.is_set():
-                began, failure = time.time(), None
+                began, failure, kind = time.time(), None, "attempts_lost"
                 try:
                     response = client.post(path, json=BODY)
+                    if response.status_code == 429:
+                        kind = "attempts_shed"
                     if response.status_code != 200:
                         failure = f"{began:.3f} {response.status_code} {response.text[:200]}"
                 except httpx.TransportError as error:
                     failure = f"{began:.3f} {error!r}"
-                self._count("attempts", "attempts_lost", failure)
+                self._count("attempts", kind, failure)
 
     def watch(self) -> None:
         """Which replicas answer."""

@@ -47,6 +47,11 @@ class Load:
         """Single attempts that failed."""
         return list(self.report["attempts_lost"])
 
+    @property
+    def attempts_shed(self) -> list[str]:
+        """Single attempts that an overloaded replica refused with 429."""
+        return list(self.report["attempts_shed"])
+
     def versions(self) -> list[str]:
         """The versions that answered, in the order of their first answers."""
         found = self.report["versions"]
