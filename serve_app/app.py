@@ -112,6 +112,7 @@ class PolicyServer(ray_serve.AsgiReplica):
     ) -> None:
         check_deployed_stack(stack, ray_serve.node_address())
         sys.setswitchinterval(SWITCH_INTERVAL)
+        ray_serve.load_proxy_classes_from_installed_code()
         # A replica that starts while the database is missing must not create an empty one.
         registry = Registry.open(Storage.from_environment(), create=False)
         self._replica = Replica(

@@ -53,6 +53,18 @@ def is_draining() -> bool:
     return any(getattr(replica, "_shutting_down", False) for replica in replicas)
 
 
+def load_proxy_classes_from_installed_code() -> None:
+    """Let this process take the classes of actors from the installed packages, if they are there.
+
+    The proxy of a head that was started again sends its handle to each replica. The event loop would fetch the class of
+    that proxy from the head, and block for up to 15 s until this process is connected again.
+    """
+    from ray._private.worker import global_worker
+    from ray.serve._private import haproxy, proxy  # noqa: F401 (imported here, not by the event loop)
+
+    global_worker.set_load_code_from_local(True)
+
+
 def request_counter() -> Callable[[str, int], None]:
     """Adds requests of a route to Ray Serve's count of the requests of this replica, which Ray's dashboard shows.
 

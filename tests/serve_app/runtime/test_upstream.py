@@ -20,7 +20,9 @@ import httpx
 import psutil
 import pytest
 import uvicorn
+from ray._private.function_manager import FunctionActorManager
 from ray._private.worker import global_worker
+from ray._raylet import PythonFunctionDescriptor
 from ray.serve._private import common, grpc_util, http_util, replica
 from ray.serve._private.common import RequestProtocol
 from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
@@ -236,6 +238,18 @@ class Replica(BaseHTTPRequestHandler):
 
     def log_message(self, *_: object) -> None:
         """Print nothing."""
+
+
+@pytest.mark.parametrize("name", ["proxy.ProxyActor", "haproxy.HAProxyManager"])
+def test_classes_of_proxies_are_loaded_without_a_head(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a replica that receives the handle of a new head's proxy: a worker without a connection."""
+    monkeypatch.setattr(global_worker, "_load_code_from_local", False)
+    ray_serve.load_proxy_classes_from_installed_code()
+    worker = SimpleNamespace(load_code_from_local=global_worker._load_code_from_local)
+    module, _, class_name = name.partition(".")
+    descriptor = PythonFunctionDescriptor(f"ray.serve._private.{module}", "__init__", class_name, "0")
+    loaded = FunctionActorManager(worker).load_actor_class(None, descriptor)
+    assert hasattr(loaded, "ready")
 
 
 def test_ray_serve_knows_the_variables_that_are_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
