@@ -17,6 +17,7 @@ from serve_app.access.errors import CODES, status_of
 from serve_app.access.permissions import for_request
 from serve_app.app import Replica
 from serve_app.openapi.document import document
+from serve_app.runtime import haproxy_script
 from tests.support.servers.replicas import QUICK
 
 ROOT = Path(__file__).parents[3]
@@ -146,4 +147,10 @@ def test_docs_http_md_lists_the_same_codes(openapi: dict[str, Any]) -> None:
         for status, response in operation["responses"].items()
         for code in codes_of(openapi, response)
     }
-    assert written == documented | {(405, "method_not_allowed")}
+    of_haproxy = {(status, code) for status, (_, code, _) in haproxy_script.ERRORS.items()}
+    assert written == documented | of_haproxy | {(405, "method_not_allowed")}
+
+
+def test_the_errors_of_haproxy_are_described(openapi: dict[str, Any]) -> None:
+    for status, (_, code, _) in haproxy_script.ERRORS.items():
+        assert f"{status} `{code}`" in openapi["info"]["description"]
