@@ -2,7 +2,7 @@
 
 from typing import Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from league.config.base import ContestantRef, Part
 
@@ -23,7 +23,7 @@ class OpponentConfig(Part):
 
 
 Sampling = Literal["latest", "uniform", "pfsp", "nash", "alpha_rank"]
-Weighting = Literal["squared", "variance", "linear_capped"]
+Weighting = Literal["power", "variance", "linear_capped"]
 
 
 class LeagueOpponentsConfig(Part):
@@ -34,8 +34,10 @@ class LeagueOpponentsConfig(Part):
     sampling: Sampling = "pfsp"
     """How opponents are drawn. latest: the newest version. uniform: all candidates alike. pfsp: by the probability x
     that the learner beats them. nash, alpha_rank: by their shares in the payoff matrix of the candidates."""
-    weighting: Weighting = "squared"
-    """With pfsp, the weight of an opponent. squared: (1 - x)². variance: x(1 - x). linear_capped: min(½, 1 - x)."""
+    weighting: Weighting = "power"
+    """With pfsp, the weight of an opponent. power: (1 - x)^power. variance: x(1 - x). linear_capped: min(½, 1 - x)."""
+    power: float = Field(default=2.0, gt=0)
+    """The exponent of weighting `power`: the higher it is, the more often the strongest opponents are drawn."""
     window: int = Field(default=10, ge=1)
     """Number of newest versions that are candidates, exploiters not counted."""
     champions: bool = True
@@ -46,6 +48,11 @@ class LeagueOpponentsConfig(Part):
     """Maximum number of opponents that episodes start with between two updates."""
     forgotten: float = Field(default=0.15, ge=0, le=1)
     """Fraction of the draws that is uniform over the opponents with x < 0.7, if there are any."""
+
+    @field_validator("weighting", mode="before")
+    @classmethod
+    def _from_former_name(cls, value: Any) -> Any:
+        return "power" if value == "squared" else value
 
 
 class OpponentsConfig(Part):

@@ -1,7 +1,10 @@
 """Errors of a configuration in one line, with the key, the expected value and similar known keys."""
 
 import difflib
-from typing import Any, get_args, get_origin
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -12,6 +15,17 @@ from league.errors import one_line
 
 RENAMED_KEYS = {"copies": "num_envs"}
 """Former key → current key."""
+SHOWN = 3
+"""Number of faults in a message."""
+TYPES = {
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a mapping",
+    "model_type": "a mapping",
+    "string_type": "a string",
+}
+"""Pydantic's type of an error → what YAML calls the expected value."""
+BASIC_TYPES = ("str", "int", "float", "bool")
 
 
 def describe_yaml_error(error: yaml.YAMLError | UnicodeDecodeError) -> str:
@@ -22,44 +36,109 @@ def describe_yaml_error(error: yaml.YAMLError | UnicodeDecodeError) -> str:
 
 
 def describe_validation_error(model: type[BaseModel], error: ValidationError) -> str:
-    """Return the first errors as a sentence that names the keys and the expected values."""
-    return "; ".join(_describe_one(model, detail) for detail in error.errors()[:3])
+    """Return the first faults as a sentence that names the keys and the expected values, unknown keys first."""
+    faults = _without_consequences([Fault.of(model, detail) for detail in error.errors()])
+    unknown_first = sorted(faults, key=lambda fault: not fault.is_unknown_key)
+    messages = dict.fromkeys(str(fault) for fault in unknown_first)
+    return "; ".join(list(messages)[:SHOWN])
 
 
-def _describe_one(model: type[BaseModel], detail: Any) -> str:
-    path, known_by = [str(part) for part in detail["loc"]], model
-    if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
-        # Pydantic includes the member of the union in the path.
-        known_by = ALGORITHMS[path.pop(1)]
-        path = [part for part in path if part not in SCHEDULE_FORMS]
-    key = ".".join(path) or "file"
+@dataclass(frozen=True)
+class Fault:
+    """One of pydantic's errors. path: keys and indices, without the names of union members; guess: a similar key."""
+
+    path: tuple[str | int, ...]
+    kind: str
+    message: str
+    guess: str | None = None
+
+    @classmethod
+    def of(cls, model: type[BaseModel], detail: Any) -> "Fault":
+        """Read an error of `model`."""
+        path, known_by, start = list(detail["loc"]), model, 0
+        if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
+            known_by, start = ALGORITHMS[path.pop(1)], 1
+            path = [part for part in path if part not in SCHEDULE_FORMS]
+        path = [part for part in path if not _is_union_member(part, detail["type"])]
+        if detail["type"] != "extra_forbidden" or path[-1] in RENAMED_KEYS:
+            return cls(tuple(path), detail["type"], _message(detail, path))
+        known = _known_keys(known_by, path[start:-1])
+        guesses = difflib.get_close_matches(str(path[-1]), known, n=1)
+        listed = f", expected one of {', '.join(sorted(known))}" if known else ""
+        hint = f", did you mean {guesses[0]!r}?" if guesses else listed
+        return cls(tuple(path), "extra_forbidden", f"unknown key{hint}", guesses[0] if guesses else None)
+
+    @property
+    def is_unknown_key(self) -> bool:
+        """Whether the fault is a key that does not exist."""
+        return self.kind == "extra_forbidden"
+
+    def __str__(self) -> str:
+        key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in self.path).removeprefix(".")
+        return f"{key or 'file'}{'.algorithm' if self.kind == 'union_tag_invalid' else ''}: {self.message}"
+
+
+def _message(detail: Any, path: list[str | int]) -> str:
     match detail["type"]:
         case "missing":
-            return f"{key}: missing, but required"
-        case "extra_forbidden" if path[-1] in RENAMED_KEYS:
-            return f"{key}: this key has been renamed to {RENAMED_KEYS[path[-1]]!r}"
+            return "missing, but required"
         case "extra_forbidden":
-            known = _known_keys(known_by, path[:-1] if known_by is model else path[1:-1])
-            guess = difflib.get_close_matches(path[-1], known, n=1)
-            hint = f"did you mean {guess[0]!r}?" if guess else f"expected one of {', '.join(sorted(known))}"
-            return f"{key}: unknown key, {hint}"
+            return f"this key has been renamed to {RENAMED_KEYS[str(path[-1])]!r}"
         case "union_tag_invalid":
-            return f"{key}.algorithm: expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
+            return f"expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
         case "value_error":
-            return f"{key}: {detail['ctx']['error']}"
-    expected = detail["msg"][0].lower() + detail["msg"][1:]
-    return f"{key}: {expected}, got {detail['input']!r}"
+            return str(detail["ctx"]["error"])
+        case kind if kind in TYPES:
+            return f"expected {TYPES[kind]}, got {detail['input']!r}"
+    return f"{detail['msg'][0].lower()}{detail['msg'][1:]}, got {detail['input']!r}"
 
 
-def _known_keys(model: type[BaseModel], path: list[str]) -> list[str]:
+def _is_union_member(part: str | int, kind: str) -> bool:
+    """Pydantic puts the member that it tried into the path: `tuple[str, ...]`, or the name of a basic type."""
+    return isinstance(part, str) and ("[" in part or (part in BASIC_TYPES and kind.endswith("_type")))
+
+
+def _without_consequences(faults: list[Fault]) -> list[Fault]:
+    """Leave out faults of a collection with a faulty item, and keys that are missing because they are misspelt."""
+    paths = [fault.path for fault in faults]
+    misspelt = {(*fault.path[:-1], fault.guess) for fault in faults if fault.guess is not None}
+    return [
+        fault
+        for fault in faults
+        if not (fault.kind == "missing" and fault.path in misspelt)
+        and not any(len(path) > len(fault.path) and path[: len(fault.path)] == fault.path for path in paths)
+    ]
+
+
+def _known_keys(model: type[BaseModel], path: list[str | int]) -> list[str]:
+    """The keys of the mappings at a path below `model`."""
+    annotations: list[Any] = [model]
     for part in path:
-        if part.isdigit():
-            continue  # the index of a list whose item model is already current
-        fields = {field.alias or name: field for name, field in model.model_fields.items()}
-        annotation = fields[part].annotation if part in fields else None
-        while get_origin(annotation) is not None and get_args(annotation):
-            annotation = get_args(annotation)[0]
-        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
-            return []
-        model = annotation
-    return [field.alias or name for name, field in model.model_fields.items()]
+        annotations = [below for annotation in annotations for below in _below(annotation, part)]
+    models = [member for annotation in annotations for member in _members(annotation) if _is_model(member)]
+    return [field.alias or name for found in models for name, field in found.model_fields.items()]
+
+
+def _below(annotation: Any, part: str | int) -> Iterator[Any]:
+    """The types of a value's part: of a model's field, a mapping's value or a list's item."""
+    for member in _members(annotation):
+        if _is_model(member):
+            yield from (field.annotation for name, field in member.model_fields.items() if part in (field.alias, name))
+        elif issubclass(get_origin(member) or object, Mapping):
+            yield from get_args(member)[-1:]
+        elif isinstance(part, int):
+            yield from get_args(member)[:1]
+
+
+def _members(annotation: Any) -> list[Any]:
+    """The members of a union, without annotations."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _members(arguments[0])
+    if origin in (Union, UnionType):
+        return [member for argument in arguments for member in _members(argument)]
+    return [annotation]
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)

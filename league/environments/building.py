@@ -3,8 +3,9 @@
 import fnmatch
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
+from inspect import signature
 from typing import Any
 
 import gymnasium
@@ -25,7 +26,7 @@ from league.entry_points import import_entry_point, import_module, missing
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
-from league.errors import ConfigError, EnvironmentMismatch, LeagueError
+from league.errors import ConfigError, EnvironmentMismatch, LeagueError, one_line, raised_at
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
 from league.spaces import Discrete
@@ -91,8 +92,12 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
     kwargs = config.kwargs if render_mode is None else config.kwargs | {"render_mode": render_mode}
     try:
         env = constructor(**kwargs)
-    except TypeError as error:
-        raise ConfigError(f"environment.kwargs: {config.entry_point} does not accept them: {error}") from error
+    except LeagueError:
+        raise
+    except Exception as error:
+        if _refuses_arguments(constructor, kwargs, error):
+            raise ConfigError(f"environment.kwargs: {config.entry_point} does not accept them: {error}") from error
+        raise ConfigError(f"environment.entry_point: {config.entry_point} cannot be created{_cause(error)}") from error
     found = _api(env)
     if found is None or config.api not in (None, found):
         expected = NAMES[config.api] if config.api else "an environment of PettingZoo (AEC or Parallel) or RLlib"
@@ -108,6 +113,34 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
             " environments; for an RLlib environment, transform observations in its own code"
         )
     return with_info_masks(with_cycles(wrapped(env, config.wrappers)), f"{config.model_dump_json()}{config.folder}")
+
+
+def _refuses_arguments(constructor: Callable[..., Any], kwargs: Mapping[str, Any], error: Exception) -> bool:
+    """Whether an error is about the names of arguments, which a constructor may pass on to another one."""
+    try:
+        signature(constructor).bind(**kwargs)
+    except TypeError:
+        return True
+    except ValueError:  # it has no signature
+        return isinstance(error, TypeError)
+    return isinstance(error, TypeError) and "keyword argument" in str(error)
+
+
+def _spaces(env: Any, agent: str, entry_point: str) -> AgentInterface:
+    try:
+        spaces = observation_space(env, agent), action_space(env, agent)
+    except LeagueError:
+        raise
+    except Exception as error:
+        raise EnvironmentMismatch(f"{entry_point}: the spaces of {agent} cannot be read{_cause(error)}") from error
+    observation, action = map(from_gymnasium, spaces)
+    return AgentInterface(observation=observation, action=action)
+
+
+def _cause(error: Exception) -> str:
+    """Describe an exception of an environment's code: where it was raised, its type and its message."""
+    where = raised_at(error)
+    return f"{f' ({where})' if where else ''}: {one_line(error, with_type=True)}"
 
 
 def observation_space(env: Any, agent: str) -> gymnasium.Space[Any]:
@@ -150,13 +183,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
         raise EnvironmentMismatch(f"{config.environment.entry_point} has no possible_agents, which are required")
     if not all(isinstance(name, str) for name in names):
         raise EnvironmentMismatch(f"{config.environment.entry_point} has agents {names}: expected strings")
-    agents = {
-        agent: AgentInterface(
-            observation=from_gymnasium(observation_space(env, agent)),
-            action=from_gymnasium(action_space(env, agent)),
-        )
-        for agent in names
-    }
+    agents = {agent: _spaces(env, agent, config.environment.entry_point) for agent in names}
     divided = config.policies
     if divided is None:
         policies = policies_by_spaces(agents)

@@ -137,6 +137,51 @@ def test_a_misspelt_function(league: League, folder: Path) -> None:
     assert one_line(result.err) == f"league: {expected}"
 
 
+CONSTRUCTOR = """    most = 5
+
+    def __init__(self, side=3):
+        self.side = side"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "    most = 5",
+            f"{CONSTRUCTOR} + missing",
+            "cannot be created ({place}): NameError: name 'missing' is not defined",
+        ),
+        ("    most = 5", f'{CONSTRUCTOR} + "a"', "cannot be created ({place}): TypeError: unsupported operand type(s)"),
+        (
+            "return spaces.Box(0, 9, (1,), np.float32)",
+            "return self.space",
+            "the spaces of a cannot be read ({place}): AttributeError: 'Guess' object has no attribute 'space'",
+        ),
+    ],
+)
+@pytest.mark.parametrize(("command", "code"), [("check-env", 1), ("train", 2)])
+def test_an_exception_in_the_constructor(
+    league: League, folder: Path, command: str, code: int, old: str, new: str, message: str
+) -> None:
+    line = replaced(folder, old, new)
+    write(folder)
+    result = league(command, "guess.yaml")
+    assert result.code == code
+    text = " ".join((result.out + result.err).split())
+    assert message.format(place=f"{module(folder)}, line {line}") in text
+
+
+def test_an_unknown_argument_of_the_constructor(league: League, folder: Path) -> None:
+    replaced(folder, "    most = 5", CONSTRUCTOR)
+    entry_point = f"{module(folder).stem}:Guess"
+    write(folder, environment={"entry_point": entry_point, "kwargs": {"sied": 4}})
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    message = f"environment.kwargs: {entry_point} does not accept them: "
+    assert one_line(result.err).startswith(f"league: {message}")
+    assert "'sied'" in result.err
+
+
 def test_an_exception_in_step(league: League, folder: Path) -> None:
     line = replaced(folder, "self.steps += 1", "self.steps += self.speed")
     write(folder)
@@ -173,8 +218,18 @@ def test_an_observation_outside_of_its_space(league: League, folder: Path) -> No
     result = league("check-env", "guess.yaml", "--json")
     assert result.code == 1
     faults = [each for each in result.json["findings"] if each["severity"] == "fault"]
-    assert faults[0]["text"] == "observes observation with shape [1], but its space has [2]"
+    expected = "observes observation with shape [1], but its space has [2]"
+    assert faults[0]["text"] == f"{expected}: correct observation_space, or what reset and step return"
     assert faults[0]["agents"] == ["a", "b"]
+    assert [each for each in result.json["findings"] if "not in its space" in each["text"]] == []
+
+
+def test_a_value_outside_of_its_space(league: League, folder: Path) -> None:
+    replaced(folder, "self.rng.integers(10)", "self.rng.integers(10, 11)")
+    write(folder)
+    result = league("check-env", "guess.yaml", "--json")
+    notes = [each for each in result.json["findings"] if "observations are not in its space Box(0.0" in each["text"]]
+    assert [each["example"] for each in notes] == ["observation[0] is 10, outside of [0, 9]"]
 
 
 def test_an_observation_of_another_structure(league: League, folder: Path) -> None:
@@ -183,7 +238,8 @@ def test_an_observation_of_another_structure(league: League, folder: Path) -> No
     result = league("check-env", "guess.yaml", "--json")
     assert result.code == 1
     (fault,) = [each["text"] for each in result.json["findings"] if each["severity"] == "fault"]
-    assert fault == "a observes a dict with digit, but its space is Box(0.0, 9.0, (1,), float32)"
+    expected = "a observes a dict with digit, but its space is Box(0.0, 9.0, (1,), float32)"
+    assert fault == f"{expected}: correct observation_space, or what reset and step return"
 
 
 def test_a_wrong_name_of_a_league(league: League, registry: Registry) -> None:

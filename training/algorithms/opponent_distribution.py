@@ -3,7 +3,7 @@
 x is the probability that the learner beats an opponent, where draws count ½.
 
 - **pfsp**: prioritised fictitious self-play (O. Vinyals et al., "Grandmaster level in StarCraft II using multi-agent
-  reinforcement learning", Nature 575, 2019), with the weight (1 - x)², x(1 - x) or min(½, 1 - x);
+  reinforcement learning", Nature 575, 2019), with the weight (1 - x)^p, x(1 - x) or min(½, 1 - x);
 - **nash**, **alpha_rank**: policy-space response oracles (M. Lanctot et al., "A unified game-theoretic approach to
   multiagent reinforcement learning", NeurIPS 2017): the meta-strategy of the candidates' payoff matrix.
 """
@@ -11,7 +11,7 @@ x is the probability that the learner beats an opponent, where draws count ½.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from league.config.opponents import LeagueOpponentsConfig, Sampling, Weighting
+from league.config.opponents import LeagueOpponentsConfig, Weighting
 from league.results.equilibria import alpha_rank, nash_averaging
 from league.results.payoffs import UNKNOWN
 
@@ -35,18 +35,18 @@ def opponent_distribution(settings: LeagueOpponentsConfig, scores: ArrayLike, pa
     x = known(scores)
     if not len(x):
         return x
-    drawn = _base(settings.sampling, settings.weighting, x, known(payoff))
+    drawn = _base(settings, x, known(payoff))
     forgotten = x < FORGOTTEN_BELOW
     if not forgotten.any():
         return drawn
     return np.asarray((1 - settings.forgotten) * drawn + settings.forgotten * forgotten / forgotten.sum())
 
 
-def pfsp_weights(scores: Floats, weighting: Weighting) -> Floats:
+def pfsp_weights(scores: Floats, weighting: Weighting, power: float) -> Floats:
     """Return the weights of opponents whom the learner beats with probabilities `scores`, (n,)."""
     match weighting:
-        case "squared":
-            return (1 - scores) ** 2
+        case "power":
+            return np.asarray((1 - scores) ** power)
         case "variance":
             return scores * (1 - scores)
         case "linear_capped":
@@ -69,15 +69,15 @@ def known(scores: ArrayLike) -> Floats:
     return np.nan_to_num(np.asarray(scores, dtype=np.float64), nan=UNKNOWN)
 
 
-def _base(sampling: Sampling, weighting: Weighting, x: Floats, payoff: Floats) -> Floats:
+def _base(settings: LeagueOpponentsConfig, x: Floats, payoff: Floats) -> Floats:
     uniform = np.full(len(x), 1 / len(x))
-    match sampling:
+    match settings.sampling:
         case "latest":
             return np.eye(len(x))[-1]
         case "uniform":
             return uniform
         case "pfsp":
-            weights = pfsp_weights(x, weighting)
+            weights = pfsp_weights(x, settings.weighting, settings.power)
             total = weights.sum()
             return weights / total if total > 0 else uniform
         case "nash":

@@ -57,7 +57,9 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, s
         found.add("fault", str(error))
         return found
     except Exception as error:
-        found.add("fault", f"{config.environment.entry_point} cannot be created: {one_line(error, with_type=True)}")
+        where = "".join(f" ({place})" for place in [raised_at(error)] if place)
+        reason = one_line(error, with_type=True)
+        found.add("fault", f"{config.environment.entry_point} cannot be created{where}: {reason}")
         return found
     found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
     found.agents = len(interface.agents)

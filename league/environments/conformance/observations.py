@@ -19,6 +19,9 @@ ENOUGH_TURNS = 20
 """Minimum turns of an agent for the check that its observations change."""
 
 
+REMEDY = "correct observation_space, or what reset and step return"
+
+
 class ObservationCheck:
     """Splits an agent's observations into arrays, and checks them against its space."""
 
@@ -36,13 +39,12 @@ class ObservationCheck:
                 "note", "its observations are modified after they are returned: they are copied", self._agent
             )
         arrays = self._arrays(value)
-        for name, leaf in self._leaves.items():
-            if arrays[name].shape != leaf.shape:
-                shape, expected = list(arrays[name].shape), list(leaf.shape)
-                self._found.add(
-                    "fault", f"observes {name} with shape {shape}, but its space has {expected}", self._agent
-                )
-        if not self._gymnasium.contains(value):
+        misshapen = [name for name, leaf in self._leaves.items() if arrays[name].shape != leaf.shape]
+        for name in misshapen:
+            shape, expected = list(arrays[name].shape), list(self._leaves[name].shape)
+            text = f"observes {name} with shape {shape}, but its space has {expected}: {REMEDY}"
+            self._found.add("fault", text, self._agent)
+        if not misshapen and not self._gymnasium.contains(value):
             self._found.add(
                 "note",
                 f"observations are not in its space {_shortened(self._gymnasium)}: the bounds or the dtype differ;"
@@ -61,7 +63,7 @@ class ObservationCheck:
         except (TypeError, ValueError, LookupError) as error:
             kind = f"a dict with {', '.join(map(str, value))}" if isinstance(value, Mapping) else type(value).__name__
             raise EnvironmentMismatch(
-                f"{self._agent} observes {kind}, but its space is {_shortened(self._gymnasium)}"
+                f"{self._agent} observes {kind}, but its space is {_shortened(self._gymnasium)}: {REMEDY}"
             ) from error
 
 

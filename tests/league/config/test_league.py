@@ -60,7 +60,7 @@ def test_only_league_and_environment_are_required() -> None:
         ({"policies": {}}, "policies: expected at least one entry"),
         ({"policies": {"A": ["*"]}}, "must consist of a-z"),
         ({"play": {"opening_plies": -1}}, "play.opening_plies: "),
-        ({"environment": {"entry_point": "x", "wrappers": [{"a": 1, "b": 2}]}}, "environment.wrappers.0"),
+        ({"environment": {"entry_point": "x", "wrappers": [{"a": 1, "b": 2}]}}, "environment.wrappers[0]"),
     ],
 )
 def test_a_fault_has_source_key_and_expectation(change: dict, message: str) -> None:

@@ -124,7 +124,7 @@ def test_schedules_survive_json() -> None:
         ({"entropy": {"initial": -1, "final": 0}}, "training.entropy.initial: input should be greater than or equal"),
         ({"clip": []}, "training.clip: expected [step, value] pairs with increasing steps, got []"),
         ({"clip": [[10, 1], [10, 2]]}, "training.clip: expected [step, value] pairs with increasing steps, got [[10,"),
-        ({"clip": [0.1, 0.2]}, "training.clip.0: input should be a valid tuple, got 0.1"),
+        ({"clip": [0.1, 0.2]}, "training.clip[0]: expected a list, got 0.1"),
         ({"per_policy": {"a": {"lr": {"initial": 1}}}}, "training.per_policy.a.lr.final: missing, but required"),
     ],
 )

@@ -16,7 +16,7 @@ def distribution(
     payoff: object = None,
     *,
     sampling: Sampling = "pfsp",
-    weighting: Weighting = "squared",
+    weighting: Weighting = "power",
     forgotten: float = 0.0,
 ) -> np.ndarray:
     settings = LeagueOpponentsConfig(sampling=sampling, weighting=weighting, forgotten=forgotten)
@@ -27,22 +27,32 @@ def distribution(
 @pytest.mark.parametrize(
     ("weighting", "scores", "expected"),
     [
-        ("squared", [1.0, 1.0], [1 / 2, 1 / 2]),
+        ("power", [1.0, 1.0], [1 / 2, 1 / 2]),
         ("variance", [1.0, 0.0], [1 / 2, 1 / 2]),
         ("linear_capped", [1.0, 1.0, 1.0], [1 / 3, 1 / 3, 1 / 3]),
-        ("squared", [0.0, 0.0], [1 / 2, 1 / 2]),
+        ("power", [0.0, 0.0], [1 / 2, 1 / 2]),
         ("variance", [0.0, 0.0], [1 / 2, 1 / 2]),
         ("linear_capped", [0.0, 0.0], [1 / 2, 1 / 2]),
-        ("squared", [0.0, 0.5, 1.0], [4 / 5, 1 / 5, 0.0]),
+        ("power", [0.0, 0.5, 1.0], [4 / 5, 1 / 5, 0.0]),
         ("variance", [0.5, 0.75, 1.0], [4 / 7, 3 / 7, 0.0]),
         ("linear_capped", [0.0, 0.25, 0.75], [2 / 5, 2 / 5, 1 / 5]),
-        ("squared", [NAN, NAN], [1 / 2, 1 / 2]),
-        ("squared", [1.0, NAN], [0.0, 1.0]),
-        ("squared", [0.0, NAN], [4 / 5, 1 / 5]),
+        ("power", [NAN, NAN], [1 / 2, 1 / 2]),
+        ("power", [1.0, NAN], [0.0, 1.0]),
+        ("power", [0.0, NAN], [4 / 5, 1 / 5]),
     ],
 )
 def test_pfsp_prefers_opponents_that_win(weighting: Weighting, scores: list[float], expected: list[float]) -> None:
     np.testing.assert_allclose(distribution(scores, weighting=weighting), expected)
+
+
+@pytest.mark.parametrize(("power", "expected"), [(1.0, [2 / 3, 1 / 3]), (2.0, [4 / 5, 1 / 5]), (3.0, [8 / 9, 1 / 9])])
+def test_a_higher_power_prefers_stronger_opponents(power: float, expected: list[float]) -> None:
+    settings = LeagueOpponentsConfig(power=power, forgotten=0.0)
+    np.testing.assert_allclose(opponent_distribution(settings, [0.0, 0.5], np.full((2, 2), NAN)), expected)
+
+
+def test_the_former_name_of_a_weighting_is_read() -> None:
+    assert LeagueOpponentsConfig.model_validate({"weighting": "squared"}).weighting == "power"
 
 
 def test_forgotten_opponents_have_a_share_of_their_own() -> None:
@@ -69,7 +79,7 @@ def test_the_meta_strategy_of_the_payoff_matrix(sampling: Sampling) -> None:
 @given(
     scores=st.lists(st.floats(0, 1) | st.just(NAN), min_size=1, max_size=6),
     sampling=st.sampled_from(SAMPLINGS),
-    weighting=st.sampled_from(["squared", "variance", "linear_capped"]),
+    weighting=st.sampled_from(["power", "variance", "linear_capped"]),
     forgotten=st.floats(0, 1),
     data=st.data(),
 )
