@@ -201,6 +201,7 @@ class Replica:
             settings,
             on_heartbeat=registry.database.close_unused,
             on_replicas=lambda number: self.stream.replicas_counted(number),
+            is_draining=is_draining,
         )
         self.access = AccessControl(self.api_keys, settings, is_exposed)
         self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)

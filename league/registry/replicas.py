@@ -42,6 +42,8 @@ KEPT = timedelta(days=1)
 """Replicas that died without deregistering are removed after this time, unless another replica notices earlier."""
 LIVENESS_TIMEOUT = timedelta(seconds=15)
 """A replica without a report for longer is silent: dead, stuck, or cut off from the database."""
+DRAINING = "draining"
+"""Key in the description of a process, for a replica that is being stopped."""
 _UPDATE = update(ReplicaTable).where(ReplicaTable.replica == bindparam("name"))
 _UPDATE_NOW = _UPDATE.values(seen_at=func.clock_timestamp())
 """Built once, since replicas execute them again and again."""
@@ -53,23 +55,26 @@ class ReplicaCounts(NamedTuple):
     Attributes:
         registered: Replicas that have registered and were not removed.
         silent: Those of them that are silent.
+        draining: Those of them that are being stopped and get no new requests.
     """
 
     registered: int
     silent: int
+    draining: int
 
 
 class ReplicaRepository(Repository):
     """Writes and reads the reports of replicas."""
 
-    def register(self, replica: str, process: Mapping[str, str]) -> bool:
+    def register(self, replica: str, process: Mapping[str, str], is_draining: bool = False) -> bool:
         """Record that a replica runs.
 
         A replica registers before it reads the aliases for the first time, and then repeatedly.
-        process: where it runs; see RegisteredReplica. Returns whether it was registered already; if not, nothing that
+        process: where it runs; see RegisteredReplica. is_draining: whether it is being stopped. Returns whether it was registered already; if not, nothing that
         it has acknowledged is known.
         """
-        if self._update(replica, {"process": dict(process)}):
+        process = dict(process) | ({DRAINING: "true"} if is_draining else {})
+        if self._update(replica, {"process": process}):
             return True
         with self._database.write() as session:
             _remove(session, replica)
@@ -82,10 +87,11 @@ class ReplicaRepository(Repository):
             return _registered(session, true())
 
     def counts(self) -> ReplicaCounts:
-        """Return how many replicas have registered and were not removed, and how many of them are silent."""
+        """Return how many replicas have registered and were not removed, are silent, and are being stopped."""
         now = datetime.now(UTC) if self._database.is_sqlite else func.clock_timestamp()
         silent = func.count().filter(ReplicaTable.seen_at <= now - LIVENESS_TIMEOUT)
-        (found,) = self._database.rows(select(func.count(), silent).select_from(ReplicaTable))
+        draining = func.count().filter(ReplicaTable.process[DRAINING].as_string() == "true")
+        (found,) = self._database.rows(select(func.count(), silent, draining).select_from(ReplicaTable))
         return ReplicaCounts(*found)
 
     def silent(self) -> list[RegisteredReplica]:

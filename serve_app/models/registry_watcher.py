@@ -56,7 +56,8 @@ class RegistryWatcher:
     """Keeps slots, traffic and keys at what the registry requires, and acknowledges it as `replica`.
 
     update_keys: raises StorageError if the keys are those of a different database. on_heartbeat: called at each
-    heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas.
+    heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas that
+    are not being stopped. is_draining: whether this one is.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class RegistryWatcher:
         settings: ServeSettings,
         on_heartbeat: Callable[[], None] = lambda: None,
         on_replicas: Callable[[int], None] = lambda _: None,
+        is_draining: Callable[[], bool] = lambda: False,
     ) -> None:
         self._connection = connection
         self._slots = slots
@@ -80,6 +82,7 @@ class RegistryWatcher:
         self._settings = settings
         self._on_heartbeat = on_heartbeat
         self._on_replicas = on_replicas
+        self._is_draining = is_draining
         self._polling = Polling(self.poll_once, "the registry", settings, self._pause)
         self._aliases: Mapping[Alias, AliasTarget] = {}
         self._wanted_traffic: Mapping[str, Setting] = {}
@@ -151,15 +154,15 @@ class RegistryWatcher:
         self._heartbeat_at = time.monotonic() + self._settings.heartbeat
 
     def _report_life(self, registry: Registry) -> tuple[bool, int]:
-        """Whether this replica was registered, and the number of replicas."""
-        is_known = registry.replicas.register(self._replica, self._process.description)
+        """Whether this replica was registered, and the number of replicas that are not being stopped."""
+        is_known = registry.replicas.register(self._replica, self._process.description, self._is_draining())
         replicas = registry.replicas.counts()
         for other in registry.replicas.silent() if replicas.silent else ():
             if other.silence > KEPT or self._process.has_ended(other.process):
                 registry.replicas.remove(other.replica)
                 logger.info("replica %s has ended without deregistering", other.replica)
         self._on_heartbeat()
-        return is_known, replicas.registered
+        return is_known, replicas.registered - replicas.draining
 
     def _read(self, registry: Registry) -> _Read:
         """Read the parts that have changed, or all through a new connection: it may be a different database."""

@@ -115,7 +115,11 @@ class StreamRoute:
                     closing.cancel()
 
     def replicas_counted(self, number: int) -> None:
-        """Called at each heartbeat with the number of replicas. If it has changed, open streams reconnect."""
+        """Called at each heartbeat with the number of replicas that are not being stopped.
+
+        If it has changed, HAProxy has a new configuration, and the open streams reconnect. A replica that ends after it
+        was drained changes nothing.
+        """
         if self._replicas not in (None, number):
             self._reconnect(AFTER_CHANGE)
         self._replicas = number

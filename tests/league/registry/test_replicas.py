@@ -46,8 +46,17 @@ def test_a_silent_replica_is_listed(registry: Registry) -> None:
     silent = {row.replica: row.silence for row in registry.replicas.acknowledgements(LEAGUE)}
     assert silent["alive"] < timedelta(minutes=1) < timedelta(hours=22) < silent["silent"]
     assert [row.replica for row in registry.replicas.silent()] == ["silent"]
-    assert registry.replicas.counts() == (2, 1)
+    assert registry.replicas.counts() == (2, 1, 0)
     assert [row.replica for row in registry.replicas.registered()] == ["alive", "silent"]
+
+
+def test_replicas_that_are_being_stopped_are_counted_until_they_end(registry: Registry) -> None:
+    for name in ("one", "two"):
+        registry.replicas.register(name, {"machine": "here"})
+    registry.replicas.register("one", {"machine": "here"}, is_draining=True)
+    assert registry.replicas.counts() == (2, 0, 1)
+    registry.replicas.remove("one")
+    assert registry.replicas.counts() == (1, 0, 0)
 
 
 def test_a_registered_replica_is_listed_before_it_serves_a_league(registry: Registry) -> None:
