@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
-from cli.output import elo, emit, say, table
+from cli.output import counted, elo, emit, say, table
 from league.errors import ConfigError, InvalidInput, InvalidReference
 from league.refs import (
     CHAMPION,
@@ -286,7 +286,7 @@ def _moved(event: "AliasEvent", as_json: bool, replicas: list[str] | None) -> No
         before = "nothing" if event.previous is None else f"version {event.previous}"
         say(f"{event.league}@{event.alias} now points to version {event.version} (before: {before}).")
     if replicas is not None:
-        say(f"All {len(replicas)} replicas serve it.")
+        say(f"Confirmed by {counted(len(replicas), 'replica')}.")
 
 
 def history(

@@ -4,6 +4,7 @@ import pytest
 
 from league.registry.registry import Registry
 from tests.support.command import League
+from tests.support.servers.streaming import listening
 
 
 def test_a_mixture_is_promoted_shown_and_rolled_back(league: League, registry: Registry) -> None:
@@ -16,6 +17,17 @@ def test_a_mixture_is_promoted_shown_and_rolled_back(league: League, registry: R
     assert (event["version"], [member["version"] for member in event["members"]]) == (4, [1, 3])
     assert league("promote", "tictactoe@3:0.4,@1:0.6", "--json").json["id"] == event["id"], "nothing changes"
     assert league("rollback", "tictactoe", "--json").json["version"] == 1
+
+
+def test_replicas_are_waited_for(league: League, registry: Registry) -> None:
+    league("promote", "tictactoe@1")
+    with listening(registry.storage):
+        assert "Confirmed by 1 replica." in league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--wait").out
+        assert "Confirmed by 1 replica." in league("rollback", "tictactoe", "--wait").out
+    result = league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--wait", "--timeout", "0")
+    assert result.code == 1
+    assert "is a server running" in result.err
+    assert registry.versions.resolve("tictactoe@champion").mixture is not None
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,10 @@ BLOCKS = 300
 """Matches of each of two versions against a slow bot."""
 HTTP_BLOCKS = 4
 RARE = 0.001
-OUTAGE = 30.0
+HEAD_OUTAGE, DATABASE_OUTAGE = 30.0, 60.0
 """Seconds without a head, and without the database."""
+WAIT = 60.0
+"""Seconds for replicas to follow, on shared cores."""
 
 
 def test_a_learner_runs_where_there_are_cpus(cluster: LeagueCluster, directory: Path) -> None:
@@ -62,6 +64,20 @@ def test_evaluations_over_http_are_played(cluster: LeagueCluster, key: str) -> N
     }
 
 
+def test_a_promotion_waits_for_the_replicas_of_all_nodes(cluster: LeagueCluster, key: str) -> None:
+    """`promote --wait` on a worker, for each of two versions."""
+    for version in (2, 1):
+        said = serving_scenarios.promote_and_wait(cluster, version, WAIT)
+        assert f"Confirmed by {serving_scenarios.REPLICAS} replicas." in said
+
+
+def test_no_call_is_lost_when_a_worker_is_drained(cluster: LeagueCluster, key: str) -> None:
+    calls, began, _ = serving_scenarios.drain_worker_while_serving(cluster, key)
+    assert calls.lost == []
+    assert calls.attempts_lost == []
+    assert calls.new_replicas(began), "others are started elsewhere"
+
+
 def test_no_call_is_lost_with_a_worker(cluster: LeagueCluster, key: str) -> None:
     calls, killed = serving_scenarios.lose_worker_while_serving(cluster, key)
     assert calls.lost == []
@@ -71,14 +87,14 @@ def test_no_call_is_lost_with_a_worker(cluster: LeagueCluster, key: str) -> None
 
 
 def test_no_call_is_lost_with_the_database(cluster: LeagueCluster, key: str) -> None:
-    calls, _ = serving_scenarios.cut_off_database(cluster, key, 2, OUTAGE)
+    calls, _ = serving_scenarios.cut_off_database(cluster, key, 2, DATABASE_OUTAGE)
     assert calls.lost == []
     assert calls.attempts_lost == calls.attempts_shed == []
     assert calls.versions() == ["1", "2"], "promoted meanwhile, followed afterwards"
 
 
 def test_no_call_is_lost_with_the_head(cluster: LeagueCluster, key: str) -> None:
-    calls, killed, _ = serving_scenarios.lose_head(cluster, key, 1, OUTAGE)
+    calls, killed, _ = serving_scenarios.lose_head(cluster, key, 1, HEAD_OUTAGE)
     assert calls.lost == []
     assert calls.attempts_lost == []
     assert len(calls.attempts_shed) < RARE * calls.report["attempts"], "while a head starts on the same cores"
