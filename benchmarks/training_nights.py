@@ -40,11 +40,13 @@ def main() -> int:
     parser.add_argument("configs", nargs="*", metavar="CONFIG", default=["connect_four"], help="default: %(default)s")
     parser.add_argument("--nights", type=int, default=NIGHTS)
     parser.add_argument("--minutes", type=float, default=MINUTES, help="training time of a night; default: %(default)g")
+    parser.add_argument("--quick", action="store_true", help="smoke test: two nights of 0.2 minutes")
     options = parser.parse_args()
+    nights, minutes = (2, 0.2) if options.quick else (options.nights, options.minutes)
     met = True
     for name in options.configs:
         with tempfile.TemporaryDirectory() as home:
-            met &= measure(_short_nights(name, options.minutes, Path(home)), Path(home), options.nights)
+            met &= measure(_short_nights(name, minutes, Path(home)), Path(home), nights)
     return int(not met)
 
 
