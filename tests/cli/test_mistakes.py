@@ -101,6 +101,17 @@ def test_the_game_itself_is_sound(league: League, folder: Path) -> None:
     assert "The environment passes" in result.out
 
 
+def test_the_implementation_of_an_environment_is_named_and_compared(league: League, folder: Path) -> None:
+    assert (
+        "It is stepped in lockstep, because it has no vectorised implementation."
+        in league("check-env", str(write(folder))).out
+    )
+    shown = " ".join(league("check-env", "tictactoe").out.split())
+    assert "It is vectorised by league.environments.vector." in shown
+    assert "The vectorised and the stock environment reported the same in " in shown
+    assert " Steps per second: " in shown
+
+
 def test_a_misspelt_key(league: League, folder: Path) -> None:
     write(folder, training={**TRAINING, "stesp": 5})
     result = league("train", "guess.yaml")

@@ -11,6 +11,7 @@ from sqlalchemy import select
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
 from evaluation.matches.game_records import forfeits
+from league.environments.implementation import implementation
 from league.errors import InvalidInput, NotFound, VerdictRefuted
 from league.registry.registry import Registry
 from league.registry.storage import tables
@@ -55,6 +56,17 @@ def test_all_verdicts_of_a_run_are_verified_by_replay(gated: Registry) -> None:
         found = verify(row.id, registry=gated, replays=5)
         assert (found.outcome, found.replayed) == (row.outcome, 5)
         assert found.matches >= row.evidence["blocks"]  # type: ignore[index]
+
+
+def test_games_are_replayed_in_the_stock_environment(gated: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    vector = implementation(CONFIG.environment).vector
+    assert vector is not None
+
+    def fail(*_: Any) -> None:
+        raise RuntimeError("the vectorised environment was used")
+
+    monkeypatch.setattr(vector, "step", fail)
+    assert verify(verdicts(gated)[-1].id, registry=gated, replays=3).replayed == 3
 
 
 def test_verification_is_reproducible_with_another_registry(gated: Registry) -> None:

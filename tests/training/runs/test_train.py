@@ -73,6 +73,7 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
     assert "Published tictactoe@1 after 512 steps" in trained.output
     assert "shared: return" in trained.output
     assert "Environments: 4 in one runner." in trained.output
+    assert "pettingzoo.classic.tictactoe_v3: It is vectorised by " in trained.output
     (run,) = (registry.storage.home / "runs" / "tictactoe").iterdir()
     assert not list(run.rglob("checkpoints/*")), "published checkpoints are deleted"
     tags = curves(run).Tags()["scalars"]
