@@ -99,6 +99,27 @@ def test_a_champion_that_stays_keeps_its_exploiter_and_its_measurement(registry:
     assert second.steps["measure"] == first.steps["measure"]
 
 
+def test_a_champion_that_changes_during_training_is_the_opponent_of_the_gate(registry: Registry) -> None:
+    for graph in (WEAK, MIDDLING):
+        tictactoe.publish(registry, graph)
+    registry.aliases.set(LEAGUE, "champion", 1, expected=None, actor="me", reason="test")
+
+    def promote_meanwhile(number: int, _: object) -> bytes:
+        if number == 2:
+            registry.aliases.set(LEAGUE, "champion", 2, expected=1, actor="me", reason="meanwhile")
+        return STRONGEST
+
+    night, report = training_night(CONFIG, registry=registry, train=HandwrittenTrainer(registry, promote_meanwhile))
+    assert night.parent == 1, "training began from the champion of that time"
+    assert night.steps["gate"]["champion_before"] == "tictactoe@2"
+    assert night.steps["gate"]["verdicts"][-1] == {
+        "candidate": "tictactoe@3", "opponent": "tictactoe@2", "outcome": "promote"
+    }  # fmt: skip
+    assert report is not None
+    assert report.champion == "tictactoe@3"
+    assert night.steps["exploiter"]["versions"] == ["tictactoe@4"]
+
+
 def test_failed_training_is_recorded_and_the_night_goes_on(registry: Registry) -> None:
     tictactoe.publish(registry, STRONG)
 
