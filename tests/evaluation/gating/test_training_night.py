@@ -111,7 +111,7 @@ def test_a_champion_that_changes_during_training_is_the_opponent_of_the_gate(reg
 
     night, report = training_night(CONFIG, registry=registry, train=HandwrittenTrainer(registry, promote_meanwhile))
     assert night.parent == 1, "training began from the champion of that time"
-    assert night.steps["gate"]["champion_before"] == "tictactoe@2"
+    assert night.steps["gate"]["champion_before"] == "tictactoe@1", "the one at the beginning of the night"
     assert night.steps["gate"]["verdicts"][-1] == {
         "candidate": "tictactoe@3", "opponent": "tictactoe@2", "outcome": "promote"
     }  # fmt: skip
