@@ -1,12 +1,12 @@
 """Opens the source of an import by its kind."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from league.errors import ConfigError, InvalidInput
-from league.interface import Interface
+from league.interface import AgentInterface, Interface
 from training.importing.source import Source, onnx_source
 
 SourceKind = Literal["rllib", "sb3"]
@@ -23,7 +23,7 @@ def open_sources(
     """Open the models for all policies of a league.
 
     Args:
-        path: A file for all policies, or a directory.
+        path: A file for all policies, or a directory with one named after each policy. With RLlib, a checkpoint.
         interface: Interface of the league.
         kind: Format of `path` if it contains pickles; else its suffix decides.
         mapping: File with a GraphMapping, for ONNX files and programs.
@@ -42,8 +42,8 @@ def open_sources(
         raise InvalidInput("--policy: only checkpoints of RLlib contain several modules; it requires --rllib")
     if unknown := [policy for policy in modules or () if policy not in interface.policy_ids]:
         raise InvalidInput(f"--policy {unknown[0]}: expected one of {', '.join(interface.policy_ids)}")
-    sources = {}
     digest = _digest(path, mapping, modules)
+    sources = {}
     for policy in interface.policy_ids:
         spaces = interface.of_policy(policy)
         origin: dict[str, Any] = {"format": kind or "", "file": path.name, "sha256": digest}
@@ -55,18 +55,31 @@ def open_sources(
         elif kind == "sb3":
             from training.importing.sb3_source import sb3_source
 
-            sources[policy] = sb3_source(path, spaces, origin)
+            sources[policy] = sb3_source(_file(path, policy, (".zip",)), spaces, origin)
         else:
-            file = path / f"{policy}.onnx" if path.is_dir() else path
-            if file.suffix == ".pt2":
-                from training.importing.torch_source import torch_source
-
-                sources[policy] = torch_source(file, mapping, spaces, origin | {"format": "torch.export"})
-            elif file.suffix == ".onnx":
-                sources[policy] = onnx_source(file, mapping, spaces, origin | {"format": "onnx"})
-            else:
-                raise ConfigError(f"{path}: expected a directory, .onnx or .pt2, or the option --rllib or --sb3")
+            sources[policy] = _graph_or_program(_file(path, policy, (".onnx", ".pt2")), mapping, spaces, origin)
     return sources, digest
+
+
+def _file(path: Path, policy: str, suffixes: Sequence[str]) -> Path:
+    """Return the file of a policy: `path`, or the one named after the policy in the directory `path`."""
+    if not path.is_dir():
+        return path
+    candidates = [path / f"{policy}{suffix}" for suffix in suffixes]
+    for file in candidates:
+        if file.exists():
+            return file
+    raise ConfigError(f"{path}: no file {' or '.join(file.name for file in candidates)}")
+
+
+def _graph_or_program(file: Path, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
+    if file.suffix == ".pt2":
+        from training.importing.torch_source import torch_source
+
+        return torch_source(file, mapping, spaces, origin | {"format": "torch.export"})
+    if file.suffix == ".onnx":
+        return onnx_source(file, mapping, spaces, origin | {"format": "onnx"})
+    raise ConfigError(f"{file}: expected a directory, .onnx or .pt2, or the option --rllib or --sb3")
 
 
 def _digest(path: Path, *choices: object) -> str:

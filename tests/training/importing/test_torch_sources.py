@@ -54,6 +54,25 @@ def test_a_program(tmp_path: Path) -> None:
     assert_equal_actions(sources["shared"], FIVE)
 
 
+def test_a_directory_has_a_file_for_each_policy(tmp_path: Path) -> None:
+    """With spaces of their own."""
+    two = Interface(
+        agents={"a": interface(FIVE).agents["agent"], "b": interface(STEERED).agents["agent"]},
+        policies={"a": "chooser", "b": "driver"},
+        sides={"a": ("a",), "b": ("b",)},
+    )
+    for policy, outputs in (("chooser", 5), ("driver", 4)):
+        if policy == "driver":
+            with pytest.raises(ConfigError, match=r"no file driver\.onnx or driver\.pt2"):
+                open_sources(tmp_path, two)
+        network = nn.Linear(4, outputs)
+        program = torch.export.export(network, (torch.zeros(2, 4),), dynamic_shapes=({0: torch.export.Dim("batch")},))
+        torch.export.save(program, tmp_path / f"{policy}.pt2")
+    sources, _ = open_sources(tmp_path, two)
+    assert_equal_actions(sources["chooser"], FIVE)
+    assert_equal_actions(sources["driver"], STEERED)
+
+
 def test_a_program_with_a_fixed_batch_size_is_refused(tmp_path: Path) -> None:
     program = torch.export.export(nn.Linear(4, 5), (torch.zeros(2, 4),))
     torch.export.save(program, tmp_path / "program.pt2")
