@@ -70,8 +70,8 @@ class ReplicaRepository(Repository):
         """Record that a replica runs.
 
         A replica registers before it reads the aliases for the first time, and then repeatedly.
-        process: where it runs; see RegisteredReplica. is_draining: whether it is being stopped. Returns whether it was registered already; if not, nothing that
-        it has acknowledged is known.
+        process: where it runs; see RegisteredReplica. is_draining: whether it is being stopped. Returns whether it was
+        registered already; if not, nothing that it has acknowledged is known.
         """
         process = dict(process) | ({DRAINING: "true"} if is_draining else {})
         if self._update(replica, {"process": process}):

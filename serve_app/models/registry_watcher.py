@@ -56,8 +56,8 @@ class RegistryWatcher:
     """Keeps slots, traffic and keys at what the registry requires, and acknowledges it as `replica`.
 
     update_keys: raises StorageError if the keys are those of a different database. on_heartbeat: called at each
-    heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas that
-    are not being stopped. is_draining: whether this one is.
+    heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas
+    that are not being stopped. is_draining: whether this one is.
     """
 
     def __init__(

@@ -71,13 +71,6 @@ def test_a_promotion_waits_for_the_replicas_of_all_nodes(cluster: LeagueCluster,
         assert f"Confirmed by {serving_scenarios.REPLICAS} replicas." in said
 
 
-def test_no_call_is_lost_when_a_worker_is_drained(cluster: LeagueCluster, key: str) -> None:
-    calls, began, _ = serving_scenarios.drain_worker_while_serving(cluster, key)
-    assert calls.lost == []
-    assert calls.attempts_lost == []
-    assert calls.new_replicas(began), "others are started elsewhere"
-
-
 def test_no_call_is_lost_with_a_worker(cluster: LeagueCluster, key: str) -> None:
     calls, killed = serving_scenarios.lose_worker_while_serving(cluster, key)
     assert calls.lost == []
