@@ -258,6 +258,12 @@ def raised_at(error: BaseException) -> str | None:
     return f"{outside[-1].filename}, line {outside[-1].lineno}" if outside else None
 
 
+def cause(error: BaseException) -> str:
+    """Return where an exception was raised, its type and its message, to follow a statement: ` (FILE, line N): …`."""
+    where = raised_at(error)
+    return f"{f' ({where})' if where else ''}: {one_line(error, with_type=True)}"
+
+
 def last_line(text: str) -> str:
     """Return the last line that is not blank, or an empty string."""
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")

@@ -26,7 +26,7 @@ from league.entry_points import import_entry_point, import_module, missing
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
-from league.errors import ConfigError, EnvironmentMismatch, LeagueError, one_line, raised_at
+from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
 from league.spaces import Discrete
@@ -97,7 +97,7 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
     except Exception as error:
         if _refuses_arguments(constructor, kwargs, error):
             raise ConfigError(f"environment.kwargs: {config.entry_point} does not accept them: {error}") from error
-        raise ConfigError(f"environment.entry_point: {config.entry_point} cannot be created{_cause(error)}") from error
+        raise ConfigError(f"environment.entry_point: {config.entry_point} cannot be created{cause(error)}") from error
     found = _api(env)
     if found is None or config.api not in (None, found):
         expected = NAMES[config.api] if config.api else "an environment of PettingZoo (AEC or Parallel) or RLlib"
@@ -132,15 +132,9 @@ def _spaces(env: Any, agent: str, entry_point: str) -> AgentInterface:
     except LeagueError:
         raise
     except Exception as error:
-        raise EnvironmentMismatch(f"{entry_point}: the spaces of {agent} cannot be read{_cause(error)}") from error
+        raise EnvironmentMismatch(f"{entry_point}: the spaces of {agent} cannot be read{cause(error)}") from error
     observation, action = map(from_gymnasium, spaces)
     return AgentInterface(observation=observation, action=action)
-
-
-def _cause(error: Exception) -> str:
-    """Describe an exception of an environment's code: where it was raised, its type and its message."""
-    where = raised_at(error)
-    return f"{f' ({where})' if where else ''}: {one_line(error, with_type=True)}"
 
 
 def observation_space(env: Any, agent: str) -> gymnasium.Space[Any]:

@@ -297,25 +297,9 @@ def _tune(
 ) -> Literal["spent", "stopped", "moved"]:
     """Run one attempt as a Tune experiment of one trial. Returns why it ended; `moved`: to continue on other nodes."""
     config, attempt = run.record.config, run.next_attempt()
-    (attempt / CHECKPOINTS).mkdir(parents=True)
-    check_nodes(registry.storage)  # some may have joined meanwhile
     share = cpu_share(config.training.runners)
-    if (cpus := share * (1 + config.training.runners)) > (available := cluster_cpus()):
-        progress.say(f"Ray's autoscaler is asked for {cpus:g} CPUs; the cluster has {available}.")
-    start = _start(run, registry, attempt / CHECKPOINTS / START)
-    if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
-        progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
-    plan = TrialPlan(
-        start,
-        attempt / CHECKPOINTS,
-        attempt / STOP_FILE,
-        registry.storage,
-        cpus=share,
-        run=run.id,
-        parent=run.record.parent,
-        driver=driver_machine(),
-    )
-    reporter.begin(start.steps - start.steps_before_run, start.seconds)
+    plan = _plan(run, registry, progress, attempt, share)
+    reporter.begin(plan.start.steps - plan.start.steps_before_run, plan.start.seconds)
 
     is_stop_requested = False
 
@@ -350,6 +334,28 @@ def _tune(
         return "stopped"
     progress.say(f"{watch.reason[0].upper()}{watch.reason[1:]}. Training continues.")
     return "moved"
+
+
+def _plan(run: RunDirectory, registry: Registry, progress: TrainingProgress, attempt: Path, share: float) -> TrialPlan:
+    """Prepare an attempt in its directory. share: CPUs of each of its processes."""
+    config = run.record.config
+    (attempt / CHECKPOINTS).mkdir(parents=True)
+    check_nodes(registry.storage)  # some may have joined meanwhile
+    if (cpus := share * (1 + config.training.runners)) > (available := cluster_cpus()):
+        progress.say(f"Ray's autoscaler is asked for {cpus:g} CPUs; the cluster has {available}.")
+    start = _start(run, registry, attempt / CHECKPOINTS / START)
+    if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
+        progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
+    return TrialPlan(
+        start,
+        attempt / CHECKPOINTS,
+        attempt / STOP_FILE,
+        registry.storage,
+        cpus=share,
+        run=run.id,
+        parent=run.record.parent,
+        driver=driver_machine(),
+    )
 
 
 class _ResultCallback(NotPickled, tune.Callback):

@@ -22,7 +22,7 @@ from league.environments.conformance.findings import Examination, Vectorised
 from league.environments.implementation import implementation
 from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
-from league.errors import LeagueError, one_line, raised_at
+from league.errors import LeagueError, cause, one_line, raised_at
 from league.interface import Interface
 from league.spaces import Box, Discrete, MultiDiscrete, Space
 
@@ -57,9 +57,7 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, s
         found.add("fault", str(error))
         return found
     except Exception as error:
-        where = "".join(f" ({place})" for place in [raised_at(error)] if place)
-        reason = one_line(error, with_type=True)
-        found.add("fault", f"{config.environment.entry_point} cannot be created{where}: {reason}")
+        found.add("fault", f"{config.environment.entry_point} cannot be created{cause(error)}")
         return found
     found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
     found.agents = len(interface.agents)
