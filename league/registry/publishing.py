@@ -8,8 +8,6 @@ longer become ready. A crash at any point leaves a row that `stale` finds later.
 """
 
 import hashlib
-import os
-import socket
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -27,6 +25,7 @@ from league.errors import (
     VersionRetired,
 )
 from league.files import DISK_FULL_OR_READ_ONLY, disk_errors
+from league.processes import has_ended, this_process
 from league.registry import leagues, versions
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository, row_count
@@ -245,52 +244,14 @@ def stale(session: Session, league: str) -> list[int]:
     return numbers
 
 
-def this_process() -> str:
-    """Return `machine:pid:start`, where `start` distinguishes processes that reuse a pid, if the system reports it."""
-    return f"{_machine()}:{os.getpid()}:{_start(os.getpid())}"
-
-
 def is_dead(publisher: str, reserved_at: datetime) -> bool:
     """Return whether `publisher` will not finish the publication that it began at `reserved_at`.
 
     If this is wrong, that process loses its publication and nothing else: the version can no longer become ready.
     """
-    machine, pid, start = publisher.rsplit(":", 2)
-    if datetime.now(UTC) - reserved_at > PUBLICATION_TIMEOUT:
-        return True
-    return machine == _machine() and not (_exists(int(pid)) and _start(int(pid)) == start)
-
-
-def _machine() -> str:
-    """Host name, last start and container, if the system reports them: several may have the same name."""
-    try:
-        boot, container = (
-            Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
-            os.stat("/proc/self/ns/pid").st_ino,
-        )
-    except OSError:
-        return socket.gethostname()
-    return f"{socket.gethostname()}/{boot}/{container}"
+    return datetime.now(UTC) - reserved_at > PUBLICATION_TIMEOUT or has_ended(publisher)
 
 
 def _leave_publishing(session: Session, league: str, number: int, values: dict[str, str | None]) -> bool:
     statement = update(VersionTable).filter_by(league=league, number=number, state=PUBLISHING).values(**values)
     return row_count(session, statement) == 1
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _start(pid: int) -> str:
-    """Clock ticks from boot to the start of a process (proc(5), stat field 22); empty if there is no /proc."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
-    except OSError:
-        return ""

@@ -13,7 +13,7 @@ import json
 import math
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,9 +31,12 @@ from league.files import disk_errors, replacing
 from league.interface import Interface
 from league.policies.loading import contestant, players
 from league.policies.open_inference import fixed_version
+from league.processes import host_name, is_local
 from league.refs import CheckpointRef, RemoteRef, of_league, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, Role
+from league.registry.storage.rows import StoredRun
+from league.registry.training.runs import HEARTBEAT_TIMEOUT, RUNNING
 from league.settings import Storage
 
 
@@ -191,40 +194,59 @@ class RunDirectory:
         return run
 
     @classmethod
-    def find(cls, storage: Storage, league: str, name: str) -> Self | None:
-        """Return the run with this id, if it has begun on this machine."""
-        file = _runs(storage, league) / name / RUN_FILE
-        return cls(file.parent, RunRecord.model_validate_json(file.read_text())) if file.exists() else None
+    def find(cls, registry: Registry, league: str, name: str) -> Self | None:
+        """Return the run with this id, if it has begun, on this machine or another one.
+
+        Raises AlreadyRunning if it is trained on another machine.
+        """
+        path = _runs(registry.storage, league) / name
+        stored = registry.runs.stored(league, name)
+        record = _records(registry.storage, league, stored).get(path)
+        if record is None:
+            return None
+        _check_machine(path, stored)
+        return cls._copy(path, record)
 
     @classmethod
-    def resume(cls, storage: Storage, config: LeagueConfig, role: Role = MAIN) -> Self:
+    def resume(cls, registry: Registry, config: LeagueConfig, role: Role = MAIN) -> Self:
         """Open the league's newest run of a role if it is incomplete: it was interrupted, or its budget is larger now.
 
-        Raises NotFound; ConfigError if `config` differs.
+        It may have begun on another machine, with the same registry.
+
+        Raises NotFound; ConfigError if `config` differs; AlreadyRunning if it is trained on another machine.
         """
-        runs = _runs(storage, config.league)
-        files = sorted(runs.glob(f"*/{RUN_FILE}"), reverse=True)
-        records = ((file, RunRecord.model_validate_json(file.read_text())) for file in files)
-        newest, record = next((each for each in records if each[1].role == role), (None, None))
-        if newest is None or record is None:
+        stored = registry.runs.stored(config.league)
+        records = _records(registry.storage, config.league, stored)
+        newest = max((path for path, record in records.items() if record.role == role), default=None)
+        if newest is None:
             raise NotFound(
-                f"league {config.league} has no training run with the role {role} in {runs}: there is nothing to resume"
+                f"league {config.league} has no training run with the role {role}, neither in"
+                f" {_runs(registry.storage, config.league)} nor in the registry: there is nothing to resume"
             )
+        _check_machine(newest, stored)
+        record = records[newest]
         if record.exploits is not None:
             config = against(config, record.exploits)
         config = with_pins(config, record.pins)
         if (changed := changed_setting(record.config, config)) is not None:
             raise ConfigError(
-                f"{changed} has changed since training run {newest.parent.name} began, so it cannot be resumed: "
+                f"{changed} has changed since training run {newest.name} began, so it cannot be resumed: "
                 f"set it back, or start a new run without --resume (with --from to continue from a version)"
             )
         if record.complete and not _has_larger_budget(record.config.training, config.training):
             raise NotFound(
-                f"training run {newest.parent.name} is complete: there is nothing to resume, unless --steps or"
+                f"training run {newest.name} is complete: there is nothing to resume, unless --steps or"
                 " --minutes is larger"
             )
-        run = cls(newest.parent, record.model_copy(update={"config": config, "complete": False}))
-        run._write()
+        return cls._copy(newest, record.model_copy(update={"config": config, "complete": False}))
+
+    @classmethod
+    def _copy(cls, path: Path, record: RunRecord) -> Self:
+        """Write the record of a run that exists, here or on another machine."""
+        run = cls(path, record)
+        with disk_errors(path):
+            path.mkdir(parents=True, exist_ok=True)
+            run._write()
         return run
 
     def locked(self) -> AbstractContextManager[None]:
@@ -261,6 +283,29 @@ class RunDirectory:
 
 def _runs(storage: Storage, league: str) -> Path:
     return storage.home / "runs" / league
+
+
+def _records(storage: Storage, league: str, stored: Sequence[StoredRun]) -> dict[Path, RunRecord]:
+    """Return directory → record of the runs in the directory of this machine, and of those in the registry.
+
+    The registry has the newer record of a run that another machine trained last.
+    """
+    runs = _runs(storage, league)
+    found = {file.parent: RunRecord.model_validate_json(file.read_text()) for file in runs.glob(f"*/{RUN_FILE}")}
+    for run in stored:
+        if runs / run.id not in found or not is_local(run.driver):
+            found[runs / run.id] = RunRecord.model_validate(run.record | {"complete": run.state == "ended"})
+    return found
+
+
+def _check_machine(run: Path, stored: Sequence[StoredRun]) -> None:
+    """Raise AlreadyRunning if a process on another machine works on a run. The lock excludes those on this one."""
+    for other in stored:
+        if other.id == run.name and other.state == RUNNING and not is_local(other.driver):
+            raise AlreadyRunning(
+                f"training run {run.name} is running on {host_name(other.driver)}; if that machine was lost, try again"
+                f" in {HEARTBEAT_TIMEOUT.total_seconds():.0f} s"
+            )
 
 
 def changed_setting(old: LeagueConfig, new: LeagueConfig) -> str | None:

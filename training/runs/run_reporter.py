@@ -151,6 +151,7 @@ class RunReporter:
             parent=self._run.record.parent,
             exploits=self._run.record.exploits,
             steps=self._start_steps,
+            record=self._run.record.model_dump(mode="json", by_alias=True, exclude={"complete"}),
         )
 
 

@@ -81,9 +81,10 @@ def train(
         role: The role of the versions.
         target: The version that an exploiter is trained against, in all episodes and instead of `training.opponents`.
             An alias is resolved at the start.
-        resume: Continue the league's newest run of this role, which was interrupted or has a larger budget now. Its
-            versions stay, and checkpoints that were saved but not published are published first. With a checkpoint
-            interval in steps and one runner, the versions equal those of an uninterrupted run.
+        resume: Continue the league's newest run of this role, which was interrupted or has a larger budget now. It may
+            have begun on another machine that uses the same registry. Its versions stay, and checkpoints that were
+            saved on this machine but not published are published first. With a checkpoint interval in steps and one
+            runner, the versions equal those of an uninterrupted run.
         name: The id of the run, by default a new one. A run with this id continues with the settings that it began
             with; if it is complete, nothing is trained.
         address: A running Ray cluster. None uses the Ray that this process is connected to, or starts one.
@@ -117,9 +118,9 @@ def train(
         config = against(config, exploits)
     number = None if parent is None else _parent(registry, parent, config, interface).number
     if resume:
-        interrupted: RunDirectory | None = RunDirectory.resume(registry.storage, config, role)
+        interrupted: RunDirectory | None = RunDirectory.resume(registry, config, role)
     else:
-        interrupted = None if name is None else RunDirectory.find(registry.storage, config.league, name)
+        interrupted = None if name is None else RunDirectory.find(registry, config.league, name)
     if interrupted is not None and interrupted.record.complete:
         # Its driver may have died between the end of training and its last report.
         with suppress(UnknownRun):

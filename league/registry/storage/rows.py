@@ -467,6 +467,18 @@ class RunRow:
 
 
 @dataclass(frozen=True, slots=True)
+class StoredRun:
+    """What a machine needs to continue a training run that began on another one."""
+
+    id: str
+    state: RunState
+    driver: str
+    """The process that trains it, or trained it last, see `league.processes.this_process`."""
+    record: dict[str, Any]
+    """The content of its file `run.json`."""
+
+
+@dataclass(frozen=True, slots=True)
 class RunPoint:
     """Values of a run's curves at a step."""
 

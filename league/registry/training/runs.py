@@ -6,22 +6,24 @@ A driver sends heartbeats; a run without a recent heartbeat is `silent`. The num
 there are too many, every second point is deleted, and the spacing of new points doubles.
 """
 
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import Any, cast
 
 from sqlalchemy import delete, func, select, tuple_
 from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput, InvalidReference, UnknownRun
+from league.processes import this_process
 from league.registry import leagues
 from league.registry.storage.database import Repository
-from league.registry.storage.rows import RunPoint, RunRow, RunState, detached
+from league.registry.storage.rows import RunPoint, RunRow, RunState, StoredRun, detached
 from league.registry.storage.tables import RunPointTable, RunTable
 
 RUNNING = "running"
 HEARTBEAT_TIMEOUT = timedelta(minutes=1)
 """A run without a heartbeat for longer is reported as silent."""
+MAX_STORED = 20
+"""Newest runs that are searched for one to continue."""
 MAX_LISTED = 5
 """Runs that a message about an unknown one lists."""
 MAX_POINTS = 601
@@ -43,11 +45,13 @@ class RunRepository(Repository):
         parent: int | None = None,
         exploits: str | None = None,
         steps: int = 0,
+        record: dict[str, Any] | None = None,
     ) -> RunRow:
         """Record that a training run starts, or resumes at `steps`; later points are deleted.
 
         target: steps at which the run ends, None if only its time is limited. parent: the version that training
-        starts from. exploits: the version that an exploiter is trained against. Raises UnknownLeague.
+        starts from. exploits: the version that an exploiter is trained against. record: what another machine needs to
+        continue the run, see `stored`. Raises UnknownLeague.
         """
         now = datetime.now(UTC)
         with self._database.write() as session:
@@ -57,7 +61,7 @@ class RunRepository(Repository):
                 row = RunTable(league=league, id=run, attempts=0, seconds=0.0, curves={}, spacing=0, began_at=now)
                 session.add(row)
             row.algorithm, row.settings, row.seed, row.target, row.parent = algorithm, settings, seed, target, parent
-            row.exploits = exploits
+            row.exploits, row.record, row.driver = exploits, record, this_process()
             row.state, row.error, row.ended_at = RUNNING, None, None
             row.attempts += 1
             row.steps, row.heartbeat_at = steps, now
@@ -128,6 +132,24 @@ class RunRepository(Repository):
                 query = query.where(tuple_(table.began_at, table.id) < (last.began_at, last.id))
             return [_row(row) for row in session.scalars(query)]
 
+    def stored(self, league: str, run: str | None = None) -> list[StoredRun]:
+        """Return the newest runs of a league, or one of them, that can be continued on another machine, newest first.
+
+        Raises UnknownLeague.
+        """
+        table = RunTable
+        query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc())
+        if run is not None:
+            query = query.filter_by(id=run)
+        with self._database.read() as session:
+            leagues.require(session, league)
+            found = session.scalars(query.where(table.driver.is_not(None)).limit(MAX_STORED))
+            return [
+                StoredRun(row.id, _state(row), row.driver, row.record)
+                for row in found
+                if row.driver is not None and row.record is not None
+            ]
+
     def counts(self) -> dict[str, int]:
         """Return league → number of active training runs, of the leagues that have any."""
         alive = (RunTable.state == RUNNING) & (RunTable.heartbeat_at >= datetime.now(UTC) - HEARTBEAT_TIMEOUT)
@@ -184,6 +206,9 @@ def _keep(session: Session, row: RunTable, point: RunPoint) -> None:
 
 
 def _row(run: RunTable) -> RunRow:
-    row = detached(RunRow, run)
-    is_silent = row.state == RUNNING and row.heartbeat_at < datetime.now(UTC) - HEARTBEAT_TIMEOUT
-    return replace(row, state="silent") if is_silent else row
+    return detached(RunRow, run, state=_state(run))
+
+
+def _state(run: RunTable) -> RunState:
+    is_silent = run.state == RUNNING and run.heartbeat_at < datetime.now(UTC) - HEARTBEAT_TIMEOUT
+    return "silent" if is_silent else cast(RunState, run.state)

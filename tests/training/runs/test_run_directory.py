@@ -1,85 +1,122 @@
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from sqlalchemy import update
 
 from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER
+from league.registry.storage.tables import RunTable
+from league.registry.training.runs import HEARTBEAT_TIMEOUT
 from league.settings import Storage
+from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
 from training.runs.run_directory import CHECKPOINTS, RunDirectory, against
+from training.runs.run_reporter import RunReporter
 
 
 @pytest.fixture
-def storage(tmp_path: Path) -> Storage:
-    return Storage.at(tmp_path)
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    opened = Registry.open(Storage.at(tmp_path / "home"))
+    opened.leagues.register(tictactoe(), interface())
+    yield opened
+    opened.close()
 
 
-def test_the_latest_run_is_resumed(storage: Storage) -> None:
+@pytest.fixture
+def storage(registry: Registry) -> Storage:
+    return registry.storage
+
+
+@pytest.fixture
+def elsewhere(registry: Registry, tmp_path: Path) -> Iterator[Registry]:
+    """The same registry on another machine."""
+    opened = Registry.open(replace(registry.storage, home=tmp_path / "elsewhere"))
+    yield opened
+    opened.close()
+
+
+def start(registry: Registry, run: RunDirectory) -> None:
+    with suppress(KeyboardInterrupt), RunReporter(registry, run) as reporter:
+        reporter.begin(0, 0.0)
+        raise KeyboardInterrupt
+
+
+def change(registry: Registry, run: RunDirectory, **columns: object) -> None:
+    with registry.database.write() as session:
+        session.execute(update(RunTable).filter_by(id=run.id).values(**columns))
+
+
+def test_the_latest_run_is_resumed(registry: Registry, storage: Storage) -> None:
     RunDirectory.begin(storage, tictactoe(), None, None)
     newest = RunDirectory.begin(storage, tictactoe(), 3, "abc")
     latest_path = newest.path.rename(newest.path.with_name("9" + newest.id))
-    run = RunDirectory.resume(storage, tictactoe())
+    run = RunDirectory.resume(registry, tictactoe())
     assert run.path == latest_path
     assert (run.record.parent, run.record.git_commit, run.record.config) == (3, "abc", tictactoe())
 
 
-def test_resuming_requires_an_incomplete_run(storage: Storage) -> None:
+def test_resuming_requires_an_incomplete_run(registry: Registry, storage: Storage) -> None:
     with pytest.raises(NotFound, match="no training run"):
-        RunDirectory.resume(storage, tictactoe())
+        RunDirectory.resume(registry, tictactoe())
     RunDirectory.begin(storage, tictactoe(), None, None).complete()
     with pytest.raises(NotFound, match="complete"):
-        RunDirectory.resume(storage, tictactoe())
+        RunDirectory.resume(registry, tictactoe())
 
 
-def test_only_the_budget_may_change(storage: Storage) -> None:
+def test_only_the_budget_may_change(registry: Registry, storage: Storage) -> None:
     RunDirectory.begin(storage, tictactoe(), None, None)
-    RunDirectory.resume(storage, tictactoe(steps=5, minutes=1, checkpoint_every=2, checkpoint_minutes=3, runners=3))
+    RunDirectory.resume(registry, tictactoe(steps=5, minutes=1, checkpoint_every=2, checkpoint_minutes=3, runners=3))
     with pytest.raises(ConfigError, match=r"training\.lr has changed"):
-        RunDirectory.resume(storage, tictactoe(lr=0.5))
+        RunDirectory.resume(registry, tictactoe(lr=0.5))
 
 
-def test_a_complete_run_continues_with_a_larger_budget(storage: Storage) -> None:
+def test_a_complete_run_continues_with_a_larger_budget(registry: Registry, storage: Storage) -> None:
     RunDirectory.begin(storage, tictactoe(steps=10, minutes=5), None, None).complete()
     for budget in ({"steps": 10, "minutes": 5}, {"steps": 9, "minutes": 4}):
         with pytest.raises(NotFound, match="unless --steps or --minutes is larger"):
-            RunDirectory.resume(storage, tictactoe(**budget))
-    assert not RunDirectory.resume(storage, tictactoe(steps=11, minutes=5)).record.complete
-    RunDirectory.resume(storage, tictactoe(steps=11, minutes=5)).complete()
-    assert RunDirectory.resume(storage, tictactoe(minutes=5)).record.config.training.max_steps is None
-    RunDirectory.resume(storage, tictactoe(minutes=5)).complete()
+            RunDirectory.resume(registry, tictactoe(**budget))
+    assert not RunDirectory.resume(registry, tictactoe(steps=11, minutes=5)).record.complete
+    RunDirectory.resume(registry, tictactoe(steps=11, minutes=5)).complete()
+    assert RunDirectory.resume(registry, tictactoe(minutes=5)).record.config.training.max_steps is None
+    RunDirectory.resume(registry, tictactoe(minutes=5)).complete()
     with pytest.raises(NotFound, match="unless --steps or --minutes is larger"):
-        RunDirectory.resume(storage, tictactoe(minutes=5))
-    assert RunDirectory.resume(storage, tictactoe(steps=11)).record.config.training.minutes is None
+        RunDirectory.resume(registry, tictactoe(minutes=5))
+    assert RunDirectory.resume(registry, tictactoe(steps=11)).record.config.training.minutes is None
 
 
-def test_opponents_remain_pinned_in_a_resumed_run(storage: Storage) -> None:
+def test_opponents_remain_pinned_in_a_resumed_run(registry: Registry, storage: Storage) -> None:
     """The alias may have moved in the meantime."""
     written = tictactoe(opponents=[{"ref": "@champion", "share": 0.5}])
     run = RunDirectory.begin(storage, written, None, None, {"@champion": "tictactoe@3"})
     assert run.record.config.training.opponents.fixed[0].ref == "tictactoe@3"
-    assert RunDirectory.resume(storage, written).record.config == run.record.config
+    assert RunDirectory.resume(registry, written).record.config == run.record.config
     for other in ({"ref": "@latest", "share": 0.5}, {"ref": "@champion", "share": 0.25}):
         with pytest.raises(ConfigError, match=r"training\.opponents has changed"):
-            RunDirectory.resume(storage, tictactoe(opponents=[other]))
+            RunDirectory.resume(registry, tictactoe(opponents=[other]))
 
 
-def test_runs_are_resumed_by_role(storage: Storage) -> None:
+def test_runs_are_resumed_by_role(registry: Registry, storage: Storage) -> None:
     """An exploiter has its target as the opponent in all episodes, also where the league's file names others."""
     written = tictactoe(opponents=[{"ref": "script:random", "share": 0.5}])
     main = RunDirectory.begin(storage, written, None, None)
     with pytest.raises(NotFound, match="no training run with the role exploiter"):
-        RunDirectory.resume(storage, written, EXPLOITER)
+        RunDirectory.resume(registry, written, EXPLOITER)
     exploiter = RunDirectory.begin(storage, against(written, "tictactoe@3"), None, None, exploits="tictactoe@3")
-    assert RunDirectory.resume(storage, written).id == main.id
-    resumed = RunDirectory.resume(storage, written, EXPLOITER)
+    assert RunDirectory.resume(registry, written).id == main.id
+    resumed = RunDirectory.resume(registry, written, EXPLOITER)
     assert (resumed.id, resumed.record) == (exploiter.id, exploiter.record)
     assert [(each.ref, each.share) for each in resumed.record.config.training.opponents.fixed] == [("tictactoe@3", 1)]
 
 
-def test_one_driver_at_a_time(storage: Storage) -> None:
+def test_one_driver_at_a_time(registry: Registry, storage: Storage) -> None:
     run = RunDirectory.begin(storage, tictactoe(), None, None)
     with run.locked():
-        other = RunDirectory.resume(storage, tictactoe())
+        other = RunDirectory.resume(registry, tictactoe())
         with pytest.raises(AlreadyRunning, match=run.id), other.locked():
             pass
     with run.locked():
@@ -97,3 +134,48 @@ def test_complete_checkpoints_of_all_attempts_are_sorted_by_steps(storage: Stora
     run.remove_checkpoints()
     assert run.checkpoints() == []
     assert run.next_attempt().name == "attempt-3"
+
+
+def test_a_run_is_resumed_on_another_machine(registry: Registry, elsewhere: Registry) -> None:
+    written = tictactoe(opponents=[{"ref": "@champion", "share": 0.5}])
+    run = RunDirectory.begin(registry.storage, written, 3, "abc", {"@champion": "tictactoe@3"})
+    with pytest.raises(NotFound, match=r"neither in .*elsewhere.* nor in the registry"):
+        RunDirectory.resume(elsewhere, written)
+    assert RunDirectory.find(elsewhere, "tictactoe", run.id) is None
+    start(registry, run)
+    resumed = RunDirectory.resume(elsewhere, written)
+    assert (resumed.id, resumed.record) == (run.id, run.record)
+    assert resumed.path == elsewhere.storage.home / "runs" / "tictactoe" / run.id
+    assert RunDirectory.find(elsewhere, "tictactoe", run.id).record == run.record
+
+
+@pytest.mark.parametrize("by_name", [False, True])
+def test_a_run_is_trained_on_one_machine_at_a_time(registry: Registry, elsewhere: Registry, by_name: bool) -> None:
+    run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
+    start(registry, run)
+    change(registry, run, state="running", driver="trainer-7/boot/1:10:20")
+    for one in (registry, elsewhere):
+        with pytest.raises(AlreadyRunning, match=rf"{run.id} is running on trainer-7; .* try again in 60 s"):
+            RunDirectory.find(one, "tictactoe", run.id) if by_name else RunDirectory.resume(one, tictactoe())
+    change(registry, run, heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
+    assert RunDirectory.resume(elsewhere, tictactoe()).id == run.id
+
+
+def test_a_run_that_ended_on_another_machine_is_complete(registry: Registry) -> None:
+    """The record on this machine is from before it continued there."""
+    run = RunDirectory.begin(registry.storage, tictactoe(steps=10), None, None)
+    start(registry, run)
+    change(registry, run, state="ended", driver="trainer-7/boot/1:10:20")
+    with pytest.raises(NotFound, match="is complete"):
+        RunDirectory.resume(registry, tictactoe(steps=10))
+    assert RunDirectory.find(registry, "tictactoe", run.id).record.complete
+    assert not RunDirectory.resume(registry, tictactoe(steps=11)).record.complete
+
+
+def test_runs_of_earlier_releases_are_resumed_where_they_began(registry: Registry, elsewhere: Registry) -> None:
+    run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
+    start(registry, run)
+    change(registry, run, record=None, driver=None)
+    assert RunDirectory.resume(registry, tictactoe()).id == run.id
+    with pytest.raises(NotFound):
+        RunDirectory.resume(elsewhere, tictactoe())

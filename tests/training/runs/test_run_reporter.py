@@ -150,7 +150,7 @@ def test_the_ending_is_recorded(
 def test_a_resumed_run_keeps_its_record(registry: Registry, run: RunDirectory) -> None:
     with pytest.raises(KeyboardInterrupt):
         drive(registry, run, [100, 200, 300], KeyboardInterrupt())
-    resumed = RunDirectory.resume(registry.storage, LEAGUE.with_training(steps=2000))
+    resumed = RunDirectory.resume(registry, LEAGUE.with_training(steps=2000))
     with RunReporter(registry, resumed) as reporter:
         reporter.begin(200, 20.0)
         reporter.report(result(250, loss=0.5))

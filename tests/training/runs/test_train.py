@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -275,8 +276,10 @@ SLOW = tictactoe(steps=1536, **SETTINGS | {"epochs": 16, "minibatch_size": 32})
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
-def test_a_killed_run_publishes_the_same_versions_after_resuming(tmp_path: Path) -> None:
-    """The driver is killed with SIGKILL during the run."""
+@pytest.mark.parametrize("home_is_lost", [False, True], ids=["same machine", "other machine"])
+def test_a_killed_run_publishes_the_same_versions_after_resuming(tmp_path: Path, home_is_lost: bool) -> None:
+    """The driver is killed with SIGKILL during the run. It is resumed on a machine that has its directory, or has only
+    the registry and the versions."""
     home = tmp_path / "killed"
     driver = subprocess.Popen([sys.executable, "-c", SCRIPT, str(home)], stdout=subprocess.DEVNULL)
     try:
@@ -287,6 +290,8 @@ def test_a_killed_run_publishes_the_same_versions_after_resuming(tmp_path: Path)
     killed = Registry.open(Storage.at(home))
     before = killed.versions.all("tictactoe")
     assert len(before) < 3, "the driver was killed too late"
+    if home_is_lost:
+        shutil.rmtree(home / "runs")
     resumed = train(SLOW, registry=killed, resume=True)
 
     whole = train(SLOW, registry=Registry.open(Storage.at(tmp_path / "whole")))

@@ -103,7 +103,8 @@ def test_the_budgets_and_points_of_old_runs_are_kept(storage: Storage) -> None:
         connection.execute(text("ALTER TABLE runs DROP COLUMN target"))
         connection.execute(text("ALTER TABLE runs RENAME COLUMN old TO target"))
         connection.execute(text("ALTER TABLE leagues DROP COLUMN archived_at"))
-        connection.execute(text("ALTER TABLE runs DROP COLUMN exploits"))
+        for column in ("exploits", "driver", "record"):
+            connection.execute(text(f"ALTER TABLE runs DROP COLUMN {column}"))
         for table in ("earlier_games", "strengths", "change_counter"):
             connection.execute(text(f"DROP TABLE {table}"))
         connection.execute(text("DROP INDEX ix_replicas_seen_at"))

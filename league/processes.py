@@ -1,0 +1,56 @@
+"""Identifies processes across machines: whether one that wrote a record is still alive."""
+
+import os
+import socket
+from pathlib import Path
+
+
+def this_process() -> str:
+    """Return `machine:pid:start`, where `start` distinguishes processes that reuse a pid, if the system reports it."""
+    return f"{_machine()}:{os.getpid()}:{_start(os.getpid())}"
+
+
+def is_local(process: str) -> bool:
+    """Return whether a process runs, or ran, on this machine, since its last start and in this container."""
+    return process.rsplit(":", 2)[0] == _machine()
+
+
+def has_ended(process: str) -> bool:
+    """Return whether a process ran on this machine and has ended. False for those of other machines."""
+    _, pid, start = process.rsplit(":", 2)
+    return is_local(process) and not (_exists(int(pid)) and _start(int(pid)) == start)
+
+
+def host_name(process: str) -> str:
+    """Return the name of the machine of a process."""
+    return process.rsplit(":", 2)[0].partition("/")[0]
+
+
+def _machine() -> str:
+    """Host name, last start and container, if the system reports them: several may have the same name."""
+    try:
+        boot, container = (
+            Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+            os.stat("/proc/self/ns/pid").st_ino,
+        )
+    except OSError:
+        return socket.gethostname()
+    return f"{socket.gethostname()}/{boot}/{container}"
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _start(pid: int) -> str:
+    """Clock ticks from boot to the start of a process (proc(5), stat field 22); empty if there is no /proc."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except OSError:
+        return ""
