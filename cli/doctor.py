@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+import yaml
 
 from cli.output import emit, say, table
 from league.errors import LeagueError, last_line
 from league.ray_cluster import usable_cpus
 from league.settings import Storage
 from league.stack import OPTIONAL, VERIFIED, installed
+from serve_app.runtime.launch import DEPLOY_YAML
 
 GIGABYTE = 10**9
 MINIMUM_DISK = 2 * GIGABYTE
@@ -193,12 +195,20 @@ def _haproxy() -> Iterator[Check]:
     yield Check("HAProxy", "ok", version.stdout.splitlines()[0].partition(" - ")[0])
 
 
-def _port() -> Iterator[Check]:
+def _ports() -> Iterator[Check]:
+    document = yaml.safe_load(DEPLOY_YAML.read_text(encoding="utf-8"))
+    for name, section, option in (("HTTP", "http_options", "--port"), ("gRPC", "grpc_options", "--grpc-port")):
+        if section in document:
+            port = document[section]["port"]
+            taken = _is_taken(port)
+            found = f"port {port} is {'in use' if taken else 'free'}"
+            advice = f"unless this is your policy server, use `league serve {option} PORT`" if taken else ""
+            yield Check(f"serving {name}", "note" if taken else "ok", found, advice)
+
+
+def _is_taken(port: int) -> bool:
     with socket.socket() as probe:
-        taken = probe.connect_ex(("127.0.0.1", 8000)) == 0
-    found = "port 8000 is in use" if taken else "port 8000 is free"
-    advice = "unless this is your policy server, use `league serve --port PORT`" if taken else ""
-    yield Check("serving", "note" if taken else "ok", found, advice)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
@@ -211,5 +221,5 @@ CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _registry,
     _ray,
     _haproxy,
-    _port,
+    _ports,
 )

@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -22,7 +22,14 @@ TYPES = {
     "list_type": "a list",
     "dict_type": "a mapping",
     "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
     "string_type": "a string",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "int_type": "an integer",
+    "int_parsing": "an integer",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
 }
 """Pydantic's type of an error → what YAML calls the expected value."""
 BASIC_TYPES = ("str", "int", "float", "bool")
@@ -37,7 +44,7 @@ def describe_yaml_error(error: yaml.YAMLError | UnicodeDecodeError) -> str:
 
 def describe_validation_error(model: type[BaseModel], error: ValidationError) -> str:
     """Return the first faults as a sentence that names the keys and the expected values, unknown keys first."""
-    faults = _without_consequences([Fault.of(model, detail) for detail in error.errors()])
+    faults = _by_value(_without_consequences([Fault.of(model, detail) for detail in error.errors()]))
     unknown_first = sorted(faults, key=lambda fault: not fault.is_unknown_key)
     messages = dict.fromkeys(str(fault) for fault in unknown_first)
     return "; ".join(list(messages)[:SHOWN])
@@ -45,12 +52,17 @@ def describe_validation_error(model: type[BaseModel], error: ValidationError) ->
 
 @dataclass(frozen=True)
 class Fault:
-    """One of pydantic's errors. path: keys and indices, without the names of union members; guess: a similar key."""
+    """One of pydantic's errors.
+
+    path: keys and indices, without the names of union members; guess: a similar key; expected: the types that the value
+    does not have.
+    """
 
     path: tuple[str | int, ...]
     kind: str
     message: str
     guess: str | None = None
+    expected: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, model: type[BaseModel], detail: Any) -> "Fault":
@@ -60,6 +72,8 @@ class Fault:
             known_by, start = ALGORITHMS[path.pop(1)], 1
             path = [part for part in path if part not in SCHEDULE_FORMS]
         path = [part for part in path if not _is_union_member(part, detail["type"])]
+        if (kind := detail["type"]) in TYPES:
+            return cls(tuple(path), kind, f"got {detail['input']!r}", expected=(TYPES[kind],))
         if detail["type"] != "extra_forbidden" or path[-1] in RENAMED_KEYS:
             return cls(tuple(path), detail["type"], _message(detail, path))
         known = _known_keys(known_by, path[start:-1])
@@ -75,7 +89,9 @@ class Fault:
 
     def __str__(self) -> str:
         key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in self.path).removeprefix(".")
-        return f"{key or 'file'}{'.algorithm' if self.kind == 'union_tag_invalid' else ''}: {self.message}"
+        algorithm = ".algorithm" if self.kind == "union_tag_invalid" else ""
+        expected = f"expected {' or '.join(self.expected)}, " if self.expected else ""
+        return f"{key or 'file'}{algorithm}: {expected}{self.message}"
 
 
 def _message(detail: Any, path: list[str | int]) -> str:
@@ -88,8 +104,6 @@ def _message(detail: Any, path: list[str | int]) -> str:
             return f"expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
         case "value_error":
             return str(detail["ctx"]["error"])
-        case kind if kind in TYPES:
-            return f"expected {TYPES[kind]}, got {detail['input']!r}"
     return f"{detail['msg'][0].lower()}{detail['msg'][1:]}, got {detail['input']!r}"
 
 
@@ -108,6 +122,16 @@ def _without_consequences(faults: list[Fault]) -> list[Fault]:
         if not (fault.kind == "missing" and fault.path in misspelt)
         and not any(len(path) > len(fault.path) and path[: len(fault.path)] == fault.path for path in paths)
     ]
+
+
+def _by_value(faults: list[Fault]) -> list[Fault]:
+    """Combine the faults of a value that has none of several types."""
+    found: dict[tuple[Any, ...], Fault] = {}
+    for fault in faults:
+        key = (fault.path, fault.message)
+        expected = (*(found[key].expected if key in found else ()), *fault.expected)
+        found[key] = replace(fault, expected=tuple(dict.fromkeys(expected)))
+    return list(found.values())
 
 
 def _known_keys(model: type[BaseModel], path: list[str | int]) -> list[str]:

@@ -1,3 +1,4 @@
+import socket
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,16 @@ def test_a_missing_optional_package_is_a_note(league: League, monkeypatch: pytes
     assert statuses.pop("rlcard") == "note"
     assert statuses.pop("onnx") == "fail"
     assert set(statuses.values()) == {"ok"}
+
+
+def test_the_ports_are_those_of_the_deployment(league: League, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", (doctor._ports,))
+    monkeypatch.setattr(doctor, "DEPLOY_YAML", deploy := tmp_path / "deploy.yaml")
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_server(("127.0.0.1", 0)) as other:
+        taken, free = (each.getsockname()[1] for each in (server, other))
+        other.close()
+        deploy.write_text(f"http_options: {{port: {free}}}\ngrpc_options: {{port: {taken}}}\n")
+        http, grpc = league("doctor", "--json").json["checks"]
+    assert (http["what"], http["status"], http["found"]) == ("serving HTTP", "ok", f"port {free} is free")
+    assert (grpc["what"], grpc["status"], grpc["found"]) == ("serving gRPC", "note", f"port {taken} is in use")
+    assert "--grpc-port PORT" in grpc["advice"]

@@ -31,7 +31,7 @@ def test_only_league_and_environment_are_required() -> None:
         ({"gate": {"alpha": 2}}, "gate.alpha: input should be less than 0.5, got 2"),
         ({"gate": {"elo0": 10, "elo1": 5}}, "gate: elo1 must be greater than elo0 (10)"),
         ({"training": {"algorithm": "dqm"}}, f"training.algorithm: expected one of {', '.join(ALGORITHMS)}, got 'dqm'"),
-        ({"training": {"lr": "fast"}}, "training.lr: input should be a valid number"),
+        ({"training": {"lr": "fast"}}, "training.lr: expected a number, got 'fast'"),
         ({"training": {"lrr": 1}}, "training.lrr: unknown key, did you mean 'lr'?"),
         ({"training": {"algorithm": "dqn", "epochs": 4}}, "training.epochs: unknown key, "),
         ({"training": {"algorithm": "dqn", "n_stepp": 4}}, "training.n_stepp: unknown key, did you mean 'n_step'?"),

@@ -134,5 +134,5 @@ def test_a_fault_of_a_schedule_is_reported_with_its_key(training: dict[str, Any]
 
 
 def test_off_policy_algorithms_have_no_schedule_of_the_learning_rate() -> None:
-    with pytest.raises(ConfigError, match=r"training\.lr: input should be a valid number"):
+    with pytest.raises(ConfigError, match=r"training\.lr: expected a number, got"):
         league(algorithm="dqn", lr={"initial": 1, "final": 0})
