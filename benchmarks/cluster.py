@@ -8,6 +8,8 @@ requires root, iproute2, PostgreSQL and Redis. The clients call through the node
 import argparse
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tests.support.cluster import league_cluster, scenarios, serving_scenarios
@@ -18,24 +20,27 @@ HTTP_BLOCKS = 32
 
 
 def main() -> int:
-    """Run all scenarios and print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Run the scenarios and print what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     parser.add_argument("--quick", action="store_true", help="outages of 10 s instead of 30 and 60 s")
-    quick = parser.parse_args().quick
+    options = parser.parse_args()
+    if unknown := [part for part in options.parts if part not in PARTS]:
+        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
     if (reason := league_cluster.obstacle()) is not None:
         print(reason, file=sys.stderr)
         return 2
-    with tempfile.TemporaryDirectory(prefix="cluster-") as name:
-        directory = Path(name)
-        directory.chmod(0o755)
-        with league_cluster.cluster(directory) as cluster:
-            _training(cluster, directory)
-            _serving(cluster, *((10.0, 10.0) if quick else (30.0, 60.0)))
+    for part in options.parts or PARTS:
+        with tempfile.TemporaryDirectory(prefix="cluster-") as name:
+            directory = Path(name)
+            directory.chmod(0o755)
+            with league_cluster.cluster(directory) as cluster:
+                scenarios.train(cluster, directory)
+                PARTS[part](cluster, directory, options.quick)
     return 0
 
 
-def _training(cluster: LeagueCluster, directory: Path) -> None:
-    scenarios.train(cluster, directory)
+def _training(cluster: LeagueCluster, directory: Path, _: bool) -> None:
     changes, steps = scenarios.change_nodes_while_training(cluster, directory)
     print(
         f"training: {_described(changes)}; {len(steps)} versions, each once: {steps == sorted(set(steps))}", flush=True
@@ -51,16 +56,14 @@ def _described(changes: scenarios.Changes) -> str:
     )
 
 
-def _serving(cluster: LeagueCluster, head_outage: float, database_outage: float) -> None:
-    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "benchmark")
-    with serving_scenarios.serving(cluster) as key:
+def _serving(cluster: LeagueCluster, _: Path, quick: bool) -> None:
+    head_outage, database_outage = (10.0, 10.0) if quick else (30.0, 60.0)
+    with _served(cluster) as key:
         ended = serving_scenarios.evaluate_over_http(cluster, key, HTTP_BLOCKS)
         print(f"evaluation over HTTP: {ended['state']}", flush=True)
         calls, killed = serving_scenarios.lose_worker_while_serving(cluster, key)
         restored = calls.new_replicas(killed)[-1] - killed
         print(f"worker killed under load: {_losses(calls)}; replicas restored after {restored:.1f} s", flush=True)
-        calls, _, drained = serving_scenarios.drain_worker_while_serving(cluster, key)
-        print(f"worker drained under load: {_losses(calls)}; drained within {drained:.1f} s", flush=True)
         calls, ended_at = serving_scenarios.cut_off_database(cluster, key, 2, database_outage)
         followed = calls.followed(2) - ended_at
         print(f"no database for {database_outage:g} s: {_losses(calls)}; followed {followed:.2f} s later", flush=True)
@@ -70,6 +73,24 @@ def _serving(cluster: LeagueCluster, head_outage: float, database_outage: float)
         print(f"promotion without a head: followed after {followed:.2f} s", flush=True)
 
 
+def _draining(cluster: LeagueCluster, _: Path, __: bool) -> None:
+    """The first loss of a server: later, the worker that has joined again has no replicas."""
+    with _served(cluster) as key:
+        calls, began, drained = serving_scenarios.drain_worker_while_serving(cluster, key)
+        print(
+            f"worker drained under load: {_losses(calls)}; {len(calls.new_replicas(began))} replicas started elsewhere;"
+            f" drained within {drained:.1f} s",
+            flush=True,
+        )
+
+
+@contextmanager
+def _served(cluster: LeagueCluster) -> Iterator[str]:
+    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "benchmark")
+    with serving_scenarios.serving(cluster) as key:
+        yield key
+
+
 def _losses(calls: serving_scenarios.Load) -> str:
     report = calls.report
     return (
@@ -77,6 +98,10 @@ def _losses(calls: serving_scenarios.Load) -> str:
         f" {report['attempts']:,} single attempts lost, {len(calls.attempts_shed)} refused"
         f" with 429, longest call {report['longest']:.1f} s"
     )
+
+
+PARTS = {"training": _training, "serving": _serving, "draining": _draining}
+"""Each with a cluster of its own."""
 
 
 if __name__ == "__main__":

@@ -81,9 +81,12 @@ def serving(cluster: LeagueCluster) -> Iterator[str]:
     scopes = ("--scope", "act", "--scope", "read", "--scope", "evaluate")
     token = json.loads(cluster.league(cluster.head, "keys", "create", "clients", *scopes, "--json"))["key"]
     options = ("--host", "0.0.0.0", "--replicas", str(REPLICAS), "--address", cluster.address)
+    before = len(cluster.head.log.read_text())
     server = cluster.start_league(cluster.head, "serve", *options)
     try:
-        until(lambda: "Serving" in cluster.head.log.read_text() or server.poll() is not None, 2 * START_TIMEOUT)
+        until(
+            lambda: "Serving" in cluster.head.log.read_text()[before:] or server.poll() is not None, 2 * START_TIMEOUT
+        )
         assert server.poll() is None, cluster.head.log.read_text()[-3000:]
         yield token
     finally:
