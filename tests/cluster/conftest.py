@@ -8,7 +8,7 @@ from tests.support.cluster import league_cluster
 from tests.support.cluster.league_cluster import LeagueCluster
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that all machines share."""
     found = tmp_path_factory.mktemp("cluster")
@@ -17,7 +17,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def cluster(directory: Path) -> Iterator[LeagueCluster]:
     """A cluster of three nodes in network namespaces."""
     if (reason := league_cluster.obstacle()) is not None:

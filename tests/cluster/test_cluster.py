@@ -17,7 +17,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 BLOCKS = 300
 """Matches of each of two versions against a slow bot."""
 HTTP_BLOCKS = 4
-RARE = 0.001
 HEAD_OUTAGE, DATABASE_OUTAGE = 30.0, 60.0
 """Seconds without a head, and without the database."""
 WAIT = 60.0
@@ -75,7 +74,9 @@ def test_no_call_is_lost_with_a_worker(cluster: LeagueCluster, key: str) -> None
     calls, killed = serving_scenarios.lose_worker_while_serving(cluster, key)
     assert calls.lost == []
     assert len(calls.attempts_lost) <= serving_scenarios.THREADS, "no more than those in flight"
-    assert len(calls.attempts_shed) < RARE * calls.report["attempts"], "while replicas start on the same cores"
+    assert len(calls.attempts_shed) < serving_scenarios.RARE * calls.report["attempts"], (
+        "while replicas start on the same cores"
+    )
     assert calls.new_replicas(killed), "others are started elsewhere"
 
 
@@ -90,6 +91,8 @@ def test_no_call_is_lost_with_the_head(cluster: LeagueCluster, key: str) -> None
     calls, killed, _ = serving_scenarios.lose_head(cluster, key, 1, HEAD_OUTAGE)
     assert calls.lost == []
     assert calls.attempts_lost == []
-    assert len(calls.attempts_shed) < RARE * calls.report["attempts"], "while a head starts on the same cores"
+    assert len(calls.attempts_shed) < serving_scenarios.RARE * calls.report["attempts"], (
+        "while a head starts on the same cores"
+    )
     assert calls.versions() == ["2", "1"], "promoted meanwhile"
     assert calls.new_replicas(killed) == [], "replicas continue"

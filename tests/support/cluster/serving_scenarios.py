@@ -23,6 +23,8 @@ AFTERWARDS = 20.0
 """Seconds of load after the head is back: it must not replace replicas."""
 SETTLED = 3.0
 """Seconds after which all replicas have answered many calls."""
+RARE = 0.001
+"""Share of attempts that may be refused with 429 while replicas or a head start on the same cores."""
 PORT = 8000
 
 
