@@ -10,9 +10,11 @@
 """
 
 import json
+import logging
 import math
 import secrets
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
@@ -110,6 +112,9 @@ def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
     return config.with_training(**changes)
 
 
+logger = logging.getLogger("policy_league")
+POLL = 1.0
+"""Seconds between looks for a heartbeat."""
 RUN_FILE = "run.json"
 ATTEMPT = "attempt-"
 CHECKPOINTS = "checkpoints"
@@ -204,7 +209,7 @@ class RunDirectory:
         record = _records(registry.storage, league, stored).get(path)
         if record is None:
             return None
-        _check_machine(path, stored)
+        _wait_for_other_machine(registry, league, name)
         return cls._copy(path, record)
 
     @classmethod
@@ -223,7 +228,7 @@ class RunDirectory:
                 f"league {config.league} has no training run with the role {role}, neither in"
                 f" {_runs(registry.storage, config.league)} nor in the registry: there is nothing to resume"
             )
-        _check_machine(newest, stored)
+        _wait_for_other_machine(registry, config.league, newest.name)
         record = records[newest]
         if record.exploits is not None:
             config = against(config, record.exploits)
@@ -298,14 +303,26 @@ def _records(storage: Storage, league: str, stored: Sequence[StoredRun]) -> dict
     return found
 
 
-def _check_machine(run: Path, stored: Sequence[StoredRun]) -> None:
-    """Raise AlreadyRunning if a process on another machine works on a run. The lock excludes those on this one."""
-    for other in stored:
-        if other.id == run.name and other.state == RUNNING and not is_local(other.driver):
-            raise AlreadyRunning(
-                f"training run {run.name} is running on {host_name(other.driver)}; if that machine was lost, try again"
-                f" in {HEARTBEAT_TIMEOUT.total_seconds():.0f} s"
+def _wait_for_other_machine(registry: Registry, league: str, run: str) -> None:
+    """Wait until the process on another machine that trained a run is silent, if there is one. The lock excludes those
+    on this machine.
+
+    Raises AlreadyRunning if it sends another heartbeat.
+    """
+    before: StoredRun | None = None
+    while stored := registry.runs.stored(league, run):
+        (now,) = stored
+        if now.state != RUNNING or is_local(now.driver):
+            return
+        if before is None:
+            logger.warning(
+                "training run %s was running on %s; waiting for up to %.0f s to see whether it is still",
+                *(run, host_name(now.driver), HEARTBEAT_TIMEOUT.total_seconds()),
             )
+        elif now.heartbeat_at != before.heartbeat_at:
+            raise AlreadyRunning(f"training run {run} is running on {host_name(now.driver)}")
+        before = now
+        time.sleep(POLL)
 
 
 def changed_setting(old: LeagueConfig, new: LeagueConfig) -> str | None:

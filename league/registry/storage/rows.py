@@ -474,6 +474,7 @@ class StoredRun:
     state: RunState
     driver: str
     """The process that trains it, or trained it last, see `league.processes.this_process`."""
+    heartbeat_at: datetime
     record: dict[str, Any]
     """The content of its file `run.json`."""
 

@@ -145,7 +145,7 @@ class RunRepository(Repository):
             leagues.require(session, league)
             found = session.scalars(query.where(table.driver.is_not(None)).limit(MAX_STORED))
             return [
-                StoredRun(row.id, _state(row), row.driver, row.record)
+                StoredRun(row.id, _state(row), row.driver, row.heartbeat_at, row.record)
                 for row in found
                 if row.driver is not None and row.record is not None
             ]

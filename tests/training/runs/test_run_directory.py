@@ -1,3 +1,4 @@
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -15,6 +16,7 @@ from league.registry.training.runs import HEARTBEAT_TIMEOUT
 from league.settings import Storage
 from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
+from training.runs import run_directory
 from training.runs.run_directory import CHECKPOINTS, RunDirectory, against
 from training.runs.run_reporter import RunReporter
 
@@ -150,15 +152,41 @@ def test_a_run_is_resumed_on_another_machine(registry: Registry, elsewhere: Regi
 
 
 @pytest.mark.parametrize("by_name", [False, True])
-def test_a_run_is_trained_on_one_machine_at_a_time(registry: Registry, elsewhere: Registry, by_name: bool) -> None:
+def test_a_run_is_trained_on_one_machine_at_a_time(
+    registry: Registry, elsewhere: Registry, by_name: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_directory, "POLL", 0.01)
     run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
     start(registry, run)
     change(registry, run, state="running", driver="trainer-7/boot/1:10:20")
-    for one in (registry, elsewhere):
-        with pytest.raises(AlreadyRunning, match=rf"{run.id} is running on trainer-7; .* try again in 60 s"):
-            RunDirectory.find(one, "tictactoe", run.id) if by_name else RunDirectory.resume(one, tictactoe())
-    change(registry, run, heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
+    is_over = threading.Event()
+
+    def send_heartbeats() -> None:
+        while not is_over.wait(0.01):
+            registry.runs.record("tictactoe", run.id, None)
+
+    driver = threading.Thread(target=send_heartbeats)
+    driver.start()
+    try:
+        for one in (registry, elsewhere):
+            with pytest.raises(AlreadyRunning, match=rf"{run.id} is running on trainer-7"):
+                RunDirectory.find(one, "tictactoe", run.id) if by_name else RunDirectory.resume(one, tictactoe())
+    finally:
+        is_over.set()
+        driver.join()
+
+
+def test_a_run_continues_when_the_machine_that_trained_it_is_silent(
+    registry: Registry, elsewhere: Registry, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(run_directory, "POLL", 0.01)
+    run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
+    start(registry, run)
+    almost_silent = datetime.now(UTC) - HEARTBEAT_TIMEOUT + timedelta(seconds=0.5)
+    change(registry, run, state="running", driver="trainer-7/boot/1:10:20", heartbeat_at=almost_silent)
     assert RunDirectory.resume(elsewhere, tictactoe()).id == run.id
+    assert datetime.now(UTC) > almost_silent + HEARTBEAT_TIMEOUT
+    assert f"{run.id} was running on trainer-7; waiting for up to 60 s" in caplog.text
 
 
 def test_a_run_that_ended_on_another_machine_is_complete(registry: Registry) -> None:
