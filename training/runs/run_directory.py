@@ -15,7 +15,7 @@ import math
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -204,13 +204,10 @@ class RunDirectory:
 
         Raises AlreadyRunning if it is trained on another machine.
         """
-        path = _runs(registry.storage, league) / name
-        stored = registry.runs.stored(league, name)
-        record = _records(registry.storage, league, stored).get(path)
-        if record is None:
-            return None
         _wait_for_other_machine(registry, league, name)
-        return cls._copy(path, record)
+        path = _runs(registry.storage, league) / name
+        record = _records(registry, league, name).get(path)
+        return None if record is None else cls._copy(path, record)
 
     @classmethod
     def resume(cls, registry: Registry, config: LeagueConfig, role: Role = MAIN) -> Self:
@@ -220,8 +217,7 @@ class RunDirectory:
 
         Raises NotFound; ConfigError if `config` differs; AlreadyRunning if it is trained on another machine.
         """
-        stored = registry.runs.stored(config.league)
-        records = _records(registry.storage, config.league, stored)
+        records = _records(registry, config.league)
         newest = max((path for path, record in records.items() if record.role == role), default=None)
         if newest is None:
             raise NotFound(
@@ -229,7 +225,7 @@ class RunDirectory:
                 f" {_runs(registry.storage, config.league)} nor in the registry: there is nothing to resume"
             )
         _wait_for_other_machine(registry, config.league, newest.name)
-        record = records[newest]
+        record = _records(registry, config.league)[newest]
         if record.exploits is not None:
             config = against(config, record.exploits)
         config = with_pins(config, record.pins)
@@ -290,16 +286,16 @@ def _runs(storage: Storage, league: str) -> Path:
     return storage.home / "runs" / league
 
 
-def _records(storage: Storage, league: str, stored: Sequence[StoredRun]) -> dict[Path, RunRecord]:
-    """Return directory → record of the runs in the directory of this machine, and of those in the registry.
+def _records(registry: Registry, league: str, run: str | None = None) -> dict[Path, RunRecord]:
+    """Return directory → record of the runs in the directory of this machine, and of the newest in the registry, or of one run.
 
     The registry has the newer record of a run that another machine trained last.
     """
-    runs = _runs(storage, league)
+    runs = _runs(registry.storage, league)
     found = {file.parent: RunRecord.model_validate_json(file.read_text()) for file in runs.glob(f"*/{RUN_FILE}")}
-    for run in stored:
-        if runs / run.id not in found or not is_local(run.driver):
-            found[runs / run.id] = RunRecord.model_validate(run.record | {"complete": run.state == "ended"})
+    for stored in registry.runs.stored(league, run):
+        if runs / stored.id not in found or not is_local(stored.driver):
+            found[runs / stored.id] = RunRecord.model_validate(stored.record | {"complete": stored.state == "ended"})
     return found
 
 

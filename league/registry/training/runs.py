@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, cast
 
 from sqlalchemy import delete, func, select, tuple_
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, undefer
 
 from league.errors import InvalidInput, InvalidReference, UnknownRun
 from league.processes import this_process
@@ -143,7 +143,8 @@ class RunRepository(Repository):
             query = query.filter_by(id=run)
         with self._database.read() as session:
             leagues.require(session, league)
-            found = session.scalars(query.where(table.driver.is_not(None)).limit(MAX_STORED))
+            with_records = query.options(undefer(table.record)).where(table.driver.is_not(None))
+            found = session.scalars(with_records.limit(MAX_STORED))
             return [
                 StoredRun(row.id, _state(row), row.driver, row.heartbeat_at, row.record)
                 for row in found
