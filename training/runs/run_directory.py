@@ -287,7 +287,7 @@ def _runs(storage: Storage, league: str) -> Path:
 
 
 def _records(registry: Registry, league: str, run: str | None = None) -> dict[Path, RunRecord]:
-    """Return directory → record of the runs in the directory of this machine, and of the newest, or one, in the registry.
+    """Return directory → record of the runs of this machine, and of the newest, or one, in the registry.
 
     The registry has the newer record of a run that another machine trained last.
     """
