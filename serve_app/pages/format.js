@@ -2,6 +2,7 @@
 
 const NONE = "–";
 const counts = new Intl.NumberFormat("en");
+const significant = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
 const compact = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 3 });
 
 export const count = (value) => (value == null ? NONE : counts.format(value));
@@ -23,7 +24,7 @@ export function short(value) {
   const size = Math.abs(value);
   if (size >= 1e15 || (size > 0 && size < 1e-3)) return value.toExponential(2).replaceAll("-", "−");
   if (size >= 1e5) return compact.format(value).replace("-", "−");
-  return counts.format(Number.isInteger(value) ? value : Number(value.toPrecision(4))).replace("-", "−");
+  return (Number.isInteger(value) ? counts : significant).format(value).replace("-", "−");
 }
 
 export const percent = (share, digits = 1) => {
