@@ -32,21 +32,24 @@ def test_a_second_replica_appears_under_load_and_goes_without_a_lost_call() -> N
 
 @pytest.mark.timeout(300)
 def test_the_metrics_of_ray_contain_actions(tmp_path: Path) -> None:
+    """The count of requests, and the gauges that Ray's dashboard shows of autoscaling."""
     registry: Registry = everything(Storage.at(tmp_path / "home"))
-    with running(registry.storage, replicas=1) as url, httpx.Client(trust_env=False) as client:
+    with running(registry.storage, replicas=1, max_replicas=2) as url, httpx.Client(trust_env=False) as client:
         (raylet,) = processes(registry.storage, "raylet/raylet")
         found = re.search(r"/[^\0]*/session_[\d_-]+", Path(f"/proc/{raylet}/cmdline").read_text())
         assert found is not None
         (port,) = Path(found[0]).glob("metrics_export_port_*")
 
-        def counted() -> float:
-            """Actions in Ray Serve's count of requests."""
+        def total(metric: str, label: str = 'deployment="PolicyServer"') -> float:
+            """The sum of a metric's samples with a label, after one more action."""
             client.post(f"{url}{ACTION}", json={"observation": BOARD}).raise_for_status()
             text = client.get(f"http://127.0.0.1:{port.read_text()}/metrics").text
-            lines = re.findall(r"^ray_serve_deployment_request_counter_total\{(.*)\} (\S+)$", text, flags=re.M)
-            return sum(float(count) for labels, count in lines if 'route="/v1/policies/{model}/action"' in labels)
+            samples = re.findall(rf"^ray_serve_{metric}\{{(.*)\}} (\S+)$", text, flags=re.M)
+            return sum(float(value) for labels, value in samples if label in labels)
 
-        until(lambda: counted() > 0)
+        until(lambda: total("deployment_request_counter_total", 'route="/v1/policies/{model}/action"') > 0)
+        until(lambda: total("autoscaling_desired_replicas") == total("autoscaling_target_replicas") == 1)
+        until(lambda: total("autoscaling_total_requests") > 0)
     registry.close()
 
 
