@@ -18,7 +18,6 @@ from league.errors import LeagueError, last_line
 from league.ray_cluster import usable_cpus
 from league.settings import Storage
 from league.stack import OPTIONAL, VERIFIED, installed
-from serve_app.runtime.launch import DEPLOY_YAML
 
 GIGABYTE = 10**9
 MINIMUM_DISK = 2 * GIGABYTE
@@ -196,6 +195,8 @@ def _haproxy() -> Iterator[Check]:
 
 
 def _ports() -> Iterator[Check]:
+    from serve_app.runtime.launch import DEPLOY_YAML
+
     document = yaml.safe_load(DEPLOY_YAML.read_text(encoding="utf-8"))
     for name, section, option in (("HTTP", "http_options", "--port"), ("gRPC", "grpc_options", "--grpc-port")):
         if section in document:

@@ -25,8 +25,8 @@ from league.errors import (
     VersionRetired,
 )
 from league.files import DISK_FULL_OR_READ_ONLY, disk_errors
-from league.processes import has_ended, this_process
 from league.registry import leagues, versions
+from league.registry.processes import has_ended, this_process
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository, row_count
 from league.registry.storage.manifest import EXPLOITER, MIXTURE, Manifest

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from cli import doctor
+from serve_app.runtime import launch
 from tests.support.command import League
 
 
@@ -39,7 +40,7 @@ def test_a_missing_optional_package_is_a_note(league: League, monkeypatch: pytes
 
 def test_the_ports_are_those_of_the_deployment(league: League, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "CHECKS", (doctor._ports,))
-    monkeypatch.setattr(doctor, "DEPLOY_YAML", deploy := tmp_path / "deploy.yaml")
+    monkeypatch.setattr(launch, "DEPLOY_YAML", deploy := tmp_path / "deploy.yaml")
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_server(("127.0.0.1", 0)) as other:
         taken, free = (each.getsockname()[1] for each in (server, other))
         other.close()

@@ -33,8 +33,8 @@ from league.files import disk_errors, replacing
 from league.interface import Interface
 from league.policies.loading import contestant, players
 from league.policies.open_inference import fixed_version
-from league.processes import host_name, is_local
 from league.refs import CheckpointRef, RemoteRef, of_league, parse_ref
+from league.registry.processes import host_name, is_local
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, Role
 from league.registry.storage.rows import StoredRun

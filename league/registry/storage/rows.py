@@ -473,7 +473,7 @@ class StoredRun:
     id: str
     state: RunState
     driver: str
-    """The process that trains it, or trained it last, see `league.processes.this_process`."""
+    """The process that trains it, or trained it last, see `league.registry.processes.this_process`."""
     heartbeat_at: datetime
     record: dict[str, Any]
     """The content of its file `run.json`."""

@@ -117,7 +117,7 @@ class VersionTable(Base):
     exploits: Mapped[str | None] = mapped_column(Text)
     """As in the manifest."""
     publisher: Mapped[str] = mapped_column(Text)
-    """The process that writes it, see `league.processes.this_process`."""
+    """The process that writes it, see `league.registry.processes.this_process`."""
     reserved_at: Mapped[datetime] = mapped_column(Utc)
     manifest: Mapped[str | None] = mapped_column(Text)
     """manifest.json, byte for byte; null until ready."""
@@ -477,7 +477,7 @@ class RunTable(Base):
     attempts: Mapped[int] = mapped_column("lives")
     """How often it was started or resumed."""
     driver: Mapped[str | None] = mapped_column(Text)
-    """The process that trains it, or trained it last, see `league.processes.this_process`."""
+    """The process that trains it, or trained it last, see `league.registry.processes.this_process`."""
     record: Mapped[dict[str, Any] | None] = mapped_column(JSON, deferred=True)
     """What another machine needs to continue it; null in runs of earlier releases."""
     steps: Mapped[int] = mapped_column(BigInteger)

@@ -13,8 +13,8 @@ from sqlalchemy import delete, func, select, tuple_
 from sqlalchemy.orm import Session, undefer
 
 from league.errors import InvalidInput, InvalidReference, UnknownRun
-from league.processes import this_process
 from league.registry import leagues
+from league.registry.processes import this_process
 from league.registry.storage.database import Repository
 from league.registry.storage.rows import RunPoint, RunRow, RunState, StoredRun, detached
 from league.registry.storage.tables import RunPointTable, RunTable

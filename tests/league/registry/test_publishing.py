@@ -22,8 +22,8 @@ from league.errors import (
     UnknownLeague,
     UnknownVersion,
 )
-from league.processes import this_process
 from league.registry import publishing
+from league.registry.processes import this_process
 from league.registry.publishing import is_dead
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest

@@ -1,9 +1,9 @@
 import subprocess
 import sys
 
-from league.processes import has_ended, host_name, is_local, this_process
+from league.registry.processes import has_ended, host_name, is_local, this_process
 
-PROGRAM = "from league.processes import this_process; print(this_process(), flush=True); input()"
+PROGRAM = "from league.registry.processes import this_process; print(this_process(), flush=True); input()"
 
 
 def test_a_process_ends() -> None:
