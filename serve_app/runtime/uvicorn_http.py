@@ -1,4 +1,5 @@
-"""uvicorn's HTTP protocol with batched accepts, notification of shutdown, and the length of the accept queue.
+"""uvicorn's HTTP protocol with batched accepts, responses sent as one write, notification of shutdown, and the length
+of the accept queue.
 
 uvloop accepts one connection per turn of the event loop, and a turn handles the requests of all open connections. If
 many clients connect at once with slow requests, the last one would wait for a long time. Therefore each new
@@ -22,6 +23,8 @@ from uvicorn.config import Config
 from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
+
+from serve_app.runtime.joined_writes import JoinedWrites
 
 TCP_INFO_BYTES = 28
 UNACKED = slice(24, 28)
@@ -114,6 +117,8 @@ class HttpProtocol(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Start this connection, and accept those that wait."""
         super().connection_made(cast(asyncio.Transport, transport))
+        self._joined = JoinedWrites(self.transport, self.loop.call_soon)
+        self.transport = cast(asyncio.Transport, self._joined)
         if self.server is None or self.server[1] is None:
             return
         queue = _queues.get(self.server_state)
@@ -123,6 +128,17 @@ class HttpProtocol(HttpToolsProtocol):
             begun = self.loop.create_task(self.loop.connect_accepted_socket(self._another, connection))
             self.server_state.tasks.add(begun)  # type: ignore[arg-type]
             begun.add_done_callback(self.server_state.tasks.discard)
+
+    def on_response_complete(self) -> None:
+        """Send the response."""
+        self._joined.flush()
+        super().on_response_complete()
+
+    def handle_websocket_upgrade(self) -> None:
+        """Hand over the connection."""
+        self._joined.flush()
+        self.transport = self._joined.transport
+        super().handle_websocket_upgrade()
 
     def _another(self) -> "HttpProtocol":
         return HttpProtocol(self._when_stopping, self.config, self.server_state, self.app_state, self.loop)
