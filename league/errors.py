@@ -184,6 +184,10 @@ class ArtifactCorrupt(LeagueError, code="artifact_corrupt"):
     """A file of a version is missing, or its digest differs from the manifest."""
 
 
+class RunCorrupt(LeagueError, code="run_corrupt"):
+    """The record of a training run is not valid: a file was changed, or another release wrote it."""
+
+
 class GameHung(LeagueError, code="game_hung"):
     """A game has not ended after `play.max_moves` steps or `play.game_seconds` of environment time."""
 

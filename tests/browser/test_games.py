@@ -1,6 +1,8 @@
 """Playback of recorded games, and games against policies."""
 
 import re
+from base64 import b64decode
+from io import BytesIO
 from pathlib import Path
 
 import pytest
@@ -8,7 +10,15 @@ from PIL import Image
 from playwright.sync_api import Page, expect
 
 from tests.support.clients.browsers import Served, Tab
-from tests.support.leagues.browser_leagues import CONNECT_FOUR, HIDDEN, NAMED, answer, verdict_between_versions
+from tests.support.environments.declaring import VIEWS as VIEWS_OF_AGENTS
+from tests.support.leagues.browser_leagues import (
+    CONNECT_FOUR,
+    HIDDEN,
+    NAMED,
+    VIEWS,
+    answer,
+    verdict_between_versions,
+)
 from tests.support.leagues.tictactoe import LEAGUE
 
 pytestmark = pytest.mark.slow  # a browser and a server take all cores
@@ -159,6 +169,17 @@ def test_the_page_shows_colors_and_warns_of_pictures_that_show_everything(tab: T
     expect(page.locator(".notice")).to_have_count(0)
     page = tab.open(f"/leagues/{HIDDEN}/play#opponent=script:first&agent=player_1&seed=1&actions=")
     expect(page.locator(".notice")).to_contain_text("what is hidden from player_1")
+
+
+@pytest.mark.parametrize("agent", VIEWS_OF_AGENTS)
+def test_each_seat_sees_its_own_view(tab: Tab, agent: str) -> None:
+    page = tab.open(f"/leagues/{VIEWS}/play#opponent=script:first&agent={agent}&seed=1&actions=")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    expect(page.locator(".notice")).to_have_count(0)
+    source = page.locator(".picture img").get_attribute("src")
+    assert source is not None
+    with Image.open(BytesIO(b64decode(source.partition("base64,")[2]))) as picture:
+        assert set(picture.convert("L").getdata()) == {VIEWS_OF_AGENTS[agent]}
 
 
 def test_terms_are_explained(tab: Tab) -> None:

@@ -19,16 +19,16 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from league.config.base import JSON, Part
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.config.training import TrainingSettings
-from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.errors import AlreadyRunning, ConfigError, NotFound, RunCorrupt
 from league.files import disk_errors, replacing
 from league.interface import Interface
 from league.policies.loading import contestant, players
@@ -292,11 +292,22 @@ def _records(registry: Registry, league: str, run: str | None = None) -> dict[Pa
     The registry has the newer record of a run that another machine trained last.
     """
     runs = _runs(registry.storage, league)
-    found = {file.parent: RunRecord.model_validate_json(file.read_text()) for file in runs.glob(f"*/{RUN_FILE}")}
+    found = {file.parent: _record(file.read_text(), str(file)) for file in runs.glob(f"*/{RUN_FILE}")}
     for stored in registry.runs.stored(league, run):
         if runs / stored.id not in found or not is_local(stored.driver):
-            found[runs / stored.id] = RunRecord.model_validate(stored.record | {"complete": stored.state == "ended"})
+            record = stored.record | {"complete": stored.state == "ended"}
+            found[runs / stored.id] = _record(record, f"run {stored.id} in the registry")
     return found
+
+
+def _record(found: str | dict[str, Any], source: str) -> RunRecord:
+    """Parse a run's record, JSON or its object. Raises RunCorrupt, which names `source` and the key."""
+    try:
+        return RunRecord.model_validate_json(found) if isinstance(found, str) else RunRecord.model_validate(found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise RunCorrupt(f"{source}: {key or 'record'}: {first['msg']}") from error
 
 
 def _wait_for_other_machine(registry: Registry, league: str, run: str) -> None:

@@ -22,8 +22,8 @@ from tests.support.waiting import until
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
-NAMED, HIDDEN = "named", "hidden"
-"""Tic-tac-toe with names of actions, and an environment whose pictures show hidden information."""
+NAMED, HIDDEN, VIEWS = "named", "hidden", "views"
+"""Tic-tac-toe with names of actions, with pictures that show hidden information, and with one view per agent."""
 DIRECTIONS = ["up-left", "left", "down-left", "up", "centre", "down", "up-right", "right", "down-right"]
 RUN = "ppo-17"
 KEYS = {"everything": ["act", "read", "evaluate", "promote"], "evaluator": ["evaluate", "read"], "reader": ["read"]}
@@ -36,10 +36,13 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
         for name in (CONNECT_FOUR, EMPTY):
             config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
             registry.leagues.register(config, interface(config))
-        hidden = {"entry_point": "tests.support.environments.declaring:Revealing"}
+        hidden, views = (
+            {"entry_point": f"tests.support.environments.declaring:{name}"} for name in ("Revealing", "Declaring")
+        )
         for config in (
             tictactoe.config(league=NAMED, play={"action_names": DIRECTIONS}),
             tictactoe.config(league=HIDDEN, environment=hidden),
+            tictactoe.config(league=VIEWS, environment=views),
         ):
             registry.leagues.register(config, interface(config))
         change_game(registry)

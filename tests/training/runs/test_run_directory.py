@@ -1,3 +1,4 @@
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import update
 
-from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.errors import AlreadyRunning, ConfigError, NotFound, RunCorrupt
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER
 from league.registry.storage.tables import RunTable
@@ -207,3 +208,19 @@ def test_runs_of_earlier_releases_are_resumed_where_they_began(registry: Registr
     assert RunDirectory.resume(registry, tictactoe()).id == run.id
     with pytest.raises(NotFound):
         RunDirectory.resume(elsewhere, tictactoe())
+
+
+def test_a_changed_record_is_named(registry: Registry, storage: Storage) -> None:
+    run = RunDirectory.begin(storage, tictactoe(), None, None)
+    (run.path / "run.json").write_text("{")
+    with pytest.raises(RunCorrupt, match=rf"{run.path}/run\.json: record: Invalid JSON"):
+        RunDirectory.resume(registry, tictactoe())
+
+
+def test_a_changed_record_in_the_registry_is_named(registry: Registry, storage: Storage) -> None:
+    run = RunDirectory.begin(storage, tictactoe(), None, None)
+    start(registry, run)
+    shutil.rmtree(run.path)
+    change(registry, run, record={"config": 5})
+    with pytest.raises(RunCorrupt, match=rf"run {run.id} in the registry: \S+: "):
+        RunDirectory.resume(registry, tictactoe())

@@ -111,3 +111,23 @@ def test_expired_credentials_are_reported(bucket: str, tmp_path: Path, code: str
     for error, message in ((GenericError(code), "expired: renew"), (PermissionDeniedError("403"), "refuses the cred")):
         with pytest.raises(LeagueError, match=message), store._errors():
             raise error
+
+
+@pytest.mark.parametrize(
+    ("url", "store"),
+    [
+        ("s3://bucket/prefix", "S3Store"),
+        ("gs://bucket/prefix", "GCSStore"),
+        ("az://container/prefix", "AzureStore"),
+    ],
+)
+def test_each_kind_of_store_is_opened(url: str, store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
+    opened = object_artifacts._connect(url)
+    assert (type(opened).__name__, opened.prefix) == (store, "prefix")
+
+
+def test_azure_needs_an_account(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
+    with pytest.raises(ConfigError, match="LEAGUE_ARTIFACTS=az://container is invalid: .*Account must be specified"):
+        object_artifacts._connect("az://container")
