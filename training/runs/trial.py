@@ -40,7 +40,7 @@ from training.runs.checkpoint_digests import write_digests
 from training.runs.driver_files import DriverFiles, DriverMachine
 
 REPORT_SECONDS = 2.0
-"""Interval between a trial's reports after the first, in seconds."""
+"""Interval between a trial's reports, in seconds."""
 MAX_THREADS = 4
 """More do not accelerate networks of a few hundred units."""
 PROGRESS_FILE = "progress.json"
@@ -114,14 +114,11 @@ class Trial(tune.Trainable):
         self._plan_checkpoint()
 
     def step(self) -> dict[str, Any]:
-        """Update until a report is due; return the latest value of each metric.
-
-        The first report follows the first update, so that it is soon known whether and where the run trains.
-        """
+        """Update until a report is due; return the latest value of each metric."""
         metrics: dict[str, Any] = {}
         sums: Counter[str] = Counter()
         began, steps = time.monotonic(), self.steps
-        while not self._due():
+        while time.monotonic() - began < REPORT_SECONDS and not self._due():
             self.algorithm.progress = ScheduleProgress(self.steps, self._budget_spent())
             updated = time.monotonic()
             result = self.algorithm.train()
@@ -129,8 +126,6 @@ class Trial(tune.Trainable):
             self.steps += int(result[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED])
             metrics |= training_metrics(result, self.interface)
             sums.update(totals(result))
-            if self.iteration == 0 or time.monotonic() - began >= REPORT_SECONDS:
-                break
         elapsed = time.monotonic() - began
         if self.steps > steps:
             other = elapsed - sum(sums[phase] for phase in PHASES)
