@@ -129,5 +129,5 @@ def test_each_kind_of_store_is_opened(url: str, store: str, monkeypatch: pytest.
 
 def test_azure_needs_an_account(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
-    with pytest.raises(ConfigError, match="LEAGUE_ARTIFACTS=az://container is invalid: .*Account must be specified"):
+    with pytest.raises(ConfigError, match=r"LEAGUE_ARTIFACTS=az://container is invalid: .*Account must be specified"):
         object_artifacts._connect("az://container")
