@@ -28,6 +28,7 @@ from league.config.base import JSON, Part
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.config.training import TrainingSettings
+from league.config.validation_errors import describe_validation_error
 from league.errors import AlreadyRunning, ConfigError, NotFound, RunCorrupt
 from league.files import disk_errors, replacing
 from league.interface import Interface
@@ -301,13 +302,11 @@ def _records(registry: Registry, league: str, run: str | None = None) -> dict[Pa
 
 
 def _record(found: str | dict[str, Any], source: str) -> RunRecord:
-    """Parse a run's record, JSON or its object. Raises RunCorrupt, which names `source` and the key."""
+    """Parse a run's record, JSON or its object. Raises RunCorrupt, which names `source` and the keys."""
     try:
         return RunRecord.model_validate_json(found) if isinstance(found, str) else RunRecord.model_validate(found)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise RunCorrupt(f"{source}: {key or 'record'}: {first['msg']}") from error
+        raise RunCorrupt(f"{source}: {describe_validation_error(RunRecord, error)}") from error
 
 
 def _wait_for_other_machine(registry: Registry, league: str, run: str) -> None:

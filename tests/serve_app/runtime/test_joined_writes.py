@@ -4,16 +4,14 @@ import asyncio
 import socket
 import threading
 from collections.abc import Callable
-from functools import partial
 
 import pytest
-import uvicorn
 from hypothesis import given
 from hypothesis import strategies as st
 from starlette.types import Receive, Scope, Send
 
 from serve_app.runtime.joined_writes import MAX_HELD, JoinedWrites
-from serve_app.runtime.uvicorn_http import HttpProtocol
+from tests.support.servers.http_protocol import serving
 
 REQUEST = b"GET / HTTP/1.1\r\nhost: here\r\n\r\n"
 OPERATIONS = st.lists(st.binary(max_size=40) | st.just("flush") | st.just("turn"))
@@ -42,18 +40,20 @@ class Recorder(asyncio.Transport):
 def test_everything_is_sent_once_and_in_order(operations: list[bytes | str]) -> None:
     recorder, turn = Recorder(), list[Callable[[], None]]()
     joined = JoinedWrites(recorder, turn.append)
+    written: list[bytes] = []
     for operation in operations:
         if operation == "flush":
             joined.flush()
         elif operation == "turn":
             while turn:
                 turn.pop()()
-            assert not joined._held
+            assert b"".join(recorder.writes) == b"".join(written)
         else:
             assert isinstance(operation, bytes)
+            written.append(operation)
             joined.write(operation)
     joined.close()
-    assert b"".join(recorder.writes) == b"".join(each for each in operations if isinstance(each, bytes))
+    assert b"".join(recorder.writes) == b"".join(written)
     assert recorder.closed
 
 
@@ -93,29 +93,13 @@ def test_a_stream_sends_its_head_before_it_has_a_body(loop: str) -> None:
         await asyncio.to_thread(go_on.wait, 20)
         await send({"type": "http.response.body", "body": b"body"})
 
-    config = uvicorn.Config(
-        application,
-        port=0,
-        loop=loop,  # type: ignore[arg-type]
-        http=partial(HttpProtocol, lambda: None),  # type: ignore[arg-type]
-        lifespan="off",
-        log_config=None,
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-    try:
-        with socket.create_connection(server.servers[0].sockets[0].getsockname(), timeout=20) as client:
+    with serving(application, loop) as address, socket.create_connection(address, timeout=20) as client:
+        try:
             client.sendall(REQUEST)
             head = client.recv(4096)
             assert head.startswith(b"HTTP/1.1 200")
             assert head.endswith(b"\r\n\r\n")
             go_on.set()
             assert client.recv(4096) == b"body"
-    finally:
-        go_on.set()
-        server.should_exit = True
-        thread.join(20)
-    assert not thread.is_alive()
+        finally:
+            go_on.set()

@@ -4,16 +4,13 @@ import asyncio
 import socket
 import threading
 from collections.abc import Callable
-from functools import partial
 
 import pytest
-import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from serve_app.runtime.uvicorn_http import HttpProtocol
+from tests.support.servers.http_protocol import serving
 
 CLIENTS = 40
-PROTOCOL = partial(HttpProtocol, lambda: None)
 REQUEST = b"GET / HTTP/1.1\r\nhost: here\r\nconnection: close\r\n\r\n"
 
 
@@ -47,22 +44,10 @@ def receive_all(connection: socket.socket) -> bool:
     return reply.startswith(b"HTTP/1.1 204")
 
 
-def run_server(
-    protocol: Callable[..., asyncio.Protocol], loop: str, run_client: Callable[[TurnCounting, tuple[str, int]], None]
-) -> None:
+def run_server(loop: str, run_client: Callable[[TurnCounting, tuple[str, int]], None]) -> None:
     application = TurnCounting()
-    config = uvicorn.Config(application, port=0, loop=loop, http=protocol, lifespan="off", log_config=None)  # type: ignore[arg-type]
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-    try:
-        run_client(application, server.servers[0].sockets[0].getsockname())
-    finally:
-        server.should_exit = True
-        thread.join(20)
-    assert not thread.is_alive()
+    with serving(application, loop) as address:
+        run_client(application, address)
 
 
 @pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
@@ -84,7 +69,7 @@ def test_clients_that_arrived_while_the_loop_was_busy_start_together(loop: str) 
             "too many turns between the first and the last"
         )
 
-    run_server(PROTOCOL, loop, run_client)
+    run_server(loop, run_client)
 
 
 def test_a_stopping_server_accepts_no_connections() -> None:
@@ -96,6 +81,6 @@ def test_a_stopping_server_accepts_no_connections() -> None:
         client.sendall(REQUEST)
         assert receive_all(client)
 
-    run_server(PROTOCOL, "uvloop", run_client)
+    run_server("uvloop", run_client)
     with socket.socket() as probe:
         assert probe.connect_ex(addresses[0]) != 0
