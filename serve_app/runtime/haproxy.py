@@ -66,6 +66,8 @@ def environment(directory: Path) -> dict[str, str]:
         # longer than three times Ray's default of 5 s, and would never succeed.
         "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "30",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "serve_app.runtime.serve_bypass:middlewares",
+        # Ray starts its workers with 15: any busy process of the machine would take the CPU from the replicas.
+        "RAY_worker_niceness": "0",
         "RAY_AUTH_MODE": "token",
         "RAY_USAGE_STATS_ENABLED": "0",
         # Inference in a replica uses one thread.

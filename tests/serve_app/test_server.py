@@ -66,6 +66,14 @@ def test_all_replicas_answer_with_their_name(url: str, served: Registry) -> None
         assert client.get("/v1/health/ready").status_code == 200
 
 
+def test_replicas_have_the_priority_of_the_server(served: Registry) -> None:
+    """Ray lowers that of its workers by default: busy processes of the machine would take the CPU from replicas."""
+    replicas = processes(served.storage, "PolicyServer")
+    assert len(replicas) == 2
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    assert {os.getpriority(os.PRIO_PROCESS, pid) for pid in replicas} == {own}
+
+
 def test_one_scrape_covers_all_replicas(url: str, served: Registry) -> None:
     with httpx.Client(base_url=url) as client:
         for _ in range(50):
