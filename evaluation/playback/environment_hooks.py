@@ -20,6 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from league.config.environment import EnvironmentConfig
+from league.config.validation_errors import describe_validation_error
 from league.environments.building import build
 from league.errors import EnvironmentMismatch
 
@@ -84,7 +85,6 @@ def environment_hooks(config: EnvironmentConfig) -> EnvironmentHooks:
     try:
         declared = Declarations.model_validate({**KNOWN.get(str(metadata.get("name")), {}), **metadata})
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise EnvironmentMismatch(f"metadata of {config.entry_point}: {key}: {first['msg']}") from error
+        fault = describe_validation_error(Declarations, error)
+        raise EnvironmentMismatch(f"metadata of {config.entry_point}: {fault}") from error
     return EnvironmentHooks(draws, draws and has_views, declared)

@@ -49,8 +49,11 @@ def _exists(pid: int) -> bool:
 
 
 def _start(pid: int) -> str:
-    """Clock ticks from boot to the start of a process (proc(5), stat field 22); empty if there is no /proc."""
+    """Clock ticks from boot to the start of a process; empty if it has ended, or if there is no /proc."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+        # The command's name, in parentheses, may contain spaces. See proc(5).
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return ""
+    state, start = fields[0], fields[19]
+    return "" if state in "ZX" else start

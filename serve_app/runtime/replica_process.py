@@ -4,12 +4,10 @@ A process knows this only of processes on its machine and of actors in its Ray c
 off from the network, has not ended.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
-PROC = Path("/proc")
+from league.registry import processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,37 +23,10 @@ class ReplicaProcess:
 
 
 def this_process() -> ReplicaProcess:
-    """This process, known by its machine. Other systems than Linux give no description."""
-    try:
-        return ReplicaProcess({"machine": _machine(), "pid": str(os.getpid()), "start": _start(os.getpid())}, has_ended)
-    except OSError:
-        return ReplicaProcess({}, has_ended)
+    """This process, known by its machine."""
+    return ReplicaProcess({"process": processes.this_process()}, has_ended)
 
 
 def has_ended(other: Mapping[str, str]) -> bool:
     """Whether a process ran on this machine, since its last start and in this container, and has ended."""
-    try:
-        if other.get("machine") != _machine():
-            return False
-    except OSError:
-        return False
-    try:
-        return _start(int(other["pid"])) != other["start"]
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-def _machine() -> str:
-    """Machine, its last start, and the container: process ids are unique within these."""
-    boot = (PROC / "sys/kernel/random/boot_id").read_text().strip()
-    return f"{boot}/{os.stat(PROC / 'self/ns/pid').st_ino}"
-
-
-def _start(pid: int) -> str:
-    """When a process started, in ticks since the machine did: process ids are used again."""
-    # The command's name, in parentheses, may contain spaces. See proc(5).
-    fields = (PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
-    state, start = fields[0], fields[19]
-    if state in "ZX":
-        raise FileNotFoundError(f"process {pid} has ended")
-    return start
+    return "process" in other and processes.has_ended(other["process"])

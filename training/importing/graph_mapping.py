@@ -8,7 +8,7 @@ import yaml
 from onnx.helper import tensor_dtype_to_np_dtype
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
 
-from league.config.validation_errors import describe_yaml_error
+from league.config.validation_errors import describe_validation_error, describe_yaml_error
 from league.errors import ConfigError, EnvironmentMismatch
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
@@ -69,9 +69,7 @@ class GraphMapping(BaseModel):
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(map(str, first["loc"])) or "mapping"
-            raise ConfigError(f"{path}: {key}: {first['msg']}") from error
+            raise ConfigError(f"{path}: {describe_validation_error(cls, error)}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
 

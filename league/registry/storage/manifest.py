@@ -6,6 +6,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 
 from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
+from league.config.validation_errors import describe_validation_error
 from league.errors import ArtifactCorrupt
 from league.interface import Interface
 from league.registry.storage.mixture import Mixture
@@ -131,6 +132,4 @@ class Manifest(_Record):
         try:
             return cls.model_validate_json(text)
         except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"])
-            raise ArtifactCorrupt(f"{source}: {key or 'manifest'}: {first['msg']}") from error
+            raise ArtifactCorrupt(f"{source}: {describe_validation_error(cls, error)}") from error

@@ -40,7 +40,7 @@ def test_an_environment_without_pictures_has_no_views() -> None:
     [
         ({"board": [[0, 1], [2]]}, "board: .*rows of equal length"),
         ({"board": []}, "board: .*rows of equal length"),
-        ({"board": [["a"]]}, r"board\.0\.0: .*integer"),
+        ({"board": [["a"]]}, r"board\[0\]\[0\]: .*integer"),
         ({"action_keys": {"w": "up"}}, "action_keys.w: .*integer"),
         ({"agent_colors": {"player_1": "url(x)"}}, "agent_colors: .*player_1: 'url\\(x\\)' is neither"),
     ],

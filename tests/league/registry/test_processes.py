@@ -1,22 +1,42 @@
+import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+
+import pytest
 
 from league.registry.processes import has_ended, host_name, is_local, this_process
 
 PROGRAM = "from league.registry.processes import this_process; print(this_process(), flush=True); input()"
 
 
-def test_a_process_ends() -> None:
+@pytest.fixture
+def other() -> Iterator[tuple["subprocess.Popen[str]", str]]:
+    """Another process, and its identity."""
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as child:
-        assert child.stdout is not None
-        identity = child.stdout.readline().strip()
-        assert is_local(identity)
-        assert not has_ended(identity)
-        child.communicate("\n")
-    assert has_ended(identity)
+    ) as process:
+        assert process.stdout is not None
+        yield process, process.stdout.readline().strip()
+        process.kill()
+
+
+def test_a_process_that_runs_has_not_ended(other: tuple["subprocess.Popen[str]", str]) -> None:
+    process, identity = other
+    assert is_local(identity)
+    assert not has_ended(identity)
     assert not has_ended(this_process())
+    process.send_signal(signal.SIGSTOP)
+    assert not has_ended(identity), "a stuck process may continue"
+
+
+@pytest.mark.parametrize("reaped", [True, False])
+def test_a_killed_process_has_ended(other: tuple["subprocess.Popen[str]", str], reaped: bool) -> None:
+    process, identity = other
+    process.kill()
+    os.waitid(os.P_PID, process.pid, os.WEXITED | (0 if reaped else os.WNOWAIT))
+    assert has_ended(identity)
 
 
 def test_another_process_with_the_same_id() -> None:

@@ -197,10 +197,11 @@ def test_a_replica_registers_before_it_reads_the_aliases(registry: Registry, mon
 
 def test_replicas_that_ended_are_removed_and_silent_ones_are_not(registry: Registry) -> None:
     here = dict(this_process().description)
+    machine, pid, _ = here["process"].rsplit(":", 2)
     processes = {
-        "ended": here | {"start": "1"},
+        "ended": {"process": f"{machine}:{pid}:1"},
         "stuck": here,
-        "elsewhere": here | {"machine": "another", "start": "1"},
+        "elsewhere": {"process": f"another:{pid}:1"},
     }
     for name, process in processes.items():
         registry.replicas.register(name, process)
