@@ -6,7 +6,7 @@
   half of them with equal probabilities: mixtures that an alias can serve. Versions are published only for arms that
   draw opponents from them.
 - connect_four: strength, lowest score against own past versions, and learned exploitability with opponents from the
-  league and in self-play alone, after 28 minutes with each of three seeds: more than three hours.
+  league and in self-play alone, after 28 minutes with each of three seeds: more than three hours (`--minutes`).
 """
 
 import argparse
@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from rich.console import Console
 
-from benchmarks.training.league_arms import compare_arms
+from benchmarks.training.league_arms import MINUTES, compare_arms
 from benchmarks.training.learned import local_ray, one_thread, report_target, updates
 from examples.blotto import PAYOFF, exploitability
 from league.config.league import LeagueConfig
@@ -175,7 +176,12 @@ def _each(values: Any) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
-PARTS = {"overhead": overhead, "blotto": blotto, "connect_four": compare_arms}
+def connect_four(quick: bool, minutes: float = MINUTES) -> bool:
+    """Compare both arms after a budget for each; see `compare_arms`."""
+    return compare_arms(minutes / 10 if quick else minutes)
+
+
+PARTS = {"overhead": overhead, "blotto": blotto, "connect_four": connect_four}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -183,12 +189,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     parser.add_argument("--quick", action="store_true", help="a tenth of the time")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="of an arm of connect_four; default: 28")
     given = parser.parse_args(arguments)
     if unknown := [part for part in given.parts if part not in PARTS]:
         parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
+    parts = PARTS | {"connect_four": partial(connect_four, minutes=given.minutes)}
     one_thread()
     with local_ray(cpus=2):
-        missed = [name for name in given.parts or PARTS if not PARTS[name](given.quick)]
+        missed = [name for name in given.parts or parts if not parts[name](given.quick)]
     print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
     return bool(missed)
 

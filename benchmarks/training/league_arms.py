@@ -25,7 +25,9 @@ from training.runs.train import train
 
 CONFIG = Path(__file__).parent.parent.parent / "configs" / "connect_four.yaml"
 SEEDS = range(3)
-MINUTES, VERSIONS, BLOCKS = 28.0, 7, 200
+MINUTES = 28.0
+"""Of training, by default."""
+VERSIONS, BLOCKS = 7, 200
 EXPLOITER = 0.15
 """Share of the budget for the exploiter of the last version."""
 GAIN = 0.10
@@ -46,9 +48,8 @@ class Arm:
     exploiter: ExploiterScore
 
 
-def compare_arms(quick: bool) -> bool:
-    """Print the results of all seeds, and whether the league's means meet the targets."""
-    minutes = MINUTES / 10 if quick else MINUTES
+def compare_arms(minutes: float) -> bool:
+    """Print the results of all seeds, and whether the league's means meet the targets. minutes: of each training."""
     arms: dict[str, list[Arm]] = {SELF_PLAY: [], LEAGUE: []}
     scores: list[float] = []
     for seed in SEEDS:
