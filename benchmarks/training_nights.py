@@ -2,7 +2,8 @@
 
 Each night is one call of the command in a league of its own; a night trains for three minutes, and its exploiter for
 15 % of that. In the end, the last champion plays the first one. Exploitability has risen if the interval of the last
-champion's exploiter is above that of the first champion's.
+champion's exploiter is above that of the first champion's. If `benchmarks.exploitability` knows the game, the exact
+exploitability of all candidates is printed as well.
 
     python -m benchmarks.training_nights connect_four leduc_holdem
     python -m benchmarks.training_nights tictactoe --nights 2 --minutes 0.2
@@ -14,17 +15,20 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from benchmarks.exploitability import MEASUREMENTS
 from benchmarks.training.learned import report_target
 from configs import find
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
 from evaluation.statistics.payoff import score_interval
+from league.policies.loading import eligible, load
 from league.registry.registry import Registry
 from league.settings import Storage
 
@@ -75,6 +79,8 @@ def measure(config: Path, home: Path, count: int) -> bool:
         "not risen",
         last["low"] <= first["high"],
     )
+    if (known := MEASUREMENTS.get(config.stem)) is not None:
+        print(f"exact exploitability: {_exact(config.stem, home, known.exploitability)}", flush=True)
     return _is_stronger(config.stem, home, champions[-1], champions[0]) and stays
 
 
@@ -101,6 +107,13 @@ def _line(night: dict[str, Any]) -> str:
 
 def _score(found: dict[str, Any]) -> str:
     return f"{found['score']:.3f} [{found['low']:.3f}, {found['high']:.3f}]"
+
+
+def _exact(league: str, home: Path, exploitability: Callable[[Any], float]) -> str:
+    """The exact exploitability of all candidates for promotion, in order."""
+    with closing(Registry.open(Storage.at(home))) as registry:
+        policies = {version.number: load(version.ref, registry=registry) for version in eligible(registry, league)}
+        return ", ".join(f"@{number} {exploitability(policy):.3f}" for number, policy in policies.items())
 
 
 def _is_stronger(league: str, home: Path, last: str, first: str) -> bool:
