@@ -104,6 +104,8 @@ def _message(detail: Any, path: list[str | int]) -> str:
             return f"expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
         case "value_error":
             return str(detail["ctx"]["error"])
+        case "json_invalid":  # the input is the whole file
+            return f"not valid JSON: {detail['ctx']['error']}"
     return f"{detail['msg'][0].lower()}{detail['msg'][1:]}, got {detail['input']!r}"
 
 
