@@ -213,7 +213,7 @@ def test_runs_of_earlier_releases_are_resumed_where_they_began(registry: Registr
 def test_a_changed_record_is_named(registry: Registry, storage: Storage) -> None:
     run = RunDirectory.begin(storage, tictactoe(), None, None)
     (run.path / "run.json").write_text("{")
-    with pytest.raises(RunCorrupt, match=rf"{run.path}/run\.json: file: invalid JSON"):
+    with pytest.raises(RunCorrupt, match=rf"{run.path}/run\.json: file: not valid JSON"):
         RunDirectory.resume(registry, tictactoe())
 
 
