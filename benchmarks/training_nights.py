@@ -2,8 +2,8 @@
 
 Each night is one call of the command in a league of its own; a night trains for three minutes, and its exploiter for
 15 % of that. In the end, the last champion plays the first one. Exploitability has risen if the interval of the last
-champion's exploiter is above that of the first champion's. If `benchmarks.exploitability` knows the game, the exact
-exploitability of all candidates is printed as well.
+champion's exploiter is above that of the first champion's: of its score, or of its gain in returns if the gate tests
+returns. If `benchmarks.exploitability` knows the game, the exact exploitability of all candidates is printed as well.
 
     python -m benchmarks.training_nights connect_four leduc_holdem
     python -m benchmarks.training_nights tictactoe --nights 2 --minutes 0.2
@@ -24,10 +24,12 @@ import yaml
 
 from benchmarks.exploitability import MEASUREMENTS
 from benchmarks.training.learned import report_target
+from cli.output import difference
 from configs import find
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
-from evaluation.statistics.payoff import score_interval
+from evaluation.statistics.payoff import paired_difference, score_interval
+from league.config.league import LeagueConfig
 from league.policies.loading import eligible, load
 from league.registry.registry import Registry
 from league.settings import Storage
@@ -35,7 +37,8 @@ from league.settings import Storage
 NIGHTS, MINUTES = 10, 3.0
 SCORE = 0.75
 """What the last champion must score against the first."""
-BLOCKS = 200
+BLOCKS = {"score": 200, "gain": 10_000}
+"""Matches of the last champion against the first, by what is compared."""
 
 
 def main() -> int:
@@ -65,23 +68,40 @@ def _short_nights(name: str, minutes: float, home: Path) -> Path:
 
 def measure(config: Path, home: Path, count: int) -> bool:
     """Run the nights and print them; return whether the targets are met."""
-    nights = []
+    nights, compared = [], _compared(config)
     for _ in range(count):
         nights.append(run_night(config, home))
-        print(_line(nights[-1]), flush=True)
+        print(_line(nights[-1], compared), flush=True)
     champions = [champion for night in nights if (champion := night["steps"]["gate"]["champion"])]
     measured = [found for night in nights if (found := night["steps"]["measure"]["exploitability"])]
     if not champions or not measured:
         return report_target(f"{config.stem}: no champion with an exploiter", "one", False)
-    first, last = (found["exploiters"][0] for found in (measured[0], measured[-1]))
+    first, last = (_of_exploiter(found, compared) for found in (measured[0], measured[-1]))
     stays = report_target(
-        f"{config.stem}, score of the champion's exploiter: {_score(first)} at first, {_score(last)} at last",
+        f"{config.stem}, {compared} of the champion's exploiter: {_interval(first)} at first, {_interval(last)} at last",
         "not risen",
-        last["low"] <= first["high"],
+        last[1] <= first[2],
     )
     if (known := MEASUREMENTS.get(config.stem)) is not None:
-        print(f"exact exploitability: {_exact(config.stem, home, known.exploitability)}", flush=True)
-    return _is_stronger(config.stem, home, champions[-1], champions[0]) and stays
+        stays &= _is_exactly_less(config.stem, home, known.exploitability, champions)
+    return _is_stronger(config.stem, home, champions[-1], champions[0], compared) and stays
+
+
+def _compared(config: Path) -> str:
+    """What an exploiter's success is measured by: `gain` in returns if the gate tests returns, else `score`."""
+    return "gain" if LeagueConfig.load(config).gate.model == "returns" else "score"
+
+
+def _of_exploiter(found: dict[str, Any], compared: str) -> tuple[float, float, float]:
+    """The mean score or gain of the best exploiter and its interval."""
+    best = found["exploiters"][0]
+    if compared == "score":
+        return best["score"], best["low"], best["high"]
+    return best["gain"]["mean"], best["gain"]["low"], best["gain"]["high"]
+
+
+def _interval(found: tuple[float, float, float]) -> str:
+    return f"{found[0]:.3f} [{found[1]:.3f}, {found[2]:.3f}]"
 
 
 def run_night(config: Path, home: Path) -> dict[str, Any]:
@@ -93,38 +113,42 @@ def run_night(config: Path, home: Path) -> dict[str, Any]:
     return night
 
 
-def _line(night: dict[str, Any]) -> str:
+def _line(night: dict[str, Any], compared: str) -> str:
     gate, found = night["steps"]["gate"], night["steps"]["measure"]["exploitability"]
     before = gate["champion_before"]
     change = "unchanged" if gate["champion"] == before else f"before: {before or 'none'}"
-    exploited = "no exploiter" if found is None else f"its exploiter scores {_score(found['exploiters'][0])}"
     trained = len(night["steps"]["train"]["versions"])
+    exploited = f"{compared} of its exploiter: {_interval(_of_exploiter(found, compared))}" if found else "no exploiter"
     return (
         f"{night['league']}, night {night['night']}: {trained} versions, champion {gate['champion']} ({change});"
         f" {exploited}"
     )
 
 
-def _score(found: dict[str, Any]) -> str:
-    return f"{found['score']:.3f} [{found['low']:.3f}, {found['high']:.3f}]"
-
-
-def _exact(league: str, home: Path, exploitability: Callable[[Any], float]) -> str:
-    """The exact exploitability of all candidates for promotion, in order."""
+def _is_exactly_less(league: str, home: Path, exploitability: Callable[[Any], float], champions: list[str]) -> bool:
+    """Print the exact exploitability of all candidates, and compare that of the last champion with the first's."""
     with closing(Registry.open(Storage.at(home))) as registry:
-        policies = {version.number: load(version.ref, registry=registry) for version in eligible(registry, league)}
-        return ", ".join(f"@{number} {exploitability(policy):.3f}" for number, policy in policies.items())
+        exact = {each.ref: exploitability(load(each.ref, registry=registry)) for each in eligible(registry, league)}
+    print("exact exploitability: " + ", ".join(f"{ref} {value:.3f}" for ref, value in exact.items()), flush=True)
+    first, last = exact[champions[0]], exact[champions[-1]]
+    return report_target(
+        f"{league}, exact exploitability of the champion: {first:.3f} at first, {last:.3f} at last",
+        "not risen",
+        last <= first,
+    )
 
 
-def _is_stronger(league: str, home: Path, last: str, first: str) -> bool:
+def _is_stronger(league: str, home: Path, last: str, first: str, compared: str) -> bool:
     """Play the last champion against the first, without recording the matches."""
     if last == first:
         return report_target(f"{league}: {first} is still the champion", f"{SCORE:.0%} against the first", False)
     with closing(Registry.open(Storage.at(home))) as registry:
         row = registry.leagues.get(league)
-        schedule = round_robin(row.config, row.interface, [last, first], BLOCKS)
+        schedule = round_robin(row.config, row.interface, [last, first], BLOCKS[compared])
         matches = MatchWorker(row.config, registry).play(schedule, range(schedule.length))
-        score, low, high = score_interval([match.score(0) for match in matches])
+    score, low, high = score_interval([match.score(0) for match in matches])
+    if compared == "gain" and (gain := paired_difference(matches, last)) is not None:
+        print(f"{league}: {last} gains {difference(gain)} per game against {first}", flush=True)
     return report_target(
         f"{league}: {last} scores {score:.1%} [{low:.1%}, {high:.1%}] against {first}", f"{SCORE:.0%}", score >= SCORE
     )

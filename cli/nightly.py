@@ -220,14 +220,17 @@ def faults_of(night: "TrainingNightRow") -> list[str]:
 
 def summary_of_night(night: "TrainingNightRow") -> list[str]:
     """Summarise a night of training: what was trained, and how exploitable the champion is."""
+    from evaluation.results import Difference
+
     versions = night.steps["train"]["versions"]
     start = "from scratch" if night.parent is None else f"from {night.league}@{night.parent}"
     sentences = [f"{night.league}: night {night.id} trained {', '.join(versions) or 'no version'} {start}."]
     if (found := night.steps["measure"]["exploitability"]) is not None:
         best = found["exploiters"][0]
+        gain = "" if best["gain"] is None else f", return gain {difference(Difference(**best['gain']))}"
         sentences.append(
             f"{found['ref']}: {best['ref']} scores {best['score']:.3f} [{best['low']:.3f}, {best['high']:.3f}] against"
-            f" it. A best response scores at least {found['bound']:.3f}."
+            f" it{gain}. A best response scores at least {found['bound']:.3f}."
         )
     return sentences
 

@@ -243,7 +243,7 @@ def verdict(report: "VerdictReport") -> str:
 
 def exploitability(test: "ExploitabilityReport") -> str:
     """`not more exploitable than connect_four@1 by 0.1 after 600 games: a best response scores at least 0.48 (0.45)`"""
-    found = f"{test.outcome} than {test.ref} by {test.margin:g} after {test.games} games"
+    found = f"{test.outcome} than {test.ref} by {test.improvement or test.margin:g} after {test.games} games"
     if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
         return found
     return (

@@ -237,7 +237,10 @@ class ExploiterReport(CompanionReport):
 class ExploitabilityReport(CompanionReport):
     """The test of the candidate's learned exploitability against that of the champion, which is `ref`.
 
-    margin: as a share of all points or in returns. outcome: `not more exploitable` or `more exploitable`.
+    margin: as a share of all points or in returns. improvement: by how much the candidate must be less exploitable, in
+    the same unit; 0 if it need not be.
+    outcome: `not more exploitable` or `more exploitable`; with an improvement `less exploitable` or `not less
+    exploitable`.
     blocks: counted rounds; each exploiter plays one block in a round. games: of both contestants.
     candidate, champion: lower bounds of their exploitability, from a fixed number of blocks; None before these.
     difference: how much more exploitable the candidate is, in the unit of the margin, with an interval over blocks,
@@ -245,6 +248,7 @@ class ExploitabilityReport(CompanionReport):
     for others trained in the same way, too. Both are from the fixed number of blocks.
     """
 
+    improvement: float
     candidate: Exploitability | None
     champion: Exploitability | None
     difference: Difference | None

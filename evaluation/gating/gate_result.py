@@ -99,6 +99,7 @@ class ExploitabilityResult:
     Attributes:
         ref: The champion.
         margin: By how much the candidate may be more exploitable.
+        improvement: By how much it must be less exploitable; 0 if it need not be.
         schedule: Id of the schedule.
         decision: The test, whose blocks are rounds: one block of each exploiter.
         of_candidate: Exploiters of the candidate.
@@ -111,6 +112,7 @@ class ExploitabilityResult:
 
     ref: str
     margin: float
+    improvement: float
     schedule: str
     decision: Decision
     of_candidate: tuple[str, ...]
@@ -122,20 +124,27 @@ class ExploitabilityResult:
     @property
     def failure(self) -> str:
         """What a `reject` shows."""
-        return f"is more exploitable than {self.ref} by exploiters trained against each"
+        more = "not less" if self.improvement else "more"
+        return f"is {more} exploitable than {self.ref} by exploiters trained against each"
 
     @property
     def claim(self) -> str:
         """What a `promote` shows."""
-        return f"is at most {self.margin:g} more exploitable than {self.ref} by exploiters trained against each"
+        less = "less" if self.improvement else f"at most {self.margin:g} more"
+        return f"is {less} exploitable than {self.ref} by exploiters trained against each"
+
+
+def exploitability_settings(settings: GateConfig, test: Mapping[str, Any]) -> GateConfig:
+    """Return the settings of a test of exploitability. test: its record in the settings of the verdict."""
+    return settings.of_exploitability(test["margin"], test.get("improvement", 0.0))
 
 
 def exploitability_result(
     settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, test: Mapping[str, Any]
 ) -> ExploitabilityResult:
     """Compare the exploitability of candidate and champion. test: its record in the settings of the verdict."""
-    exploiters, margin = tuple(test["of_candidate"]), test["margin"]
-    pairs, against = len(exploiters), settings.against_exploiter(test["margin"])
+    exploiters, against = tuple(test["of_candidate"]), exploitability_settings(settings, test)
+    pairs = len(exploiters)
     decision = decide_pairs(against, matches, candidate, champion, pairs)
     size = test["blocks"] * matches_each(champion, pairs)
     sample = matches[:size] if len(matches) >= size else ()
@@ -145,7 +154,8 @@ def exploitability_result(
         by_block, by_exploiter = student_interval(gaps.mean(axis=0).tolist()), crossed_interval(gaps)
     return ExploitabilityResult(
         ref=champion,
-        margin=margin,
+        margin=test["margin"],
+        improvement=test.get("improvement", 0.0),
         schedule=test["schedule"],
         decision=decision,
         of_candidate=exploiters,
@@ -170,14 +180,14 @@ class GateResult:
 
     companions: started tests after that against the champion, in order, of `planned_companions` in total.
     forfeits: forfeited games, or None if the gate allows them.
-    opponent: how the note names the opponent of the first test, which is `script:random` without a champion.
+    shown: what the first test showed if it is passed.
     """
 
     champion: Decision
     companions: tuple[CompanionResult, ...] = ()
     planned_companions: int = 0
     forfeits: int | None = None
-    opponent: str = "the champion"
+    shown: str = "it beat the champion"
 
     @property
     def anchors(self) -> tuple[AnchorResult, ...]:
@@ -208,11 +218,10 @@ class GateResult:
             return "reject", f"it forfeited {self.forfeits} games, but the gate allows none"
         for test in self.companions:
             if test.decision.outcome == "reject":
-                return "reject", f"it beat {self.opponent}, but {test.failure}"
+                return "reject", f"{self.shown}, but {test.failure}"
             if test.decision.outcome == "inconclusive":
-                return "inconclusive", (
-                    f"it beat {self.opponent}, but {test.decision.games} games do not show that it {test.claim}"
-                )
+                games = test.decision.games
+                return "inconclusive", f"{self.shown}, but {games} games do not show that it {test.claim}"
         is_complete = len(self.companions) == self.planned_companions and all(map(_is_passed, self.companions))
         return ("promote" if is_complete else None), None
 
@@ -226,7 +235,7 @@ def combine_results(
     companions: Sequence[CompanionResult],
     planned_companions: int,
     forfeits: int | None,
-    opponent: str = "the champion",
+    shown: str = "it beat the champion",
 ) -> GateResult:
     """Combine the tests up to the first one after the champion's that is not passed. Later ones are ignored."""
     looked_at: list[CompanionResult] = []
@@ -234,4 +243,4 @@ def combine_results(
         looked_at.append(test)
         if not _is_passed(test):
             break
-    return GateResult(champion, tuple(looked_at), planned_companions, forfeits, opponent)
+    return GateResult(champion, tuple(looked_at), planned_companions, forfeits, shown)

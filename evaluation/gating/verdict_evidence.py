@@ -84,7 +84,7 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
         opponent=verdict.champion,
         outcome=verdict.outcome or OPEN,
         promoted=promoted,
-        reason=_reason(verdict, decision, promoted),
+        reason=_reason(verdict, gate.requires_gain, decision, promoted),
         opened_at=iso_timestamp(verdict.opened_at),
         closed_at=iso_timestamp(verdict.closed_at) if verdict.closed_at else None,
         model=gate.model,
@@ -100,8 +100,9 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
     )
 
 
-def _reason(verdict: VerdictRow, decision: Decision, promoted: bool) -> str:
+def _reason(verdict: VerdictRow, requires_gain: bool, decision: Decision, promoted: bool) -> str:
     """Why the verdict has its outcome, in one sentence."""
+    passed, failed = ("Stronger", "Not stronger") if requires_gain else ("Not inferior", "Inferior")
     note = (verdict.evidence or {}).get("note")
     llr, lower, upper = (f"{value:.2f}".replace("-", "−") for value in (decision.llr, *decision.bounds))
     after = f"after {decision.games} games, the LLR was {llr}"
@@ -109,11 +110,11 @@ def _reason(verdict: VerdictRow, decision: Decision, promoted: bool) -> str:
         case None:
             return f"Undecided: {after}, between {lower} and {upper}."
         case "promote" if promoted:
-            return f"Stronger: {after}, above the bound of {upper}."
+            return f"{passed}: {after}, above the bound of {upper}."
         case "promote":
-            return f"Stronger ({after}), but not promoted: {note or 'no reason was recorded'}."
+            return f"{passed} ({after}), but not promoted: {note or 'no reason was recorded'}."
         case "inconclusive":
             return note or f"Inconclusive: {after}, between {lower} and {upper}, at the maximum number of games."
         case "reject" if note is None and decision.llr <= decision.bounds[0]:
-            return f"Not stronger: {after}, below the bound of {lower}."
+            return f"{failed}: {after}, below the bound of {lower}."
     return note or f"{str(verdict.outcome).capitalize()}: {after}."

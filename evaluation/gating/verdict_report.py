@@ -102,7 +102,8 @@ def gate_result(registry: Registry, verdict: VerdictRow) -> GateResult:
         companions.append(found)
         forfeited += forfeits(matches[: found.decision.games // GAMES_PER_BLOCK], candidate_ref)
     opponent = "the champion" if isinstance(parse_ref(verdict.champion), CheckpointRef) else verdict.champion
-    return combine_results(champion, companions, planned, None if gate.forfeits else forfeited, opponent)
+    shown = f"it beat {opponent}" if gate.requires_gain else f"it is not inferior to {opponent}"
+    return combine_results(champion, companions, planned, None if gate.forfeits else forfeited, shown)
 
 
 def difference_of_returns(
@@ -175,6 +176,7 @@ def exploiter_report(exploiter: ExploiterResult) -> ExploiterReport:
 
 
 EXPLOITABILITY_OUTCOMES = OUTCOMES | {"promote": "not more exploitable", "reject": "more exploitable"}
+IMPROVEMENT_OUTCOMES = OUTCOMES | {"promote": "less exploitable", "reject": "not less exploitable"}
 
 
 def exploitability_report(test: ExploitabilityResult | None, candidate: str) -> ExploitabilityReport | None:
@@ -183,11 +185,13 @@ def exploitability_report(test: ExploitabilityResult | None, candidate: str) -> 
         return None
     exploiters = {candidate: test.of_candidate, test.ref: test.of_champion}
     bounds = {ref: exploitability_bound(ref, own, test.sample) for ref, own in exploiters.items() if test.sample}
+    outcomes = IMPROVEMENT_OUTCOMES if test.improvement else EXPLOITABILITY_OUTCOMES
     return ExploitabilityReport(
         ref=test.ref,
         margin=test.margin,
+        improvement=test.improvement,
         schedule=test.schedule,
-        outcome=EXPLOITABILITY_OUTCOMES[test.decision.outcome],
+        outcome=outcomes[test.decision.outcome],
         **_test_statistics(test.decision),
         candidate=bounds.get(candidate),
         champion=bounds.get(test.ref),

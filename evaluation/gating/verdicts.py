@@ -18,7 +18,7 @@ from typing import Any
 from evaluation.gating.anchors import resolve_anchors
 from evaluation.gating.exploiters import recent_exploiters
 from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
-from evaluation.gating.gate_result import GateResult
+from evaluation.gating.gate_result import GateResult, exploitability_settings
 from evaluation.gating.trained_exploiters import Trainer, prepared_test
 from evaluation.gating.verdict_report import confirmation, gate_of, gate_result, is_applied, report_of
 from evaluation.matches import tournament
@@ -95,7 +95,9 @@ def open_verdict(
     if (resumed := next((row for row in earlier if row.outcome is None), None)) is not None:
         return resumed
     config, candidate_ref, ledger = league.config, f"{league.slug}@{candidate}", Ledger(registry)
-    gate = config.gate.of_one_verdict(config.gate.alpha if alpha is None else alpha)
+    is_champion = isinstance(parse_ref(opponent), CheckpointRef)
+    gate = config.gate if is_champion else config.gate.against_baseline()
+    gate = gate.of_one_verdict(gate.alpha if alpha is None else alpha)
     schedule = verdict_schedule(config, league.interface, candidate_ref, opponent, gate, seed=len(earlier))
     ledger.open(schedule)
     settings: dict[str, Any] = {"gate": gate.model_dump(mode="json"), "night": nightly_run}
@@ -109,7 +111,7 @@ def open_verdict(
         own = exploiter_test(config, league.interface, schedule, exploiter.ref, gate.max_blocks)
         record = {"ref": exploiter.ref, "exploits": exploiter.exploits, "margin": gate.margin_against_exploiters}
         settings["exploiters"].append(record | {"schedule": ledger.open(own).id})
-    if gate.exploiters.count and isinstance(parse_ref(opponent), CheckpointRef) and len(league.interface.sides) > 1:
+    if gate.exploiters.count and is_champion and len(league.interface.sides) > 1:
         settings["exploitability"] = None  # until the exploiters are trained
     if gate.confirmation_blocks:
         own = companion(config, league.interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
@@ -186,7 +188,7 @@ def _tests(
         against = gate.against_exploiter(each["margin"])
         yield ledger.schedule(each["schedule"]), SequentialMonitor(against, candidate, verdict.champion)
     if "exploitability" in settings and (test := prepared_test(registry, verdict, train)) is not None:
-        against, pairs = gate.against_exploiter(test["margin"]), len(test["of_candidate"])
+        against, pairs = exploitability_settings(gate, test), len(test["of_candidate"])
         watch = SequentialMonitor(against, candidate, verdict.champion, pairs, at_least=test["blocks"])
         yield ledger.schedule(test["schedule"]), watch
 
@@ -245,9 +247,13 @@ def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     anchors = f", and is not inferior to {', '.join(each.ref for each in seen.anchors)}" if seen.anchors else ""
     exploiters = ", ".join(each.ref for each in seen.exploiters)
     unexploited = f", and does no worse than it against {exploiters}" if exploiters else ""
-    exploitability = ", and is not more exploitable by its own exploiters" if seen.exploitability else ""
+    test = seen.exploitability
+    exploitability = (
+        f", and is {'less' if test.improvement else 'not more'} exploitable by its own exploiters" if test else ""
+    )
+    result = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
     return (
-        f"beat {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
+        f"{result} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
         f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{unexploited}{exploitability}"
     )
 

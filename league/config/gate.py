@@ -37,7 +37,17 @@ class ExploitersConfig(Part):
     budget: float = Field(default=0.15, gt=0, le=1)
     """Training budget of each, in steps and minutes, as a fraction of the candidate's run."""
     blocks: int = Field(default=200, ge=2)
-    """Matches of each exploiter from which its score is estimated. The test itself may take fewer or more."""
+    """Matches of each exploiter from which its score is estimated: in the gate, whose test may take fewer or more, in a
+    night of training, and by `league exploitability`."""
+    improvement: float = Field(default=0.0, ge=0)
+    """By how much less exploitable than the champion a candidate must be, in the unit of `exploiter_margin`. 0: it may
+    be more exploitable by up to `exploiter_margin`."""
+
+    @model_validator(mode="after")
+    def _improvement_is_tested(self) -> Self:
+        if self.improvement and not self.count:
+            raise ValueError("exploiters.improvement requires exploiters.count, the number of exploiters to train")
+        return self
 
 
 class GateConfig(Part):
@@ -117,13 +127,33 @@ class GateConfig(Part):
             raise ValueError(f"margin must be smaller than return_bound ({self.return_bound:g}), got {margin:g}")
 
     @model_validator(mode="after")
-    def _margin_is_possible(self) -> Self:
-        margin = self.margin_against_exploiters
+    def _margins_are_possible(self) -> Self:
         largest = 2 * (self.return_bound or 0) if self.model == "returns" else 1.0
-        if margin >= largest:
-            name = "twice return_bound" if self.model == "returns" else "all points"
-            raise ValueError(f"exploiter_margin must be smaller than {largest:g} ({name}), got {margin:g}")
+        margins = {
+            "exploiter_margin": self.margin_against_exploiters,
+            "exploiters.improvement": self.exploiters.improvement,
+        }
+        for setting, margin in margins.items():
+            if margin >= largest:
+                name = "twice return_bound" if self.model == "returns" else "all points"
+                raise ValueError(f"{setting} must be smaller than {largest:g} ({name}), got {margin:g}")
         return self
+
+    @property
+    def requires_gain(self) -> bool:
+        """Whether a candidate must be stronger than the champion; otherwise it must not be inferior."""
+        return (self.return0 if self.model == "returns" else self.elo0) >= 0
+
+    def against_baseline(self) -> Self:
+        """Return the settings of the first test without a champion, which shows a gain over a script in any case.
+
+        If H0 is that the candidate is weaker by a margin, it becomes equal strength, and H1 at least that margin.
+        """
+        if self.requires_gain:
+            return self
+        if self.model == "returns":
+            return self.model_copy(update={"return0": 0.0, "return1": max(self.return1, -self.return0)})
+        return self.model_copy(update={"elo0": 0.0, "elo1": max(self.elo1, -self.elo0)})
 
     def against_anchor(self, margin: float | None) -> Self:
         """Return the settings of a non-inferiority test. H0: weaker by the margin; H1: equally strong."""
@@ -141,14 +171,29 @@ class GateConfig(Part):
     def against_exploiter(self, margin: float) -> Self:
         """Return the settings of a paired test against an exploiter, which observes half of the difference between
         candidate and champion. H0: the candidate is worse by the margin; H1: it is as good.
+        """
+        return self._of_pairs(-margin, 0.0)
 
-        A score of ½ − margin/2 is expressed in Elo of the model `logistic`, whose hypotheses are mean scores. Those of
-        `normalized` would depend on how alike the games of candidate and champion are.
+    def of_exploitability(self, margin: float, improvement: float = 0.0) -> Self:
+        """Return the settings of the test of exploitability, which observes half of the difference between the results
+        of candidate and champion against their own exploiters.
+
+        H0: the candidate is more exploitable by the margin; H1: it is as exploitable. With an improvement, H0: it is as
+        exploitable; H1: it is less exploitable by the improvement.
+        """
+        return self._of_pairs(0.0, improvement) if improvement else self._of_pairs(-margin, 0.0)
+
+    def _of_pairs(self, low: float, high: float) -> Self:
+        """Return the settings of a test of half of a difference between candidate and champion. H0: it is `low`; H1: it
+        is `high`.
+
+        A score of ½ + difference/2 is expressed in Elo of the model `logistic`, whose hypotheses are mean scores. Those
+        of `normalized` would depend on how alike the games of candidate and champion are.
         """
         if self.model == "returns":
-            return self.model_copy(update={"return0": -margin / 2, "return1": 0.0})
-        elo0 = 400 * log10((1 - margin) / (1 + margin))
-        return self.model_copy(update={"model": "logistic", "elo0": elo0, "elo1": 0.0})
+            return self.model_copy(update={"return0": low / 2, "return1": high / 2})
+        elo0, elo1 = (400 * log10((1 + difference) / (1 - difference)) for difference in (low, high))
+        return self.model_copy(update={"model": "logistic", "elo0": elo0, "elo1": elo1})
 
     def of_one_verdict(self, alpha: float) -> Self:
         """Return the settings of one verdict with error probability `alpha`."""

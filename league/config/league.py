@@ -7,7 +7,7 @@ from typing import Any, Self
 import yaml
 from pydantic import ValidationError, field_validator, model_validator
 
-from league.config.algorithms import TrainingConfig
+from league.config.algorithms import AnyTraining, TrainingConfig
 from league.config.base import JSON, Part
 from league.config.environment import EnvironmentConfig
 from league.config.gate import GateConfig
@@ -55,6 +55,15 @@ class LeagueConfig(Part):
             raise ValueError("expected at least one entry")
         for key in value if isinstance(value, dict) else ():
             _slug("name", key)
+        return value
+
+    @field_validator("training")
+    @classmethod
+    def _exploiters_can_be_trained(cls, value: AnyTraining) -> AnyTraining:
+        try:
+            type(value).model_validate(value.model_dump(by_alias=True) | value.exploiter)
+        except ValidationError as error:
+            raise ValueError(f"exploiter.{describe_validation_error(type(value), error)}") from error
         return value
 
     @model_validator(mode="after")
@@ -124,6 +133,13 @@ class LeagueConfig(Part):
         if night.opponents is not None:
             settings["opponents"] = night.opponents.model_dump(by_alias=True)
         return self.with_training(**settings)
+
+    def against(self, target: str) -> Self:
+        """Return the configuration of a run of an exploiter, whose opponent in all episodes is `target`.
+
+        It has the training settings that are different for exploiters. Raises ConfigError.
+        """
+        return self.with_training(**self.training.exploiter, exploiter={}, opponents=[{"ref": target, "share": 1.0}])
 
     def of_exploiter(self, seed: int, steps: int | None, minutes: float | None, share: float) -> Self:
         """Return the configuration of the run of an exploiter, whose last checkpoint alone is published.

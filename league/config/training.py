@@ -1,8 +1,8 @@
 """The `training` section: settings common to all algorithms; and the `nightly` section."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from league.config.base import Part
 from league.config.network import ConvolutionConfig
@@ -10,6 +10,10 @@ from league.config.opponents import OpponentsConfig
 
 DEFAULT_STEPS = 1_000_000
 DEFAULT_CHECKPOINT_EVERY = 200_000
+FIXED_FOR_EXPLOITERS = frozenset(
+    ("algorithm", "seed", "steps", "minutes", "checkpoint_every", "checkpoint_minutes", "opponents", "exploiter")
+)
+"""Settings that the command, the night or the gate determines for an exploiter."""
 
 
 class PhaseConfig(Part):
@@ -61,6 +65,9 @@ class TrainingSettings(Part):
     version (`--from`), or their initial weights."""
     opponents: OpponentsConfig = OpponentsConfig()
     """Opponents. In their episodes one random side learns, and the opponent controls all others."""
+    exploiter: dict[str, Any] = Field(default_factory=dict)
+    """Training settings that are different for exploiters. What makes a policy hard to exploit, such as a magnet or a
+    high entropy, makes an exploiter weak."""
     strength: StrengthConfig | None = StrengthConfig()
     """Matches of each published version against the champion and an anchor; null plays none."""
     gpus: float = Field(default=0, ge=0)
@@ -73,6 +80,13 @@ class TrainingSettings(Part):
     """Maximum number of random legal moves at the start of each episode. They are excluded from training and lead to
     positions that self-play alone would not visit. Null: `play.opening_plies`, so that training visits the positions
     that matches start from."""
+
+    @field_validator("exploiter")
+    @classmethod
+    def _differences_are_possible(cls, value: dict[str, Any]) -> dict[str, Any]:
+        if fixed := sorted(FIXED_FOR_EXPLOITERS & value.keys()):
+            raise ValueError(f"{', '.join(fixed)} cannot be set for exploiters only")
+        return value
 
     @property
     def max_steps(self) -> int | None:

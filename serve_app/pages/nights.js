@@ -7,7 +7,7 @@ import { useChangeToken, useList } from "./data.js";
 import { Await, EmptyState, leaguePath, ShowMore, Table, Time } from "./components.js";
 import { Term } from "./term.js";
 import { range } from "./strength.js";
-import { interval, percent, shortRef, signed } from "./format.js";
+import { interval, number, percent, shortRef, signed } from "./format.js";
 
 export function Nights({ league }) {
   const nights = useList(apiPath(league, "nights"), "nights", useChangeToken("runs", "computed_at", "aliases"));
@@ -34,12 +34,12 @@ function Charts({ nights }) {
       <${Chart} label="Scores of exploiters in ${measured.length} nights. Last: ${percent(last.measured.score)}, 95 % interval ${range(last.measured)}." xName="night"
         x=${measured.map((night) => night.night)} lines=${[{ name: "score of the exploiter", values: measured.map((night) => night.exploitability.score), dots: true }]}
         intervals=${measured.map(({ exploitability: { low, high } }) => [low, high])} thresholds=${[{ name: "even", value: 0.5, tone: "muted" }]} format=${(share) => percent(share, 0)} />
-      <p class="muted small">The score of the best exploiter against the champion, with its interval. A best response scores at least the lower end.</p></article>`}
+      <p class="muted small">The score of the best exploiter against the champion, with its interval. A best response scores at least the lower end. The return gain is its mean return minus that of the champion.</p></article>`}
   </div>`;
 }
 
 function List({ league, nights }) {
-  const head = [["Night", "number"], ["Started"], ["Versions"], ["Champion"], [html`<${Term} name="rating">Rating<//>`, "number"], ["95 % interval"], ["Exploiter's score", "number"], ["95 % interval"], ["Errors"]];
+  const head = [["Night", "number"], ["Started"], ["Versions"], ["Champion"], [html`<${Term} name="rating">Rating<//>`, "number"], ["95 % interval"], ["Exploiter's score", "number"], ["95 % interval"], ["Return gain", "number"], ["Errors"]];
   return html`<${Table} caption="Nights, newest first" head=${head} cls="full">${nights.map((night) => html`<${Row} key=${night.night} league=${league} night=${night} />`)}<//>`;
 }
 
@@ -53,6 +53,7 @@ function Row({ league, night: { night, run, exploiter_run: exploiterRun, version
     <td class="number strong">${signed(rating)}</td><td class="nowrap muted">${interval(bounds)}</td>
     <td class="number">${score && exploiterRun ? html`<a href=${leaguePath(league, "runs", exploiterRun)}>${score}</a>` : score ?? html`<span class="muted">–</span>`}</td>
     <td class="nowrap muted">${exploitability ? range(exploitability) : "–"}</td>
+    <td class="number nowrap">${exploitability?.gain ? html`${signed(exploitability.gain.mean, 2)} <small class="muted">${number(exploitability.gain.low)} to ${number(exploitability.gain.high)}</small>` : html`<span class="muted">–</span>`}</td>
     <td class="wrap">${errors.join("; ")}</td>
   </tr>`;
 }

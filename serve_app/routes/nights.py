@@ -68,5 +68,5 @@ def _exploitability(measured: Mapping[str, Any] | None) -> dict[str, Any] | None
         return None
     best = measured["exploiters"][0]
     return {"bound": measured["bound"], "exploiter": best["ref"]} | {
-        name: best[name] for name in ("games", "score", "low", "high")
+        name: best[name] for name in ("games", "score", "low", "high", "gain")
     }

@@ -82,11 +82,6 @@ def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface
     return pins
 
 
-def against(config: LeagueConfig, target: str) -> LeagueConfig:
-    """Return the league with `target` as the opponent in all episodes."""
-    return config.with_training(opponents=[{"ref": target, "share": 1.0}])
-
-
 def _references(settings: TrainingSettings) -> list[str]:
     """The fixed opponents, the version of the magnet, and the teacher."""
     found: list[str | None] = [opponent.ref for opponent in settings.opponents.fixed]
@@ -228,7 +223,7 @@ class RunDirectory:
         _wait_for_other_machine(registry, config.league, newest.name)
         record = _records(registry, config.league)[newest]
         if record.exploits is not None:
-            config = against(config, record.exploits)
+            config = config.against(record.exploits)
         config = with_pins(config, record.pins)
         if (changed := changed_setting(record.config, config)) is not None:
             raise ConfigError(

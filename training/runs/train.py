@@ -32,7 +32,7 @@ from training.runs.error_messages import is_process_lost, training_error
 from training.runs.node_watch import NodeWatch
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
-from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, against, pin_opponents
+from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, pin_opponents
 from training.runs.run_reporter import RunReporter
 from training.runs.strength_queue import Measure, StrengthQueue
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
@@ -115,7 +115,8 @@ def train(
     registry.leagues.register(config, interface)
     exploits = None if target is None else _target(registry, target, config, interface)
     if exploits is not None:
-        config = against(config, exploits)
+        config = config.against(exploits)
+        check(config, interface)
     number = None if parent is None else _parent(registry, parent, config, interface).number
     if resume:
         interrupted: RunDirectory | None = RunDirectory.resume(registry, config, role)
@@ -221,7 +222,7 @@ def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueCon
     """
     version = registry.versions.resolve(ref)
     try:
-        check_network(version, config)
+        check_network(version, config.against(version.ref))
     except ConfigError:
         return None
     return ref if registry.versions.has_training(version) else None

@@ -18,7 +18,7 @@ from league.settings import Storage
 from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
 from training.runs import run_directory
-from training.runs.run_directory import CHECKPOINTS, RunDirectory, against
+from training.runs.run_directory import CHECKPOINTS, RunDirectory
 from training.runs.run_reporter import RunReporter
 
 
@@ -109,7 +109,7 @@ def test_runs_are_resumed_by_role(registry: Registry, storage: Storage) -> None:
     main = RunDirectory.begin(storage, written, None, None)
     with pytest.raises(NotFound, match="no training run with the role exploiter"):
         RunDirectory.resume(registry, written, EXPLOITER)
-    exploiter = RunDirectory.begin(storage, against(written, "tictactoe@3"), None, None, exploits="tictactoe@3")
+    exploiter = RunDirectory.begin(storage, written.against("tictactoe@3"), None, None, exploits="tictactoe@3")
     assert RunDirectory.resume(registry, written).id == main.id
     resumed = RunDirectory.resume(registry, written, EXPLOITER)
     assert (resumed.id, resumed.record) == (exploiter.id, exploiter.record)
