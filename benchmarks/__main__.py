@@ -15,6 +15,7 @@ ORDER = (
     "maddpg",
     "league_training",
     "training_nights",
+    "exploiters",
     "exploitability",
     "parity",
     "imports",

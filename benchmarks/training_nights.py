@@ -78,7 +78,7 @@ def measure(config: Path, home: Path, count: int) -> bool:
         return report_target(f"{config.stem}: no champion with an exploiter", "one", False)
     first, last = (_of_exploiter(found, compared) for found in (measured[0], measured[-1]))
     stays = report_target(
-        f"{config.stem}, {compared} of the champion's exploiter: {_interval(first)} at first, {_interval(last)} at last",
+        f"{config.stem}, {compared} of the champion's exploiter: {_interval(first)} first, {_interval(last)} last",
         "not risen",
         last[1] <= first[2],
     )

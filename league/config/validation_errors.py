@@ -70,6 +70,7 @@ class Fault:
         path, known_by, start = list(detail["loc"]), model, 0
         if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
             known_by, start = ALGORITHMS[path.pop(1)], 1
+        if known_by in ALGORITHMS.values():
             path = [part for part in path if part not in SCHEDULE_FORMS]
         path = [part for part in path if not _is_union_member(part, detail["type"])]
         if (kind := detail["type"]) in TYPES:

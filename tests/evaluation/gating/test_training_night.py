@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from tests.support.leagues import tictactoe
 from tests.support.leagues.handwritten_training import HandwrittenTrainer
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
-GATE = {"elo1": 150, "max_blocks": 100, "confirmation_blocks": 4}
+GATE = {"elo1": 150, "max_blocks": 100, "confirmation_blocks": 4, "exploiters": {"blocks": 4}}
 CONFIG = tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 4})
 LEAGUE = tictactoe.LEAGUE
 
@@ -27,13 +26,6 @@ LEAGUE = tictactoe.LEAGUE
 @pytest.fixture(autouse=True)
 def few_matches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evaluation.gating.nightly.RATING_BLOCKS", 4)
-    monkeypatch.setattr("evaluation.gating.training_night.exploitability", _short_exploitability())
-
-
-def _short_exploitability() -> Any:
-    from evaluation.gating.exploitability import exploitability
-
-    return partial(exploitability, blocks=4)
 
 
 def trainer_of(registry: Registry, *graphs: bytes) -> HandwrittenTrainer:

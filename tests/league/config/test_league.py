@@ -5,6 +5,7 @@ import pytest
 
 from league.config.algorithms import ALGORITHMS
 from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
 from league.errors import ConfigError
 
 CONFIGS = sorted(Path("configs").glob("*.yaml"))
@@ -55,6 +56,13 @@ def test_only_league_and_environment_are_required() -> None:
         (
             {"training": {"magnet": {"ref": "@champion", "weight": 1}, "recurrence": {}}},
             "magnet.ref @champion does not support recurrence: expected uniform",
+        ),
+        ({"training": {"exploiter": {"lrr": 1}}}, "training: exploiter.lrr: unknown key, did you mean 'lr'?"),
+        ({"training": {"exploiter": {"lr": "fast"}}}, "training: exploiter.lr: expected a number, got 'fast'"),
+        ({"training": {"exploiter": {"minibatch_size": 10**6}}}, "minibatch_size must be at most"),
+        (
+            {"training": {"exploiter": {"minutes": 3, "algorithm": "dqn"}}},
+            "training.exploiter: algorithm, minutes cannot be set for exploiters only",
         ),
         ({"training": 3}, "training: "),
         ({"policies": {}}, "policies: expected at least one entry"),
@@ -135,6 +143,17 @@ def test_replaced_training_settings_are_validated() -> None:
     assert config.with_training(minutes=3).training.minutes == 3
     with pytest.raises(ConfigError, match=r"training\.minutes"):
         config.with_training(minutes=-1)
+
+
+def test_exploiters_have_settings_of_their_own() -> None:
+    training = {"lr": 0.001, "gamma": 0.5, "exploiter": {"lr": {"initial": 0.1, "final": 0}, "magnet": None}}
+    training["magnet"] = {"ref": "uniform", "weight": 1}
+    config = LeagueConfig.from_mapping(MINIMAL | {"training": training})
+    settings = config.against("mini@3").training
+    assert isinstance(settings, PPOConfig)
+    assert (settings.lr.initial, settings.magnet, settings.gamma) == (0.1, None, 0.5)
+    assert [opponent.ref for opponent in settings.opponents.fixed] == ["mini@3"]
+    assert config.against("mini@3") == config.against("mini@3").against("mini@3")
 
 
 @pytest.mark.parametrize("section", ["play", "training"])

@@ -78,7 +78,8 @@ def nights(registry: Registry) -> None:
     """Two nights of training with the champions 1 and 2."""
     for number in (1, 2):
         night, ref = registry.training_nights.open(LEAGUE), f"{LEAGUE}@{number}"
-        score = {"ref": f"{LEAGUE}@3", "games": 64, "score": 0.8 - number / 10, "low": 0.5, "high": 0.9, "gain": None}
+        score = {"ref": f"{LEAGUE}@3", "games": 64, "score": 0.8 - number / 10, "low": 0.5, "high": 0.9}
+        score["gain"] = {"mean": 0.6 - number / 5, "low": 0.0, "high": 0.8}
         for step, result in {
             "train": {"run": RUN, "versions": [ref]},
             "gate": {"champion_before": None, "champion": ref, "verdicts": []},

@@ -15,7 +15,8 @@ WON, LOST, PENDING = "board-verdict-won", "board-verdict-lost", "board-verdict-p
 EARLIER = "0123456789ab-greedy"
 """Earlier conditions with results."""
 STRENGTH = StrengthRow(2, 200, "board@1", 40, 0.625, 0.5, 0.75, datetime(2026, 3, 3, 14, tzinfo=UTC))
-EXPLOITER_SCORE = {"ref": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875, "gain": None}
+GAIN = {"mean": 1.5, "low": 0.5, "high": 2.5}
+EXPLOITER_SCORE = {"ref": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875, "gain": GAIN}
 NIGHT = {
     "train": {"run": "first", "versions": ["board@2"]},
     "gate": {"champion_before": "board@1", "champion": "board@2", "verdicts": []},

@@ -114,14 +114,15 @@ def test_an_exploiter_is_trained_against_one_version(trained: Trained) -> None:
     registry = trained.registry
     registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="test", reason="test")
     shown = io.StringIO()
-    target, settings = CheckpointRef("tictactoe", "champion"), LEAGUE.with_training(steps=512)
+    target, settings = CheckpointRef("tictactoe", "champion"), LEAGUE.with_training(steps=512, exploiter={"gamma": 0.5})
     console = Console(file=shown, width=200)
     (version,) = train(settings, registry=registry, role=EXPLOITER, target=target, console=console)
     assert (version.role, version.exploits, version.parent) == (EXPLOITER, "tictactoe@1", None)
     assert version.manifest.settings["opponents"]["fixed"] == [{"ref": "tictactoe@1", "share": 1.0}]
+    assert version.manifest.settings["gamma"] == 0.5
     assert "Role: exploiter. Opponent in all episodes: tictactoe@1." in shown.getvalue()
     registry.aliases.set("tictactoe", "champion", 2, expected=1, actor="test", reason="test")
-    further = train(LEAGUE, registry=registry, role=EXPLOITER, resume=True)
+    further = train(settings.with_training(steps=1024), registry=registry, role=EXPLOITER, resume=True)
     assert [each.exploits for each in further] == ["tictactoe@1"] * 2
 
 
