@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 
 from evaluation.gating import verdicts
 from evaluation.gating.alpha_spending import alpha_share, alpha_spent
-from evaluation.gating.trained_exploiters import Trainer
+from evaluation.gating.trained_exploiters import Trainer, check_exploiters
 from evaluation.gating.verdict_report import confirmation
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import compute_leaderboard
@@ -81,7 +81,8 @@ def nightly(
         listener: Receives progress and verdicts.
 
     Raises:
-        ConfigError: A script, a bot or an anchor of the configuration does not exist or cannot play.
+        ConfigError: A script, a bot or an anchor of the configuration does not exist or cannot play, or the gate asks
+            for less exploitability in a league with one side.
         AlreadyRunning: Another nightly run of this league is active.
         LeagueArchived: The league is archived.
         InterfaceChanged: The configuration no longer fits the league's versions.
@@ -91,6 +92,7 @@ def nightly(
     with registry.exclusive_lock(f"nightly-{config.league}"), ray_session():
         found = interface(config)
         check_contestants(config, found, registry)
+        check_exploiters(config, found)
         registry.leagues.register(config, found)
         nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), train, workers, listener)
         before = nightly_run.champion()

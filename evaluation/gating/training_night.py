@@ -12,7 +12,7 @@ from typing import Any
 
 from evaluation.gating.exploitability import exploitability
 from evaluation.gating.nightly import nightly
-from evaluation.gating.trained_exploiters import Trainer, trainable_version, trained_exploiters
+from evaluation.gating.trained_exploiters import Trainer, check_exploiters, trainable_version, trained_exploiters
 from evaluation.results import Listener, NightlyReport
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -78,6 +78,7 @@ def training_night(
     with registry.exclusive_lock(f"training-night-{config.league}"):
         found = interface(config)
         check_contestants(config, found, registry)
+        check_exploiters(config, found)
         registry.leagues.register(config, found)
         row = registry.training_nights.open(config.league)
         night = _Night(config, registry, row, train, workers, listener)

@@ -126,9 +126,10 @@ function Exploitability({ test, candidate }) {
       ${bounds.map((side) => html` A best response to <span class="ref">${side.ref}</span> scores at least ${percent(side.bound)}.`)}</p>
     ${test.difference && html`<p>The exploiters of the candidate achieve ${gap(test.difference)} more than those of the champion.
       The 95 % interval is for these exploiters; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}.</p>`}
-    ${rows.length > 0 && html`<${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"]]}>
+    ${rows.length > 0 && html`<${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"], ["Return gain", "number"]]}>
       ${rows.map(([side, each]) => html`<tr key=${each.ref}><th scope="row"><span class="ref">${side.ref}</span></th><td><span class="ref">${each.ref}</span></td>
-        <td class="number">${count(each.games)}</td><td class="number">${percent(each.score)}</td><td class="nowrap">${percent(each.low)} to ${percent(each.high)}</td></tr>`)}
+        <td class="number">${count(each.games)}</td><td class="number">${percent(each.score)}</td><td class="nowrap">${percent(each.low)} to ${percent(each.high)}</td>
+        <td class="number nowrap">${each.gain ? html`${signed(each.gain.mean, 2)} <small>${number(each.gain.low)} to ${number(each.gain.high)}</small>` : "–"}</td></tr>`)}
     <//>`}`;
 }
 
