@@ -142,8 +142,9 @@ def train(
     trained network. TensorBoard logs are written to LEAGUE_HOME/runs. Ctrl-C publishes the current state and exits;
     `league train CONFIG --resume` continues after an interruption.
 
-    With --role exploiter, the version named by --against is the opponent in all episodes, and the published versions
-    cannot become champion. `--resume --role exploiter` continues the newest exploiter's run.
+    With --role exploiter, the version named by --against is the opponent in all episodes, the settings of
+    training.exploiter apply, and the published versions cannot become champion. `--resume --role exploiter` continues
+    the newest exploiter's run.
 
     A job continues when this command exits. Custom environments must be installed on the cluster.
 
