@@ -7,6 +7,9 @@ returns. If `benchmarks.exploitability` knows the game, the exact exploitability
 
     python -m benchmarks.training_nights connect_four leduc_holdem
     python -m benchmarks.training_nights tictactoe --nights 2 --minutes 0.2
+    python -m benchmarks.training_nights leduc_holdem --steps 6_000_000
+
+`--steps` limits nights by actions instead of time. On a machine with other work, exploiters get equal training then.
 """
 
 import argparse
@@ -47,20 +50,22 @@ def main() -> int:
     parser.add_argument("configs", nargs="*", metavar="CONFIG", default=["connect_four"], help="default: %(default)s")
     parser.add_argument("--nights", type=int, default=NIGHTS)
     parser.add_argument("--minutes", type=float, default=MINUTES, help="training time of a night; default: %(default)g")
+    parser.add_argument("--steps", type=int, help="actions of a night, instead of --minutes")
     parser.add_argument("--quick", action="store_true", help="smoke test: two nights of 0.2 minutes")
     options = parser.parse_args()
     nights, minutes = (2, 0.2) if options.quick else (options.nights, options.minutes)
+    budget = {"minutes": minutes} if options.steps is None else {"steps": options.steps}
     met = True
     for name in options.configs:
         with tempfile.TemporaryDirectory() as home:
-            met &= measure(_short_nights(name, minutes, Path(home)), Path(home), nights)
+            met &= measure(_short_nights(name, budget, Path(home)), Path(home), nights)
     return int(not met)
 
 
-def _short_nights(name: str, minutes: float, home: Path) -> Path:
-    """Write a bundled configuration with this training time of a night; return its path."""
+def _short_nights(name: str, budget: dict[str, Any], home: Path) -> Path:
+    """Write a bundled configuration with this training budget of a night; return its path."""
     document = yaml.safe_load(find(name).read_text())
-    document["nightly"] = document.get("nightly", {}) | {"minutes": minutes}
+    document["nightly"] = document.get("nightly", {}) | budget
     path = home / f"{document['league']}.yaml"
     path.write_text(yaml.safe_dump(document))
     return path
