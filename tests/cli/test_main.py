@@ -55,7 +55,6 @@ def test_each_command_and_option_has_help(name: str) -> None:
         (("evaluate", "tictactoe", "--minutes", "0"), ("minutes", "got 0")),
         (("evaluate", "tictactoe", "--precision", "-5"), ("precision", "got -5")),
         (("evaluate", "tictactoe", "--schedule", "cross_play"), ("cross-play", "2 side(s)")),
-        (("evaluate", "tictactoe", "--address", "127.0.0.1:1"), ("no Ray cluster at '127.0.0.1:1'",)),
         (("nightly", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
         (("train", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
         (("act", "script:random"), ("script",)),
@@ -74,6 +73,15 @@ def test_a_usage_error_is_one_line_and_exits_with_2(
     assert result.err.startswith("league: ")
     for word in messages:
         assert word in result.err
+
+
+@pytest.mark.usefixtures("registry")
+def test_a_cluster_that_does_not_exist_is_a_usage_error(league_process: League) -> None:
+    """In a subprocess, since a process that is connected to Ray already does not connect again."""
+    result = league_process("evaluate", "tictactoe", "--address", "127.0.0.1:1")
+    assert (result.code, result.out) == (2, "")
+    assert result.err.startswith("league: no Ray cluster at '127.0.0.1:1'")
+    assert result.err.count("\n") == 1
 
 
 def test_an_unusable_home_is_reported_in_one_line(league: League, home: Path) -> None:
