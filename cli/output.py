@@ -16,7 +16,7 @@ from rich.text import Text
 from league.refs import short_verdict
 
 if TYPE_CHECKING:
-    from evaluation.results import Difference, ExploitabilityReport, Listener, Standing, VerdictReport
+    from evaluation.results import CompanionReport, Difference, ExploitabilityReport, Listener, Standing, VerdictReport
     from evaluation.results import Progress as Games
 
 console = Console(highlight=False)
@@ -228,12 +228,9 @@ def verdict(report: "VerdictReport") -> str:
     games = f"after {report.games} games ({report.unique_games} unique), score {score}"
     place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
     gap = f", returns differ by {difference(report.difference)}" if report.difference else ""
-    anchors = "".join(
-        f"; {each.outcome} to {each.ref} by {each.margin:g} after {each.games} games" for each in report.anchors
-    )
+    anchors = "".join(f"; {compared(each, 'to', each.ref, each.margin)}" for each in report.anchors)
     exploiters = "".join(
-        f"; against {each.ref} {each.outcome} than {report.opponent} by {each.margin:g} after {each.games} games"
-        for each in report.exploiters
+        f"; against {each.ref} {compared(each, 'than', report.opponent, each.margin)}" for each in report.exploiters
     )
     note = f": {report.note}" if report.note else ""
     exploiters += "" if report.exploitability is None else f"; {exploitability(report.exploitability)}"
@@ -241,9 +238,16 @@ def verdict(report: "VerdictReport") -> str:
     return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}"
 
 
+def compared(test: "CompanionReport", preposition: str, other: str, margin: float) -> str:
+    """`not inferior to connect_four@1 by 50 after 600 games`"""
+    is_decided = test.outcome not in ("inconclusive", "open")
+    found = f"{preposition} {other} by {margin:g}" if is_decided else f"compared with {other}"
+    return f"{test.outcome} {found} after {test.games} games"
+
+
 def exploitability(test: "ExploitabilityReport") -> str:
     """`not more exploitable than connect_four@1 by 0.1 after 600 games: a best response scores at least 0.48 (0.45)`"""
-    found = f"{test.outcome} than {test.ref} by {test.improvement or test.margin:g} after {test.games} games"
+    found = compared(test, "than", test.ref, test.improvement or test.margin)
     if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
         return found
     return (

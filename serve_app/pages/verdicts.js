@@ -121,8 +121,9 @@ function Exploitability({ test, candidate }) {
   const rows = bounds.flatMap((side) => side.exploiters.map((each) => [side, each]));
   const gap = (difference) => `${signed(difference.mean, 3)}${difference.low == null ? "" : ` (${signed(difference.low, 3)} to ${signed(difference.high, 3)})`}`;
   const name = "Learned exploitability";
+  const isDecided = !["inconclusive", "open"].includes(test.outcome);
   return html`<h3>${name}</h3>
-    <p><span class="ref">${candidate}</span> is ${test.outcome} than <span class="ref">${test.ref}</span> by ${test.improvement || test.margin} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
+    <p><span class="ref">${candidate}</span> is ${test.outcome} ${isDecided ? "than" : "compared with"} <span class="ref">${test.ref}</span>${isDecided && ` by ${test.improvement || test.margin}`} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
       ${bounds.map((side) => html` A best response to <span class="ref">${side.ref}</span> scores at least ${percent(side.bound)}.`)}</p>
     ${test.difference && html`<p>The exploiters of the candidate achieve ${gap(test.difference)} more than those of the champion.
       The 95 % interval is for these exploiters; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}.</p>`}
