@@ -77,7 +77,8 @@ def measure(config: Path, home: Path, count: int) -> bool:
     for _ in range(count):
         nights.append(run_night(config, home))
         print(_line(nights[-1], compared), flush=True)
-    champions = [champion for night in nights if (champion := night["steps"]["gate"]["champion"])]
+    verdicts = [verdict for night in nights for verdict in night["steps"]["gate"]["verdicts"]]
+    champions = [verdict["candidate"] for verdict in verdicts if verdict["outcome"] == "promote"]
     measured = [found for night in nights if (found := night["steps"]["measure"]["exploitability"])]
     if not champions or not measured:
         return report_target(f"{config.stem}: no champion with an exploiter", "one", False)
