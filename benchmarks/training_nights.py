@@ -122,7 +122,8 @@ def run_night(config: Path, home: Path) -> dict[str, Any]:
 def _line(night: dict[str, Any], compared: str) -> str:
     gate, found = night["steps"]["gate"], night["steps"]["measure"]["exploitability"]
     before = gate["champion_before"]
-    change = "unchanged" if gate["champion"] == before else f"before: {before or 'none'}"
+    promoted = [verdict["candidate"] for verdict in gate["verdicts"] if verdict["outcome"] == "promote"]
+    change = f"before: {before or 'none'}; promoted: {', '.join(promoted)}" if promoted else "unchanged"
     trained = len(night["steps"]["train"]["versions"])
     exploited = f"{compared} of its exploiter: {_interval(_of_exploiter(found, compared))}" if found else "no exploiter"
     return (
