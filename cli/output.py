@@ -238,16 +238,19 @@ def verdict(report: "VerdictReport") -> str:
     return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}"
 
 
-def compared(test: "CompanionReport", preposition: str, other: str, margin: float) -> str:
+def compared(test: "CompanionReport", preposition: str, other: str, margin: float | None) -> str:
     """`not inferior to connect_four@1 by 50 after 600 games`"""
     is_decided = test.outcome not in ("inconclusive", "open")
-    found = f"{preposition} {other} by {margin:g}" if is_decided else f"compared with {other}"
+    by = "" if margin is None else f" by {margin:g}"
+    found = f"{preposition} {other}{by}" if is_decided else f"compared with {other}"
     return f"{test.outcome} {found} after {test.games} games"
 
 
 def exploitability(test: "ExploitabilityReport") -> str:
     """`not more exploitable than connect_four@1 by 0.1 after 600 games: a best response scores at least 0.48 (0.45)`"""
-    found = compared(test, "than", test.ref, test.improvement or test.margin)
+    # That it is less exploitable is shown, but not that it is by the improvement.
+    margin = None if test.outcome == "less exploitable" else test.improvement or test.margin
+    found = compared(test, "than", test.ref, margin)
     if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
         return found
     return (

@@ -71,7 +71,7 @@ function Evidence({ verdict }) {
 }
 
 function Statistics({ league, verdict }) {
-  const unit = verdict.model === "returns" ? "return" : "Elo";
+  const [unit, digits] = verdict.model === "returns" ? ["return", 2] : ["Elo", 0];
   const difference = verdict.difference;
   return html`<${Properties} items=${[
       ["Verdict", html`<code>${shortVerdict(verdict.verdict)}</code>`],
@@ -81,7 +81,7 @@ function Statistics({ league, verdict }) {
       ["Score", percent(verdict.score)],
       verdict.elo != null && ["Elo difference", html`${signed(verdict.elo)} <small>${interval(verdict.interval)}</small>`],
       difference && ["Difference in mean return", html`${signed(difference.mean, 2)} <small>${number(difference.low)} to ${number(difference.high)}</small>`],
-      verdict.hypotheses && ["Hypotheses", html`${signed(verdict.hypotheses[0])} vs ${signed(verdict.hypotheses[1])} <small>${unit}, ${verdict.model}</small>`],
+      verdict.hypotheses && ["Hypotheses", html`${signed(verdict.hypotheses[0], digits)} vs ${signed(verdict.hypotheses[1], digits)} <small>${unit}, ${verdict.model}</small>`],
       verdict.alpha != null && ["Alpha budget", percent(verdict.alpha, verdict.alpha < 0.001 ? 3 : 2)],
       ["Opened", html`<${Time} at=${verdict.opened_at} date />`],
       verdict.closed_at && ["Decided", html`<${Time} at=${verdict.closed_at} date />`],
@@ -123,10 +123,10 @@ function Exploitability({ test, candidate }) {
   const name = "Learned exploitability";
   const isDecided = !["inconclusive", "open"].includes(test.outcome);
   return html`<h3>${name}</h3>
-    <p><span class="ref">${candidate}</span> is ${test.outcome} ${isDecided ? "than" : "compared with"} <span class="ref">${test.ref}</span>${isDecided && ` by ${test.improvement || test.margin}`} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
+    <p><span class="ref">${candidate}</span> is ${test.outcome} ${isDecided ? "than" : "compared with"} <span class="ref">${test.ref}</span>${isDecided && test.outcome !== "less exploitable" && ` by ${test.improvement || test.margin}`} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
       ${bounds.map((side) => html` A best response to <span class="ref">${side.ref}</span> scores at least ${percent(side.bound)}.`)}</p>
     ${test.difference && html`<p>The exploiters of the candidate achieve ${gap(test.difference)} more than those of the champion.
-      The 95 % interval is for these exploiters; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}.</p>`}
+      The 95 % interval is for these exploiters${test.difference_over_exploiters.low == null ? "" : `; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}`}.</p>`}
     ${rows.length > 0 && html`<${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"], ["Return gain", "number"]]}>
       ${rows.map(([side, each]) => html`<tr key=${each.ref}><th scope="row"><span class="ref">${side.ref}</span></th><td><span class="ref">${each.ref}</span></td>
         <td class="number">${count(each.games)}</td><td class="number">${percent(each.score)}</td><td class="nowrap">${percent(each.low)} to ${percent(each.high)}</td>
