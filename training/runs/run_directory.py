@@ -127,8 +127,10 @@ RESUMABLE_SETTINGS = {
     "runner_gpus",
     "crashes",
     "strength",
+    "exploiter",
 }
-"""Training settings that may change when a run is resumed: duration and resources, not what is learned."""
+"""Training settings that may change when a run is resumed: duration and resources, not what is learned. The settings of
+`exploiter` are those of other runs; in an exploiter's own run they have replaced those of the league."""
 
 
 class RunRecord(BaseModel):

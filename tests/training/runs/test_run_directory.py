@@ -116,6 +116,15 @@ def test_runs_are_resumed_by_role(registry: Registry, storage: Storage) -> None:
     assert [(each.ref, each.share) for each in resumed.record.config.training.opponents.fixed] == [("tictactoe@3", 1)]
 
 
+def test_settings_of_exploiters_concern_the_runs_of_exploiters(registry: Registry, storage: Storage) -> None:
+    main = RunDirectory.begin(storage, tictactoe(), None, None)
+    RunDirectory.begin(storage, tictactoe().against("tictactoe@3"), None, None, exploits="tictactoe@3")
+    changed = tictactoe(exploiter={"gamma": 0.5})
+    assert RunDirectory.resume(registry, changed).id == main.id
+    with pytest.raises(ConfigError, match=r"training\.gamma has changed"):
+        RunDirectory.resume(registry, changed, EXPLOITER)
+
+
 def test_one_driver_at_a_time(registry: Registry, storage: Storage) -> None:
     run = RunDirectory.begin(storage, tictactoe(), None, None)
     with run.locked():
