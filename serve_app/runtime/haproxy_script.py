@@ -94,6 +94,14 @@ if [ -n "$config" ]; then
         setsid "$0" stand-in-for $$ > "$here/standin.log" 2>&1 &  # Ray ends the processes of a group together
         exec 9<> "$here/alive.$$"
         if [ -e "$here/{stand_in}" ]; then
+            # The stand-in has the ports: HAProxy pauses all that it replaces. A listener that it took over by -x would
+            # be paused as well, for ever.
+            before=
+            for argument; do
+                shift
+                [ "$before" = -x ] || [ "$argument" = -x ] || set -- "$@" "$argument"
+                before=$argument
+            done
             set -- "$@" -sf "$(cat "$here/{stand_in}")"
             rm "$here/{stand_in}"
         fi

@@ -1,6 +1,9 @@
 """A server that starts responds with 503 on both ports, until Ray's HAProxy takes over."""
 
+import socket
+import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import grpc
@@ -53,3 +56,59 @@ def test_the_ports_are_free_afterwards(tmp_path: Path) -> None:
     with starting_page(tmp_path, binary, "127.0.0.1", port, None):
         until(lambda: not haproxy.is_free("127.0.0.1", port))
     assert haproxy.is_free("127.0.0.1", port)
+
+
+CONFIGURATION = """global
+    stats socket {directory}/admin.sock level admin expose-fd listeners
+defaults
+    mode http
+    timeout connect 1s
+    timeout client 10s
+    timeout server 10s
+frontend prometheus
+    bind 127.0.0.1:{metrics}
+    http-request return status 200
+frontend http_frontend
+    bind 127.0.0.1:{http}
+{routes}listen stats
+    bind *:{stats}
+    http-request return status 200
+"""
+ROUTES = """    use_backend replicas if TRUE
+backend replicas
+    server one 127.0.0.1:{replica} check
+"""
+
+
+def test_haproxy_listens_on_all_ports_after_it_has_taken_over(tmp_path: Path) -> None:
+    """Ray's first HAProxy has no replica and no port of the server; the next one replaces it and the page."""
+    http, metrics, stats = haproxy.free_ports(3, "127.0.0.1")
+    binary = haproxy_script.find_haproxy()
+    assert binary is not None
+    wrapper = haproxy_script.install(tmp_path, binary, stats, metrics)
+    configuration = tmp_path / "haproxy.cfg"
+
+    def start(routes: str, *arguments: str) -> "subprocess.Popen[bytes]":
+        configuration.write_text(
+            CONFIGURATION.format(directory=tmp_path, http=http, metrics=metrics, stats=stats, routes=routes)
+        )
+        command = [str(wrapper), "-db", "-f", str(configuration), "-dR", *arguments]
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        processes.callback(process.wait)
+        processes.callback(process.kill)
+        return process
+
+    with ExitStack() as processes:
+        replica = processes.enter_context(socket.create_server(("127.0.0.1", 0)))
+        processes.enter_context(starting_page(tmp_path, binary, "127.0.0.1", http, None))
+        processes.callback((tmp_path / haproxy_script.STOPPED).touch)
+        first = start("")
+        until(lambda: not haproxy.is_free("127.0.0.1", metrics) and not haproxy.is_free("127.0.0.1", http))
+        start(
+            ROUTES.format(replica=replica.getsockname()[1]), "-sf", str(first.pid), "-x", str(tmp_path / "admin.sock")
+        )
+        until(lambda: first.poll() is not None)
+        for port in (http, metrics, stats):
+            until(lambda port=port: not haproxy.is_free("127.0.0.1", port))
+            with socket.create_connection(("127.0.0.1", port), timeout=5):
+                pass

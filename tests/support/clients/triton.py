@@ -1,6 +1,7 @@
 """The unmodified `tritonclient`, in its four forms behind one interface."""
 
 import asyncio
+import atexit
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,7 +16,8 @@ from tritonclient.utils import np_to_triton_dtype
 from tests.support.servers.protocol_servers import Address
 
 KEPT: list[Any] = []
-"""gevent clients fail if they are garbage-collected in another thread."""
+"""gevent clients fail if they are garbage-collected in another thread, and clients of gRPC when the interpreter exits."""
+atexit.register(KEPT.clear)
 FORMS = ("http", "http.aio", "grpc", "grpc.aio")
 
 
