@@ -16,7 +16,7 @@ from tritonclient.utils import np_to_triton_dtype
 from tests.support.servers.protocol_servers import Address
 
 KEPT: list[Any] = []
-"""gevent clients fail if they are garbage-collected in another thread, and clients of gRPC when the interpreter exits."""
+"""gevent clients fail if they are garbage-collected in another thread, and those of gRPC when the interpreter exits."""
 atexit.register(KEPT.clear)
 FORMS = ("http", "http.aio", "grpc", "grpc.aio")
 
