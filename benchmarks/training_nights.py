@@ -8,8 +8,10 @@ returns. If `benchmarks.exploitability` knows the game, the exact exploitability
     python -m benchmarks.training_nights connect_four leduc_holdem
     python -m benchmarks.training_nights tictactoe --nights 2 --minutes 0.2
     python -m benchmarks.training_nights leduc_holdem --steps 6_000_000
+    python -m benchmarks.training_nights leduc_holdem --nights 3 --league-share 0.5
 
 `--steps` limits nights by actions instead of time. On a machine with other work, exploiters get equal training then.
+`--league-share` sets how much of a night is played against versions of the league.
 """
 
 import argparse
@@ -51,21 +53,29 @@ def main() -> int:
     parser.add_argument("--nights", type=int, default=NIGHTS)
     parser.add_argument("--minutes", type=float, default=MINUTES, help="training time of a night; default: %(default)g")
     parser.add_argument("--steps", type=int, help="actions of a night, instead of --minutes")
+    parser.add_argument(
+        "--league-share",
+        type=float,
+        metavar="SHARE",
+        help="share of the episodes against opponents from the league, 0 for none; default: the configuration's",
+    )
     parser.add_argument("--quick", action="store_true", help="smoke test: two nights of 0.2 minutes")
     options = parser.parse_args()
     nights, minutes = (2, 0.2) if options.quick else (options.nights, options.minutes)
-    budget = {"minutes": minutes} if options.steps is None else {"steps": options.steps}
+    settings: dict[str, Any] = {"minutes": minutes} if options.steps is None else {"steps": options.steps}
+    if options.league_share is not None:
+        settings["opponents"] = {"league": {"share": options.league_share}} if options.league_share else None
     met = True
     for name in options.configs:
         with tempfile.TemporaryDirectory() as home:
-            met &= measure(_short_nights(name, budget, Path(home)), Path(home), nights)
+            met &= measure(_configure(name, settings, Path(home)), Path(home), nights)
     return int(not met)
 
 
-def _short_nights(name: str, budget: dict[str, Any], home: Path) -> Path:
-    """Write a bundled configuration with this training budget of a night; return its path."""
+def _configure(name: str, settings: dict[str, Any], home: Path) -> Path:
+    """Write a bundled configuration with these settings of a night; return its path."""
     document = yaml.safe_load(find(name).read_text())
-    document["nightly"] = document.get("nightly", {}) | budget
+    document["nightly"] = document.get("nightly", {}) | settings
     path = home / f"{document['league']}.yaml"
     path.write_text(yaml.safe_dump(document))
     return path
