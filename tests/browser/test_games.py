@@ -31,6 +31,15 @@ def game_of(served: Served) -> str:
     return f"/leagues/{LEAGUE}/matches/{verdict_between_versions(served.registry).schedule}/0/0"
 
 
+def open_game(tab: Tab, league: str, agent: str) -> Page:
+    """Open a game against a script, once the evaluation service has started the environment.
+
+    Before, it may respond with 503. The page repeats the request, but the browser logs it.
+    """
+    answer("GET", f"{tab.url}/v1/leagues/{league}/playable")
+    return tab.open(f"/leagues/{league}/play#opponent=script:first&agent={agent}&seed=1&actions=")
+
+
 def test_a_game_is_played_back_step_by_step(tab: Tab, served: Served) -> None:
     page = tab.open(game_of(served))
     info, position = page.locator(".game-info"), page.locator(".seek output")
@@ -150,7 +159,7 @@ def test_illegal_actions_are_rejected(tab: Tab) -> None:
 
 
 def test_named_actions_are_played_by_arrow_keys_and_wasd(tab: Tab) -> None:
-    page = tab.open(f"/leagues/{NAMED}/play#opponent=script:first&agent=player_1&seed=1&actions=")
+    page = open_game(tab, NAMED, "player_1")
     turn, actions = page.locator(".turn"), page.get_by_role("group", name="Your actions")
     expect(turn).to_have_text(TURN)
     expect(actions.get_by_role("button", name="centre", exact=True)).to_be_visible()
@@ -163,17 +172,17 @@ def test_named_actions_are_played_by_arrow_keys_and_wasd(tab: Tab) -> None:
 
 
 def test_the_page_shows_colors_and_warns_of_pictures_that_show_everything(tab: Tab) -> None:
-    page = tab.open(f"/leagues/{CONNECT_FOUR}/play#opponent=script:first&agent=player_0&seed=1&actions=")
+    page = open_game(tab, CONNECT_FOUR, "player_0")
     expect(page.locator(".turn")).to_have_text(TURN)
     expect(page.get_by_role("img", name="#d63c4c")).to_be_visible()
     expect(page.locator(".notice")).to_have_count(0)
-    page = tab.open(f"/leagues/{HIDDEN}/play#opponent=script:first&agent=player_1&seed=1&actions=")
+    page = open_game(tab, HIDDEN, "player_1")
     expect(page.locator(".notice")).to_contain_text("what is hidden from player_1")
 
 
 @pytest.mark.parametrize("agent", VIEWS_OF_AGENTS)
 def test_each_seat_sees_its_own_view(tab: Tab, agent: str) -> None:
-    page = tab.open(f"/leagues/{VIEWS}/play#opponent=script:first&agent={agent}&seed=1&actions=")
+    page = open_game(tab, VIEWS, agent)
     expect(page.locator(".turn")).to_have_text(TURN)
     expect(page.locator(".notice")).to_have_count(0)
     source = page.locator(".picture img").get_attribute("src")

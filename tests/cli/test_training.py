@@ -64,6 +64,7 @@ def start_command(home: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_ctrl_c_publishes_the_current_checkpoint_and_a_second_one_exits_at_once(
     start_command: Callable[..., subprocess.Popen[str]], config: Path, home: Path
 ) -> None:
