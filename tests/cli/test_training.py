@@ -20,7 +20,7 @@ from tests.support.command import League
 from tests.support.leagues import tictactoe
 from tests.support.waiting import until
 
-DEADLINE = 180
+DEADLINE = 300
 COMMAND = (sys.executable, "-c", "from cli.main import run; run()")
 TRAINING = {
     "runners": 1, "num_envs": 4, "hidden": [16], "train_batch_size": 256, "minibatch_size": 128, "epochs": 1,
