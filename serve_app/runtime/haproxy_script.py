@@ -94,8 +94,8 @@ if [ -n "$config" ]; then
         setsid "$0" stand-in-for $$ > "$here/standin.log" 2>&1 &  # Ray ends the processes of a group together
         exec 9<> "$here/alive.$$"
         if [ -e "$here/{stand_in}" ]; then
-            # The stand-in has the ports: HAProxy pauses all that it replaces. A listener that it took over by -x would
-            # be paused as well, for ever.
+            # The stand-in has the ports, so that HAProxy pauses the processes that it replaces. A listener that it
+            # shares with one of them (-x) would stay paused.
             before=
             for argument; do
                 shift
