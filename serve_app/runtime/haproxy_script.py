@@ -6,6 +6,10 @@ Ray checks HAProxy every second and replaces it a few seconds after the third fa
 HAProxy with the last configuration that had routes, unknown to Ray. The next HAProxy of Ray that has routes takes over
 the port. An HAProxy without routes does not listen for requests, because it would respond to all of them with 404.
 While the server starts, serve_app.runtime.starting_page responds in place of a stand-in, until a replica is known.
+
+A restarted controller waits at most ten seconds for its replicas to report, then it announces the application without
+them. The replicas run, so HAProxy keeps those that it knows until the controller names some. Its health checks
+find those that do not.
 """
 
 import json
@@ -72,6 +76,19 @@ has_replicas() {{  # servers of the HTTP port that are no backup
     grep '^ *server [^ ]* [^ ]* check' "$1" | grep -qv ' backup$'
 }}
 
+keep_replicas() {{  # a backend without replicas gets those of the last configuration that had routes
+    awk '
+        /^[^ ]/ {{ if (known && !found) printf "%s", last[backend]; backend = ""; known = found = 0 }}
+        /^backend / {{ backend = $2; known = FNR != NR }}
+        /^ *server [^ ]* [^ ]* check/ && !/ backup$/ {{
+            if (FNR == NR) last[backend] = last[backend] $0 "\\n"; else found = 1
+        }}
+        FNR != NR {{ print }}
+        END {{ if (known && !found) printf "%s", last[backend] }}
+    ' "$here/routed.cfg" "$1" > "$1.kept" && cat "$1.kept" > "$1"
+    rm -f "$1.kept"
+}}
+
 if [ "$1" = stand-in-for ]; then
     read -r _ < "$here/alive.$2"  # ends when nobody holds the other end of the pipe any more
     rm -f "$here/alive.$2"
@@ -88,6 +105,7 @@ done
 if [ -n "$config" ]; then
     amend "$config"
     if has_routes "$config" && {{ [ -e "$here/routed.cfg" ] || has_replicas "$config"; }}; then
+        [ ! -e "$here/routed.cfg" ] || keep_replicas "$config"
         echo $$ > "$here/serving"
         cp "$config" "$here/routed.cfg"
         mkfifo "$here/alive.$$"

@@ -84,6 +84,42 @@ def test_options_without_a_configuration_are_passed_on() -> None:
     assert shown.stdout.startswith("HAProxy version")
 
 
+BACKEND = """backend http-league
+    default-server inter 1h
+{servers}    server SERVE_PROXY_ACTOR-head 127.0.0.1:7 check backup
+backend grpc-league
+    server one 127.0.0.1:6 check
+"""
+"""As Ray writes it, with the head's own proxy."""
+REPLICAS = """    server one 127.0.0.1:4 check observe layer4
+    server two 127.0.0.1:5 check observe layer4
+"""
+
+
+def test_the_last_known_replicas_are_kept_while_the_controller_finds_them_again(tmp_path: Path) -> None:
+    """A restarted controller that needs more than ten seconds for that announces an application without replicas."""
+    (tmp_path / "binary").write_text("#!/bin/sh\n")
+    (tmp_path / "binary").chmod(0o700)
+    wrapper = haproxy_script.install(tmp_path, str(tmp_path / "binary"), 8404, 9101)
+    configuration = tmp_path / "haproxy.cfg"
+
+    def servers_after(servers: str) -> list[str]:
+        configuration.write_text(
+            f"frontend http_frontend\n    use_backend http-league if TRUE\n{BACKEND.format(servers=servers)}"
+        )
+        subprocess.run([str(wrapper), "-f", str(configuration)], check=True, timeout=60)
+        backend = configuration.read_text().partition("backend http-league\n")[2].partition("backend grpc")[0]
+        return [line.split()[1] for line in backend.splitlines() if line.strip().startswith("server ")]
+
+    head = "SERVE_PROXY_ACTOR-head"
+    assert servers_after(REPLICAS) == ["one", "two", head]
+    assert sorted(servers_after("")) == [head, "one", "two"]
+    assert sorted(servers_after("")) == [head, "one", "two"], "however often it is announced"
+    assert servers_after(REPLICAS.replace("two", "three")) == ["one", "three", head], "one is replaced"
+    assert sorted(servers_after("")) == [head, "one", "three"]
+    assert configuration.read_text().count("server one 127.0.0.1:6 check") == 1, "the other backend is unchanged"
+
+
 PROXY = """defaults
     mode http
     timeout connect 1s

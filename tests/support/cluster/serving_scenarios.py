@@ -54,6 +54,14 @@ class Load:
         """Single attempts that an overloaded replica refused with 429."""
         return list(self.report["attempts_shed"])
 
+    def losses(self) -> str:
+        """The failures of single attempts: how many, since when and until when, by what was responded."""
+        times: dict[str, list[str]] = {}
+        for failure in self.attempts_lost:
+            time, _, response = failure.partition(" ")
+            times.setdefault(response, []).append(time)
+        return "\n".join(f"{len(of)} from {min(of)} to {max(of)}: {each}" for each, of in times.items())
+
     def versions(self) -> list[str]:
         """The versions that answered, in the order of their first answers."""
         found = self.report["versions"]
