@@ -1,9 +1,10 @@
 """Do ten nights of `league nightly --train` make a league stronger, and not easier to exploit?
 
 Each night is one call of the command in a league of its own; a night trains for three minutes, and its exploiter for
-the configured share of that, by default 15 %. In the end, the last champion plays the first one. Exploitability has risen if the interval of the last
-champion's exploiter is above that of the first champion's: of its score, or of its gain in returns if the gate tests
-returns. If `benchmarks.exploitability` knows the game, the exact exploitability of all candidates is printed as well.
+the configured share of that, by default 15 %. In the end, the last champion plays the first one. Exploitability has
+risen if the interval of the last champion's exploiter is above that of the first champion's: of its score, or of its
+gain in returns if the gate tests returns. If `benchmarks.exploitability` knows the game, the exact exploitability of
+all candidates is printed as well.
 
     python -m benchmarks.training_nights connect_four leduc_holdem
     python -m benchmarks.training_nights tictactoe --nights 2 --minutes 0.2
