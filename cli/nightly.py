@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -164,11 +165,13 @@ def run_training_night(
     storage = Storage.from_environment()
     storage.export()
     registry, games = open_registry(), GameProgress(quiet)
+    if (train := _trainer(registry, games, quiet)) is None:
+        raise ConfigError("training at night needs PyTorch: pip install 'policy-league[training]'")
     with exit_on_interrupt(), connected(None, storage), games as listener:
         night, report = training_night(
             config,
             registry=registry,
-            train=_trainer(registry, games, quiet),
+            train=train,
             workers=workers,
             listener=listener,
             announce=(lambda _: None) if quiet else say,
@@ -183,21 +186,27 @@ def run_training_night(
     return night, report
 
 
-def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer":
-    """Return a function that trains a run and shows its progress in place of that of games."""
+def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer | None":
+    """Return a function that trains a run and shows its progress in place of that of games, None without PyTorch."""
+    if find_spec("torch") is None:
+        return None
 
     def train(config: "LeagueConfig", *, name: str, parent: int | None, target: str | None) -> None:
         from rich.console import Console
 
         from evaluation.service.strength_process import strength_process
         from league.refs import CheckpointRef
-        from training.runs.train import start_of_exploiter
+        from training.runs.train import start_of_exploiter, start_of_night
         from training.runs.train import train as run
 
         start = None if parent is None else CheckpointRef(config.league, parent)
         exploited = None if target is None else CheckpointRef.parse(target)
-        if exploited is not None and start is not None:
+        if start is not None and exploited is not None:
             start = start_of_exploiter(registry, start, config)
+        elif start is not None and (other := start_of_night(registry, start)) != start:
+            if not quiet:
+                say(f"{start} was imported and cannot be trained further: training starts from {other or 'scratch'}")
+            start = other
         with games.paused(), strength_process(registry.storage) as measure:
             run(
                 config,

@@ -205,7 +205,13 @@ def mixture(
     conditions = registry.leagues.get(check_slug("league", league)).conditions
     refs = [row.ref for row in eligible(registry, league)]
     found = meta_strategy(refs, Ledger(registry).results(league, conditions), method)
-    kept = {ref: share for ref, share in zip(found.refs, found.probabilities, strict=True) if share >= at_least}
+    probable = ((ref, share) for ref, share in zip(found.refs, found.probabilities, strict=True) if share > 0)
+    kept = {ref: share for ref, share in probable if share >= at_least}
+    if not kept:
+        highest = max(found.probabilities, default=0.0)
+        raise InvalidInput(
+            f"--at-least {at_least:g}: no version is as probable; the highest probability is {highest:.3f}"
+        )
     shares = {ref: share / sum(kept.values()) for ref, share in kept.items()}
     if not as_json:
         _show(found, shares)

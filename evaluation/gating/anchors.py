@@ -40,14 +40,19 @@ def earlier_champions(registry: Registry, league: LeagueRow, most: int) -> list[
 
     Versions that were rolled back or trained in another environment are left out.
     """
-    events = registry.aliases.history(league.slug)
-    rolled_back = {event.previous for event in events if event.kind == "rollback"}
+    events, refused = registry.aliases.history(league.slug), rolled_back(registry, league.slug)
     reigned = dict.fromkeys(event.version for event in events)
     now = events[0].version if events else None
     refs: list[str] = []
     for number in reigned:
-        if number == now or number in rolled_back or len(refs) == most:
+        if number == now or number in refused or len(refs) == most:
             continue
         if registry.versions.get(league.slug, number).manifest.environment_digest == league.environment_digest:
             refs.append(f"{league.slug}@{number}")
     return refs
+
+
+def rolled_back(registry: Registry, league: str) -> set[int]:
+    """Return the former champions that a person replaced with their predecessors."""
+    events = registry.aliases.history(league)
+    return {event.previous for event in events if event.kind == "rollback" and event.previous is not None}

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 
 from evaluation.gating import verdicts
 from evaluation.gating.alpha_spending import alpha_share, alpha_spent
+from evaluation.gating.anchors import rolled_back
 from evaluation.gating.trained_exploiters import Trainer, check_exploiters
 from evaluation.gating.verdict_report import confirmation
 from evaluation.matches import tournament
@@ -227,8 +228,8 @@ class _NightlyRun:
         return [each for each in eligible(self._registry, self._league.slug) if not self._is_tested(each)]
 
     def _is_tested(self, version: VersionRow) -> bool:
-        """Whether a version is champion or has an effective verdict."""
-        if version.ref == self.champion():
+        """Whether a version is champion, was rolled back, or has an effective verdict."""
+        if version.ref == self.champion() or version.number in rolled_back(self._registry, version.league):
             return True
         rows = (row for row in self._registry.verdicts.all(self._league.slug) if row.candidate == version.number)
         return any(verdicts.is_effective(row) for row in rows)

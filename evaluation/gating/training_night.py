@@ -6,6 +6,7 @@ was interrupted: its training run and its schedules have fixed names, so that it
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,6 +24,9 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import TrainingNightRow
 from league.seeds import derive
 
+WAIT = 10.0
+"""Seconds between attempts to begin the gate while another nightly run of the league is active."""
+
 
 @dataclass
 class _Night:
@@ -32,6 +36,7 @@ class _Night:
     train: Trainer
     workers: int | None
     listener: Listener | None
+    announce: Callable[[str], None]
     gate_report: NightlyReport | None = field(default=None)
 
     def versions(self, run: str) -> list[str]:
@@ -72,7 +77,7 @@ def training_night(
         The night with the results of its steps, and the report of the gate if this process ran it.
 
     Raises:
-        AlreadyRunning: Another process works on a night or a nightly run of this league.
+        AlreadyRunning: Another process works on a night of this league, or on one of its training runs.
         LeagueError: The errors of `nightly`.
     """
     with registry.exclusive_lock(f"training-night-{config.league}"):
@@ -81,7 +86,7 @@ def training_night(
         check_exploiters(config, found)
         registry.leagues.register(config, found)
         row = registry.training_nights.open(config.league)
-        night = _Night(config, registry, row, train, workers, listener)
+        night = _Night(config, registry, row, train, workers, listener, announce)
         for number, (name, step) in enumerate(STEPS.items(), 1):
             if name not in night.row.steps:
                 announce(f"{config.league}: night {row.id}, step {number} of {len(STEPS)}: {name}")
@@ -116,9 +121,7 @@ def _attempt(night: _Night, config: LeagueConfig, run: str, parent: int | None, 
 
 def _gate(night: _Night) -> dict[str, Any]:
     registry, league = night.registry, night.config.league
-    night.gate_report = nightly(
-        night.config, registry=registry, train=night.train, workers=night.workers, listener=night.listener
-    )
+    night.gate_report = _nightly_run(night)
     began = night.row.began_at
     verdicts = [
         {"candidate": f"{league}@{row.candidate}", "opponent": row.champion, "outcome": row.outcome}
@@ -132,6 +135,21 @@ def _gate(night: _Night) -> dict[str, Any]:
         "champion": None if champion is None else f"{league}@{champion}",
         "verdicts": verdicts,
     }
+
+
+def _nightly_run(night: _Night) -> NightlyReport:
+    """Run the gate, once no other nightly run of the league is active."""
+    waits = False
+    while True:
+        try:
+            return nightly(
+                night.config, registry=night.registry, train=night.train, workers=night.workers, listener=night.listener
+            )
+        except AlreadyRunning as error:
+            if not waits:
+                night.announce(f"{night.config.league}: {error}; the night waits for its end")
+            waits = True
+            time.sleep(WAIT)
 
 
 def _exploiter(night: _Night) -> dict[str, Any]:

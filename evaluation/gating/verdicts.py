@@ -26,6 +26,7 @@ from evaluation.results import Confirmation, Listener, Progress, VerdictReport
 from evaluation.schedules.builders import companion, exploiter_test
 from evaluation.schedules.builders import verdict as verdict_schedule
 from league.errors import AliasMoved
+from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow, VerdictRow
@@ -129,7 +130,8 @@ def conclude(
 ) -> VerdictReport:
     """Play an open verdict to its end, move the champion if it was beaten, and close the verdict.
 
-    A verdict that a person voids meanwhile ends immediately.
+    A verdict that a person voids meanwhile ends immediately. If the champion changes meanwhile, it is void, so that the
+    candidate is tested against the new one.
 
     Args:
         registry: The registry of the verdict.
@@ -153,6 +155,8 @@ def conclude(
     seen = gate_result(registry, verdict)
     if verdict.outcome is not None:
         return report_of(registry, verdict, verdict.outcome, seen, (verdict.evidence or {}).get("note"))
+    if seen.outcome != "promote" and (obstacle := _obstacle(registry, verdict)) is not None:
+        return _close(registry, verdict, VOID, seen, note=obstacle)
     assert seen.outcome is not None, "a schedule ends with its test"
     refused = promote(registry, verdict, _reason(verdict, seen)) if seen.outcome == "promote" else seen.note
     return _close(registry, verdict, seen.outcome, seen, note=refused)
@@ -178,7 +182,8 @@ def _tests(
 ) -> Iterator[tuple[Schedule, SequentialMonitor]]:
     """The schedules of a verdict in order, each with a monitor of its test.
 
-    Before the last one, the exploiters that it needs are trained. It is left out if the verdict is closed meanwhile.
+    Before the last one, the exploiters that it needs are trained. It is left out if the verdict is closed meanwhile, or
+    cannot continue.
     """
     gate, candidate, settings, ledger = gate_of(verdict), verdict.candidate_ref, verdict.settings, Ledger(registry)
     yield ledger.schedule(verdict.schedule), SequentialMonitor(gate, candidate)
@@ -187,7 +192,9 @@ def _tests(
     for each in settings.get("exploiters", ()):
         against = gate.against_exploiter(each["margin"])
         yield ledger.schedule(each["schedule"]), SequentialMonitor(against, candidate, verdict.champion)
-    if "exploitability" in settings and (test := prepared_test(registry, verdict, train)) is not None:
+    if "exploitability" not in settings or _obstacle(registry, verdict) is not None:
+        return
+    if (test := prepared_test(registry, verdict, train)) is not None:
         against, pairs = exploitability_settings(gate, test), len(test["of_candidate"])
         watch = SequentialMonitor(against, candidate, verdict.champion, pairs, at_least=test["blocks"])
         yield ledger.schedule(test["schedule"]), watch
@@ -233,13 +240,26 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
 
 
 def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str | None:
-    """Why the candidate is not tested: insufficient results as the champion's shadow."""
-    for shadowing in registry.traffic.shadow_counts(verdict.league):
-        if (shadowing.candidate, shadowing.champion) == (verdict.candidate, champion):
-            latency = shadowing.milliseconds(0.95)
-            seen = shadowing.observations, shadowing.failed, shadowing.agreement
-            return shadow_shortfall(gate_of(verdict), *seen, latency)
-    return shadow_shortfall(gate_of(verdict), 0, 0, None, None)
+    """Why the candidate is not tested: insufficient results as the champion's shadow.
+
+    Replicas count for the members of a mixture.
+    """
+    mixtures = registry.versions.mixtures(verdict.league, [verdict.candidate, champion])
+    candidates, champions = (
+        mixtures[number].versions if number in mixtures else (number,) for number in (verdict.candidate, champion)
+    )
+    found = [
+        counts
+        for counts in registry.traffic.shadow_counts(verdict.league)
+        if counts.candidate in candidates and counts.champion in champions
+    ]
+    observations = sum(each.observations for each in found)
+    agreement = sum(each.agreed for each in found) / observations if observations else None
+    latency = Histogram()
+    for each in found:
+        latency.merge(each.latency, each.ns)
+    failed = sum(each.failed for each in found)
+    return shadow_shortfall(gate_of(verdict), observations, failed, agreement, latency.quantile(0.95))
 
 
 def _reason(verdict: VerdictRow, seen: GateResult) -> str:

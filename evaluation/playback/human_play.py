@@ -79,7 +79,11 @@ def playability(config: LeagueConfig, registry: Registry, interface: Interface, 
     playable_agents = _playable_agents(config, interface, hooks.declared)
     kinds = sorted({type(spaces.action).__name__ for spaces in interface.agents.values()})
     why = None if playable_agents else f"human play needs Discrete actions, but its agents have {' and '.join(kinds)}"
-    mixtures = [row.ref for row in registry.versions.all(league) if row.mixture is not None and row.aliases]
+    mixtures = [
+        row.ref
+        for row in registry.versions.all(league)
+        if row.mixture is not None and row.aliases and row.manifest.environment_digest == config.environment.digest()
+    ]
     versions = [version.ref for version in reversed(eligible(registry, league))]
     return Playability(
         league=league,

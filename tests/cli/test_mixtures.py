@@ -3,6 +3,7 @@
 import pytest
 
 from league.registry.registry import Registry
+from league.results.payoffs import MetaStrategy
 from tests.support.command import League
 from tests.support.servers.streaming import listening
 
@@ -54,7 +55,9 @@ def test_an_invalid_mixture_changes_nothing(league: League, registry: Registry, 
     assert (registry.aliases.current("tictactoe"), registry.versions.numbers("tictactoe")) == before
 
 
-def test_the_equilibrium_is_shown_and_becomes_an_alias(league: League, registry: Registry) -> None:
+def test_the_equilibrium_is_shown_and_becomes_an_alias(
+    league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = league("mixture", "tictactoe")
     assert result.err.startswith("league: no two of the 3 versions have played each other: `league evaluate LEAGUE`")
     league("evaluate", "tictactoe", "--games", "60", "--workers", "0")
@@ -70,6 +73,10 @@ def test_the_equilibrium_is_shown_and_becomes_an_alias(league: League, registry:
     target = registry.versions.resolve("tictactoe@mix")
     assert target.mixture is None or set(target.mixture.versions) <= {1, 2, 3}
     assert "'best': expected nash or alpha_rank" in league("mixture", "tictactoe", "--method", "best").err
+    alike = MetaStrategy(tuple(f"tictactoe@{number}" for number in (1, 2, 3)), (1 / 3,) * 3, (0.5,) * 3, 60, 0)
+    monkeypatch.setattr("league.results.payoffs.meta_strategy", lambda *_: alike)
+    refused = league("mixture", "tictactoe", "--at-least", "0.4", "--alias", "mix", "--yes")
+    assert refused.err == "league: --at-least 0.4: no version is as probable; the highest probability is 0.333\n"
 
 
 def test_what_needs_one_policy_names_the_members(league: League, registry: Registry) -> None:

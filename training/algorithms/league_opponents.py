@@ -116,11 +116,12 @@ class LeagueOpponents:
             self._priors = dict(zip(known, payoff_matrix(known, results, self._rows)[0].tolist(), strict=True))
 
     def drop_removed(self) -> None:
-        """Drop candidates whose files were removed since the checkpoint."""
+        """Drop candidates whose files were removed since the checkpoint. Others stay, whatever was published since."""
+        league = self._league.league
         if self._storage is not None and self.candidates:
             with closing(Registry.open(self._storage)) as registry:
-                rows = self._versions(registry)
-            kept = [number for number, ref in enumerate(self.candidates) if ref in rows]
+                present = {f"{league}@{number}" for number in registry.versions.numbers(league).get(league, ())}
+            kept = [number for number, ref in enumerate(self.candidates) if ref in present]
             self.candidates = tuple(self.candidates[number] for number in kept)
             self._payoff = self._payoff[np.ix_(kept, kept)]
 

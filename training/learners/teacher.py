@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from league.config.ppo import TeacherConfig
-from league.errors import ConfigError
+from league.errors import ConfigError, GameCrashed, one_line
 from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.policy import Policy
@@ -29,7 +29,7 @@ class Teacher:
 
     def __init__(self, settings: TeacherConfig, interface: Interface, storage: Storage | None, seed: int) -> None:
         """Raises ConfigError for an unsuitable teacher, and what loading it raises."""
-        self._seed = seed
+        self._seed, self._ref = seed, settings.ref
         self._spaces = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
         self._policies = dict(_load(settings.ref, interface, storage).values())
         for policy in self._policies.values():
@@ -40,7 +40,7 @@ class Teacher:
                 )
 
     def actions(self, policy: str, batch: TrainBatch, update: int) -> Tensor:
-        """Return the teacher's raw actions at the steps of a batch, (n,) or (n, m) int64.
+        """Return the teacher's raw actions at the steps of a batch, (n,) or (n, m) int64. Raises GameCrashed.
 
         Args:
             policy: The policy id.
@@ -50,8 +50,10 @@ class Teacher:
         rows = batch.acted.cpu().numpy()
         observations = {name: value.cpu().numpy()[rows] for name, value in batch.observations.items()}
         rng = np.random.default_rng((self._seed, update))
-        chosen = self._policies[policy].act(observations, rng=[rng] * len(rows)).actions
-        return torch.from_numpy(_raw(chosen, self._spaces[policy])).to(batch.acted.device)
+        answer = self._policies[policy].act(observations, rng=[rng] * len(rows))
+        for fault in answer.faults.values():
+            raise GameCrashed(f"training.teacher: {self._ref}: {one_line(fault, with_type=True)}") from fault
+        return torch.from_numpy(_raw(answer.actions, self._spaces[policy])).to(batch.acted.device)
 
 
 def check_teacher(interface: Interface) -> None:

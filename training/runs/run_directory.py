@@ -12,6 +12,7 @@
 import json
 import logging
 import math
+import re
 import secrets
 import shutil
 import time
@@ -117,18 +118,11 @@ CHECKPOINTS = "checkpoints"
 START = "start"
 """In the directory of checkpoints: a private, verified copy of the state that training starts from."""
 STOP_FILE = "stop"
-RESUMABLE_SETTINGS = {
-    "steps",
-    "minutes",
-    "checkpoint_every",
-    "checkpoint_minutes",
-    "runners",
-    "gpus",
-    "runner_gpus",
-    "crashes",
-    "strength",
-    "exploiter",
-}
+OWN_ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{6}")
+"""The id of a run that was started without a name: its start time and a random part."""
+RESOURCES = {"runners", "gpus", "runner_gpus", "crashes", "strength"}
+"""Training settings that depend on the machine."""
+RESUMABLE_SETTINGS = {"steps", "minutes", "checkpoint_every", "checkpoint_minutes", "exploiter", *RESOURCES}
 """Training settings that may change when a run is resumed: duration and resources, not what is learned. The settings of
 `exploiter` are those of other runs; in an exploiter's own run they have replaced those of the league."""
 
@@ -143,6 +137,8 @@ class RunRecord(BaseModel):
     pins: dict[str, str] = {}
     """Opponents as the user wrote them → what they resolved to when the run began."""
     parent: int | None
+    parent_steps: int | None = None
+    """Steps of the parent when the run began. Runs of earlier releases have no record of it."""
     exploits: str | None = None
     """The version that an exploiter is trained against."""
     git_commit: str | None
@@ -177,18 +173,25 @@ class RunDirectory:
         pins: dict[str, str] | None = None,
         exploits: str | None = None,
         name: str | None = None,
+        parent_steps: int | None = None,
     ) -> Self:
         """Create the directory of a new run.
 
         pins: what the opponents' references resolve to. exploits: the version that an exploiter is trained against.
-        name: the id of the run, by default its start time and a random part.
+        name: the id of the run, by default its start time and a random part. parent_steps: those of the parent.
         """
         pins = pins or {}
         config = with_pins(config, pins)
         now = datetime.now(UTC)
-        path = _runs(storage, config.league) / (name or f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}")
+        path = _runs(storage, config.league) / (name or f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}")  # OWN_ID
         record = RunRecord(
-            config=config, pins=pins, parent=parent, exploits=exploits, git_commit=git_commit, started_at=now
+            config=config,
+            pins=pins,
+            parent=parent,
+            parent_steps=parent_steps,
+            exploits=exploits,
+            git_commit=git_commit,
+            started_at=now,
         )
         run = cls(path, record)
         with disk_errors(path):
@@ -197,26 +200,35 @@ class RunDirectory:
         return run
 
     @classmethod
-    def find(cls, registry: Registry, league: str, name: str) -> Self | None:
+    def find(cls, registry: Registry, config: LeagueConfig, name: str) -> Self | None:
         """Return the run with this id, if it has begun, on this machine or another one.
+
+        It keeps its settings, except that an incomplete one has the resources of `config`.
 
         Raises AlreadyRunning if it is trained on another machine.
         """
-        _wait_for_other_machine(registry, league, name)
-        path = _runs(registry.storage, league) / name
-        record = _records(registry, league, name).get(path)
-        return None if record is None else cls._copy(path, record)
+        _wait_for_other_machine(registry, config.league, name)
+        path = _runs(registry.storage, config.league) / name
+        record = _records(registry, config.league, name).get(path)
+        if record is None:
+            return None
+        if not record.complete:
+            resources = config.training.model_dump(include=RESOURCES, by_alias=True)
+            record = record.model_copy(update={"config": record.config.with_training(**resources)})
+        return cls._copy(path, record)
 
     @classmethod
     def resume(cls, registry: Registry, config: LeagueConfig, role: Role = MAIN) -> Self:
         """Open the league's newest run of a role if it is incomplete: it was interrupted, or its budget is larger now.
 
-        It may have begun on another machine, with the same registry.
+        It may have begun on another machine, with the same registry. Runs of nights and gates are left out: these
+        continue them.
 
         Raises NotFound; ConfigError if `config` differs; AlreadyRunning if it is trained on another machine.
         """
         records = _records(registry, config.league)
-        newest = max((path for path, record in records.items() if record.role == role), default=None)
+        own = (path for path, record in records.items() if record.role == role and OWN_ID.fullmatch(path.name))
+        newest = max(own, default=None)
         if newest is None:
             raise NotFound(
                 f"league {config.league} has no training run with the role {role}, neither in"

@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 from ray import tune
 from rich.console import Console
 
@@ -117,11 +117,11 @@ def train(
     if exploits is not None:
         config = config.against(exploits)
         check(config, interface)
-    number = None if parent is None else _parent(registry, parent, config, interface).number
+    start = None if parent is None else _parent(registry, parent, config, interface)
     if resume:
         interrupted: RunDirectory | None = RunDirectory.resume(registry, config, role)
     else:
-        interrupted = None if name is None else RunDirectory.find(registry, config.league, name)
+        interrupted = None if name is None else RunDirectory.find(registry, config, name)
     if interrupted is not None and interrupted.record.complete:
         # Its driver may have died between the end of training and its last report.
         with suppress(UnknownRun):
@@ -130,7 +130,14 @@ def train(
     pins = {} if interrupted else pin_opponents(config, registry, interface)
     with connected(address, registry.storage, local) as dashboard:
         run = interrupted or RunDirectory.begin(
-            registry.storage, config, number, git_commit(config_path), pins, exploits, name
+            registry.storage,
+            config,
+            None if start is None else start.number,
+            git_commit(config_path),
+            pins,
+            exploits,
+            name,
+            None if start is None else start.steps,
         )
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policies)
         strength = StrengthQueue(run, registry, progress, measure)
@@ -228,11 +235,27 @@ def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueCon
     return ref if registry.versions.has_training(version) else None
 
 
+def start_of_night(registry: Registry, ref: CheckpointRef) -> CheckpointRef | None:
+    """Return the version that a night's training starts from: `ref`, or if that was imported, the newest version of its
+    league that can be trained further. None if there is none.
+    """
+    if registry.versions.resolve(ref).manifest.algorithm in ALGORITHMS:
+        return ref
+    for version in reversed(registry.versions.all(ref.league)):
+        trained = version.exploits is None and version.manifest.algorithm in ALGORITHMS
+        if trained and registry.versions.has_training(version):
+            return CheckpointRef(version.league, version.number)
+    return None
+
+
 def check_network(version: VersionRow, config: LeagueConfig) -> None:
     """Raise ConfigError if `config` defines another network than the version. Missing settings have defaults."""
     if version.manifest.algorithm not in ALGORITHMS:
         raise ConfigError(f"{version.ref} was {version.manifest.algorithm}: it has no training state to start from")
-    settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    try:
+        settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    except ValidationError as error:
+        raise ConfigError(f"{version.ref} was trained with settings of another release") from error
     before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
     for key in NETWORK_SETTINGS:
         # Each algorithm has a subset of them.
@@ -255,7 +278,9 @@ def _start(run: RunDirectory, registry: Registry, private: Path) -> StartState:
     RLlib unpickles it. Therefore it is verified in a private copy, which nobody else can change in between.
     """
     parent, league = run.record.parent, run.record.config.league
-    before = registry.versions.get(league, parent).steps if parent is not None else 0
+    before = run.record.parent_steps
+    if before is None:
+        before = registry.versions.get(league, parent).steps if parent is not None else 0
     published = published_versions(registry, run)
     if published:
         state = registry.versions.copy(league, published[-1].number, TRAINING, private)

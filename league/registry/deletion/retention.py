@@ -2,8 +2,9 @@
 
 The training state of a version is by far its largest part, and only needed to continue training from it. It is kept
 for the versions that an alias points to, for the newest ones, and for young ones. All files of a version are removed if
-moreover no alias ever pointed to it and no canary, shadow, verdict or recorded game refers to it. Its row stays: the
-version is *retired*, and its number is never reused. What refers to a mixture refers to its members.
+moreover no alias ever pointed to it, no canary, shadow, verdict or recorded game refers to it, and its league is not
+being trained, since any version may be an opponent. Its row stays: the version is *retired*, and its number is never
+reused. What refers to a mixture refers to its members.
 
 Versions are marked before their files are removed. An interrupted removal is completed by the next one.
 """
@@ -31,6 +32,7 @@ from league.registry.storage.tables import (
     VerdictTable,
     VersionTable,
 )
+from league.registry.training import runs
 from league.registry.verdicts import VOID
 
 
@@ -109,6 +111,8 @@ def _candidates(session: Session, league: str, keep: int, before: datetime) -> t
     old -= aliased | versions.members(session, league, aliased)
     needed = _needed(session, league)
     needed |= versions.members(session, league, needed)
+    if runs.is_trained(session, league):
+        needed |= old  # any version may be an opponent
     # A mixture has no files but its manifest.
     needed |= set(session.scalars(select(table.number).filter_by(league=league, role=MIXTURE)))
     gone = session.scalars(select(table.number).where(table.league == league, table.retired_at.is_not(None)))

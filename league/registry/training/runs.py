@@ -176,6 +176,12 @@ def active(session: Session, league: str) -> tuple[RunRow, ...]:
     return tuple(_row(row) for row in session.scalars(query))
 
 
+def is_trained(session: Session, league: str) -> bool:
+    """Whether a run of the league sends heartbeats."""
+    now = datetime.now(UTC)
+    return any(now - run.heartbeat_at < HEARTBEAT_TIMEOUT for run in active(session, league))
+
+
 def _get(session: Session, league: str, run: str) -> RunRow:
     leagues.require(session, league)
     return _row(session.get(RunTable, (league, run)) or _unknown(league, run))

@@ -229,6 +229,33 @@ def test_a_champion_moved_during_the_test_is_not_overruled(registry: Registry) -
     assert outcomes(again) == [("tictactoe@3", "tictactoe@4", "promote", True)]
 
 
+def test_a_refusal_by_a_former_champion_does_not_count(tmp_path: Path) -> None:
+    """The candidate is weaker than version 2, but in the meantime a person has restored version 1."""
+    registry = league_of(tmp_path / "home", WEAK, STRONGEST, MIDDLING, config=CONFIG)
+    for version, expected in ((1, None), (2, 1)):
+        registry.aliases.set(tictactoe.LEAGUE, "champion", version, expected=expected, actor="me", reason="by hand")
+
+    def interfere(event: Progress | VerdictReport) -> None:
+        if isinstance(event, Progress) and event.what == "tictactoe@3 against tictactoe@2" and not event.played:
+            registry.aliases.rollback(tictactoe.LEAGUE, actor="me", reason="crashes in production")
+
+    found = outcomes(nightly(CONFIG, registry=registry, listener=interfere))
+    assert ("tictactoe@3", "tictactoe@2", "void", False) in found
+    assert ("tictactoe@3", "tictactoe@1", "promote", True) in outcomes(nightly(CONFIG, registry=registry))
+    registry.close()
+
+
+def test_a_version_that_was_rolled_back_is_not_promoted_again(tmp_path: Path) -> None:
+    """It became champion by hand, so that it has no verdict."""
+    registry = league_of(tmp_path / "home", WEAK, STRONGEST, config=CONFIG)
+    for version, expected in ((1, None), (2, 1)):
+        registry.aliases.set(tictactoe.LEAGUE, "champion", version, expected=expected, actor="me", reason="by hand")
+    registry.aliases.rollback(tictactoe.LEAGUE, actor="me", reason="crashes in production")
+    report = nightly(CONFIG, registry=registry)
+    assert (outcomes(report), report.champion) == ([], "tictactoe@1")
+    registry.close()
+
+
 def test_an_open_verdict_against_a_former_champion_is_voided(registry: Registry) -> None:
     row = registry.leagues.get(tictactoe.LEAGUE)
     registry.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=None, actor="me", reason="first")
@@ -313,6 +340,20 @@ def test_a_candidate_without_the_required_shadow_traffic_is_not_tested(tmp_path:
     ]
     assert report.verdicts[0].games == 0
     assert "has 0 observations as the champion's shadow" in str(report.verdicts[0].note)
+    registry.close()
+
+
+def test_members_of_a_champion_are_shadowed_in_its_place(tmp_path: Path) -> None:
+    gate = {"shadow_agreement": 0.5, "shadow_observations": 150}
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate=gate)
+    registry = league_of(tmp_path / "home", MIDDLING, MIDDLING, STRONGEST, config=config)
+    mixture = registry.publisher.publish_mixture(tictactoe.LEAGUE, {1: 0.5, 2: 0.5}).number
+    registry.aliases.set(tictactoe.LEAGUE, "champion", mixture, expected=None, actor="test", reason="test")
+    latency = (0, 100, *[0] * (len(BOUNDS) - 1))
+    shown = [ShadowCounts(tictactoe.LEAGUE, 3, of, 100, 100, 60, 0, 0, 0, latency, 4_000_000) for of in (1, 2)]
+    registry.replicas.write_report("replica-1", {}, shown)
+    outcome = {ref: (result, note) for ref, _, result, note in outcomes(nightly(config, registry=registry))}
+    assert outcome["tictactoe@3"] == ("promote", True)
     registry.close()
 
 

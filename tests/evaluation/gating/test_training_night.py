@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
 from evaluation.gating.training_night import training_night
 from league.errors import AlreadyRunning, ConfigError
@@ -219,3 +220,22 @@ def outline(found: dict[str, Any]) -> dict[str, Any]:
 def _copy(home: Path, to: Path) -> Registry:
     shutil.copytree(home, to)
     return Registry.open(Storage.at(to))
+
+
+def test_a_night_waits_for_another_nightly_run(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evaluation.gating.training_night.WAIT", 0.01)
+    other = FileLock(registry.storage.home / "locks" / f"nightly-{LEAGUE}.lock")
+    said: list[str] = []
+
+    def announce(sentence: str) -> None:
+        said.append(sentence)
+        if sentence.endswith("the night waits for its end"):
+            other.release()
+
+    other.acquire()
+    night, report = training_night(
+        CONFIG, registry=registry, train=trainer_of(registry, STRONG, STRONGEST), announce=announce
+    )
+    assert report is not None
+    assert set(night.steps) == {"train", "gate", "exploiter", "measure"}
+    assert sum("another process is running" in each for each in said) == 1

@@ -34,6 +34,7 @@ from league.service_requests import HumanPlayRequest
 from league.spaces import inputs
 from tests.support.environments.declaring import EVERYTHING, VIEWS
 from tests.support.leagues import tictactoe
+from tests.support.leagues.judged_league import STRONG, WEAK
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
 CONNECT_FOUR = "pettingzoo.classic.connect_four_v3"
@@ -271,3 +272,25 @@ def test_agents_have_the_declared_names_keys_and_colors(tmp_path: Path) -> None:
     assert first.keys == {"ArrowLeft": 0, "a": 0, "ArrowRight": 8, "d": 4}, "declared keys precede; 99 is no action"
     assert (first.color, second.color) == ("red", None)
     assert found.board == ((0, None), (1, 2))
+
+
+def test_mixtures_of_another_environment_are_not_offered(tmp_path: Path) -> None:
+    entry_point = "pettingzoo.classic.tictactoe_v3"
+    before, now = (
+        tictactoe.config(environment={"entry_point": entry_point, "kwargs": {"screen_height": height}})
+        for height in (400, 500)
+    )
+    with closing(tictactoe.registry(tmp_path)) as registry:
+
+        def offered(config: LeagueConfig) -> set[str]:
+            registry.leagues.register(config, interface(config))
+            found = playability(config, registry, interface(config), environment_hooks(config.environment))
+            return {ref for ref in found.opponents if not ref.startswith("script:")}
+
+        registry.leagues.register(before, interface(before))
+        for graph in (STRONG, WEAK):
+            tictactoe.publish(registry, graph)
+        registry.publisher.publish_mixture(tictactoe.LEAGUE, {1: 0.5, 2: 0.5})
+        registry.aliases.set(tictactoe.LEAGUE, "champion", 3, expected=None, actor="me", reason="test")
+        assert offered(before) == {"tictactoe@1", "tictactoe@2", "tictactoe@3"}
+        assert offered(now) == set()

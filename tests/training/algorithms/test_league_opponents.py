@@ -177,3 +177,21 @@ def test_the_payoff_matrix_has_matches_and_training_games() -> None:
     found = payoff_matrix(("a", "b", "c"), blocks, {"c": {"b": (10.0, 10.0), "unknown": (5.0, 5.0)}})
     score = (10 + PRIOR_GAMES / 2) / (10 + PRIOR_GAMES)
     np.testing.assert_allclose(found, [[0.5, score, 0.5], [1 - score, 0.5, 1 - score], [0.5, score, 0.5]])
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_versions_published_since_the_checkpoint_replace_no_opponent_after_resuming(
+    registry: Registry, window: int
+) -> None:
+    for number in range(4):
+        registries.publish(registry, f"run/{number}")
+    first, second = (opponents_of(registry, sampling="uniform", window=window) for _ in range(2))
+    first.refresh()
+    state = first.get_state()
+    for number in range(4, 10):
+        registries.publish(registry, f"run/{number}")
+    second.set_state(state)
+    second.drop_removed()
+    for opponents in (first, second):
+        opponents.reset(1000)
+    assert second.active == first.active != ()

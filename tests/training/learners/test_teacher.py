@@ -10,7 +10,7 @@ import torch
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.errors import ConfigError
+from league.errors import ConfigError, GameCrashed
 from league.spaces import ACTION_MASK, OBSERVATION
 from tests.support.leagues import tictactoe
 from tests.support.leagues.training_leagues import solvable
@@ -104,3 +104,16 @@ def test_unsuitable_teachers_are_rejected() -> None:
         algorithm_config(league, interface(league))
     with pytest.raises(ConfigError, match="tictactoe@1 is a version, but no storage is given"):
         learner_of(taught(ref="tictactoe@1"))
+
+
+def test_an_exception_of_the_teacher_ends_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_teacher.py").write_text("def act(observation, action_mask, rng):\n    raise KeyError('plan')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    league = taught(ref="script:broken_teacher:act")
+    learner, episodes = learner_of(league), episodes_of(league)
+    batch = train_batch(learner.module["shared"], episodes, gamma=1.0, lambda_=1.0)
+    assert league.training.algorithm == "ppo"
+    assert league.training.teacher is not None
+    teacher = Teacher(league.training.teacher, interface(league), None, 0)
+    with pytest.raises(GameCrashed, match=r"training\.teacher: script:broken_teacher:act: KeyError: 'plan'"):
+        teacher.actions("shared", batch, 1)

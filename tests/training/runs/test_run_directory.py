@@ -57,7 +57,7 @@ def change(registry: Registry, run: RunDirectory, **columns: object) -> None:
 def test_the_latest_run_is_resumed(registry: Registry, storage: Storage) -> None:
     RunDirectory.begin(storage, tictactoe(), None, None)
     newest = RunDirectory.begin(storage, tictactoe(), 3, "abc")
-    latest_path = newest.path.rename(newest.path.with_name("9" + newest.id))
+    latest_path = newest.path.rename(newest.path.with_name("9" + newest.id[1:]))
     run = RunDirectory.resume(registry, tictactoe())
     assert run.path == latest_path
     assert (run.record.parent, run.record.git_commit, run.record.config) == (3, "abc", tictactoe())
@@ -153,12 +153,12 @@ def test_a_run_is_resumed_on_another_machine(registry: Registry, elsewhere: Regi
     run = RunDirectory.begin(registry.storage, written, 3, "abc", {"@champion": "tictactoe@3"})
     with pytest.raises(NotFound, match=r"neither in .*elsewhere.* nor in the registry"):
         RunDirectory.resume(elsewhere, written)
-    assert RunDirectory.find(elsewhere, "tictactoe", run.id) is None
+    assert RunDirectory.find(elsewhere, tictactoe(), run.id) is None
     start(registry, run)
     resumed = RunDirectory.resume(elsewhere, written)
     assert (resumed.id, resumed.record) == (run.id, run.record)
     assert resumed.path == elsewhere.storage.home / "runs" / "tictactoe" / run.id
-    assert RunDirectory.find(elsewhere, "tictactoe", run.id).record == run.record
+    assert RunDirectory.find(elsewhere, tictactoe(), run.id).record == run.record
 
 
 @pytest.mark.parametrize("by_name", [False, True])
@@ -180,7 +180,7 @@ def test_a_run_is_trained_on_one_machine_at_a_time(
     try:
         for one in (registry, elsewhere):
             with pytest.raises(AlreadyRunning, match=rf"{run.id} is running on trainer-7"):
-                RunDirectory.find(one, "tictactoe", run.id) if by_name else RunDirectory.resume(one, tictactoe())
+                RunDirectory.find(one, tictactoe(), run.id) if by_name else RunDirectory.resume(one, tictactoe())
     finally:
         is_over.set()
         driver.join()
@@ -206,7 +206,7 @@ def test_a_run_that_ended_on_another_machine_is_complete(registry: Registry) -> 
     change(registry, run, state="ended", driver="trainer-7/boot/1:10:20")
     with pytest.raises(NotFound, match="is complete"):
         RunDirectory.resume(registry, tictactoe(steps=10))
-    assert RunDirectory.find(registry, "tictactoe", run.id).record.complete
+    assert RunDirectory.find(registry, tictactoe(), run.id).record.complete
     assert not RunDirectory.resume(registry, tictactoe(steps=11)).record.complete
 
 
@@ -233,3 +233,20 @@ def test_a_changed_record_in_the_registry_is_named(registry: Registry, storage: 
     change(registry, run, record={"config": 5})
     with pytest.raises(RunCorrupt, match=rf"run {run.id} in the registry: \S+: "):
         RunDirectory.resume(registry, tictactoe())
+
+
+def test_a_run_with_a_name_keeps_its_settings_but_not_its_resources(registry: Registry) -> None:
+    """A machine that is too small for a run of a night must not stop all later nights."""
+    begun = tictactoe(runners=8, gpus=1, lr=0.01, steps=1000)
+    RunDirectory.begin(registry.storage, begun, None, None, name="night-1")
+    found = RunDirectory.find(registry, tictactoe(runners=1, gpus=0, lr=0.5, steps=10), "night-1")
+    assert found is not None
+    settings = found.record.config.training
+    assert (settings.runners, settings.gpus, settings.steps) == (1, 0, 1000)
+    assert settings.model_dump()["lr"] == begun.training.model_dump()["lr"]
+
+
+def test_runs_of_nights_and_gates_are_not_resumed_by_hand(storage: Storage, registry: Registry) -> None:
+    own = RunDirectory.begin(storage, tictactoe(), None, None)
+    RunDirectory.begin(storage, tictactoe(seed=7), None, None, name="99990101-200000-night-1")
+    assert RunDirectory.resume(registry, tictactoe()).id == own.id

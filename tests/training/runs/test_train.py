@@ -107,6 +107,11 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
 def test_continued_training_has_a_parent(trained: Trained) -> None:
     further = train(LEAGUE, registry=trained.registry, parent=CheckpointRef("tictactoe", 1))
     assert lineage(further) == [(3, 1024, 1), (4, 1536, 3)]
+    half, parent = LEAGUE.with_training(steps=512), CheckpointRef("tictactoe", 3)
+    assert lineage(train(half, registry=trained.registry, parent=parent)) == [(5, 1536, 3)]
+    trained.registry.removal.remove_version(parent, force=True)
+    resumed = train(LEAGUE, registry=trained.registry, resume=True)
+    assert lineage(resumed)[-1] == (6, 2048, 5), "it needs its parent no longer"
 
 
 @pytest.mark.slow

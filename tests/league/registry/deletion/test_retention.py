@@ -119,3 +119,11 @@ def test_an_interrupted_removal_is_completed(versions: Registry, monkeypatch: py
 def test_an_unknown_league_is_reported(registry: Registry) -> None:
     with pytest.raises(UnknownLeague):
         registry.retention.retire("other", keep=1, before=datetime.now(UTC))
+
+
+def test_no_version_is_retired_while_its_league_is_trained(versions: Registry) -> None:
+    """Any version may be an opponent. The training state of opponents is not needed."""
+    versions.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=0, target=100)
+    assert retire(versions) == (set(), {1, 2, 3, 4, 5})
+    versions.runs.end(LEAGUE, "run", "ended")
+    assert retire(versions)[0] == {1, 2, 3, 4, 5}

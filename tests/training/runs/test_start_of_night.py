@@ -1,0 +1,44 @@
+"""Which version a night's training starts from."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.registry.storage.manifest import EXPLOITER, Manifest
+from league.settings import Storage
+from tests.support.leagues import registries
+from tests.support.leagues.registries import LEAGUE
+from training.runs.train import start_of_night
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Registry:
+    return registries.registered(Registry.open(Storage.at(tmp_path)))
+
+
+def publish(registry: Registry, **manifest: Any) -> CheckpointRef:
+    build = registries.builder()
+
+    def build_other(directory: Path, number: int) -> Manifest:
+        return build(directory, number).model_copy(update=manifest)
+
+    source = f"run/{len(registry.versions.all(LEAGUE))}"
+    return CheckpointRef(LEAGUE, registry.publisher.publish(LEAGUE, build_other, source=source, parent=None).number)
+
+
+def test_a_version_that_was_trained_continues(registry: Registry) -> None:
+    first = publish(registry)
+    publish(registry)
+    assert start_of_night(registry, first) == first
+
+
+def test_in_place_of_an_imported_version_the_newest_one_continues(registry: Registry) -> None:
+    imported = publish(registry, algorithm="imported")
+    assert start_of_night(registry, imported) is None
+    trained = publish(registry)
+    publish(registry, role=EXPLOITER, exploits=str(imported))
+    publish(registry, algorithm="imported")
+    assert start_of_night(registry, imported) == trained
