@@ -93,7 +93,7 @@ def test_an_adaptive_tournament_continues_a_shorter_or_killed_one(
 
 
 @pytest.mark.usefixtures("ray_session")
-@pytest.mark.parametrize("schedule", ["adaptive", "round_robin"])
+@pytest.mark.parametrize("schedule", [pytest.param("adaptive", marks=pytest.mark.slow), "round_robin"])
 def test_precision_stops_at_the_same_match_with_workers(registry: Registry, tmp_path: Path, schedule: Any) -> None:
     options: dict[str, Any] = {"schedule": schedule, "budget": Budget(precision=150)}
     report = evaluate(tictactoe.LEAGUE, registry=registry, **options)

@@ -135,6 +135,7 @@ def test_an_identical_policy_is_not_promoted(tmp_path: Path) -> None:
     assert report.verdicts[0].unique_games <= report.verdicts[0].games / 2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path) -> None:
     local, distributed = (league_of(tmp_path / name, WEAK, MIDDLING, STRONG) for name in ("alone", "many"))

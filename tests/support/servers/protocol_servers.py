@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from dataclasses import dataclass
+from typing import Any
 
 import grpc
 import uvicorn
@@ -34,9 +35,9 @@ class Listening:
 
     def __init__(self, server: Replica) -> None:
         self._server = server
-        self._http = uvicorn.Server(
-            uvicorn.Config(server.application(), host="127.0.0.1", port=0, log_level="warning", ws="none")
-        )
+        # A client of asyncio notices only while it is called that the server has closed its idle connection.
+        options: dict[str, Any] = {"log_level": "warning", "ws": "none", "timeout_keep_alive": 600}
+        self._http = uvicorn.Server(uvicorn.Config(server.application(), host="127.0.0.1", port=0, **options))
         self._is_listening = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
         self._grpc_port = 0

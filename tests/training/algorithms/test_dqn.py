@@ -154,7 +154,9 @@ def test_the_check_detects_targets_without_a_mask(monkeypatch: pytest.MonkeyPatc
         check_values()
 
 
-@pytest.mark.parametrize("settings", [ALL_EXTENSIONS, MEMORY], ids=["all extensions", "recurrent"])
+@pytest.mark.parametrize(
+    "settings", [ALL_EXTENSIONS, pytest.param(MEMORY, marks=pytest.mark.slow)], ids=["all extensions", "recurrent"]
+)
 def test_a_restored_algorithm_continues_identically(settings: dict[str, Any], tmp_path: Path) -> None:
     """Compares an algorithm that continues after its checkpoint with a restored one: weights, targets and buffer."""
     league = solvable_by_dqn("discrete", **settings, replay_capacity=900)

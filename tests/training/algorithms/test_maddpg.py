@@ -130,7 +130,9 @@ def test_resumed_training_is_identical(tmp_path: Path) -> None:
     assert [name for name in expected if not torch.equal(found[name], expected[name])] == []
 
 
-@pytest.mark.parametrize("name", ["numbers", "several", "discrete", "masked"])
+@pytest.mark.parametrize(
+    "name", ["numbers", *(pytest.param(name, marks=pytest.mark.slow) for name in ("several", "discrete", "masked"))]
+)
 def test_graphs_equal_the_actors(name: str, tmp_path: Path) -> None:
     league = (
         turn_based_league() if name == "masked" else maddpg(name, {} if name == "numbers" else TWO, {"shared": ["*"]})

@@ -242,7 +242,7 @@ RAISED = ("league faulty", "ZeroDivisionError: division by zero", "faulty.py:13"
 @pytest.mark.parametrize(
     ("entry_point", "runners", "messages"),
     [
-        ("raising", 0, RAISED),
+        pytest.param("raising", 0, RAISED, marks=pytest.mark.slow),
         pytest.param("raising", 1, RAISED, marks=pytest.mark.slow),
         pytest.param("unrewarding", 1, ("faulty", "player_1", "nan"), marks=pytest.mark.slow),
     ],

@@ -243,6 +243,7 @@ def test_rllibs_learner_accepts_the_episodes_and_agrees_on_value_targets(truncat
     assert learner.update(episodes=fresh, num_epochs=1, minibatch_size=32, timesteps={})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_remote_runners_have_distinct_seeds_and_the_weights_of_the_learner() -> None:
     league = tictactoe(runners=2, num_envs=2, train_batch_size=64, minibatch_size=32, epochs=1)

@@ -168,6 +168,7 @@ def plain_script(name: str) -> PPOConfig:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_a_plain_rllib_script_trains_on_simple_spread() -> None:
     register(league("mpe2.simple_spread_v3", name="plain_spread"))
