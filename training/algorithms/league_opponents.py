@@ -143,7 +143,7 @@ class LeagueOpponents:
         self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
 
     def _versions(self, registry: Registry) -> dict[str, str]:
-        """Return the versions that may be candidates → their sources, by age."""
+        """Return the versions that may be candidates → their sources: exploiters, then the others, by age."""
         assert self._settings is not None
         league = self._league.league
         numbers = registry.versions.numbers(league).get(league, [])
@@ -160,6 +160,7 @@ class LeagueOpponents:
             newest = {exploiter.exploits: exploiter.number for exploiter in of_champions}
             chosen |= set(newest.values())
         rows = [registry.versions.get(league, number) for number in numbers if number in chosen]
+        rows.sort(key=lambda row: (row.exploits is None, row.number))
         fixed = {opponent.ref for opponent in self._league.training.opponents.fixed}
         digest = self._interface.digest()
         return {

@@ -195,3 +195,16 @@ def test_versions_published_since_the_checkpoint_replace_no_opponent_after_resum
     for opponents in (first, second):
         opponents.reset(1000)
     assert second.active == first.active != ()
+
+
+def test_the_latest_version_is_no_exploiter(registry: Registry) -> None:
+    """In a night, the exploiter of the champion is published last."""
+    registries.publish(registry, "run/1")
+    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="me", reason="test")
+    registries.publish(registry, "run/2")
+    publish_exploiter(registry, "exploiter/1", "tictactoe@1")
+    opponents = opponents_of(registry, sampling="latest")
+    opponents.refresh()
+    opponents.reset(0)
+    assert opponents.candidates == ("tictactoe@3", "tictactoe@1", "tictactoe@2")
+    assert [each.ref for each in opponents.active] == ["tictactoe@2"]
