@@ -160,10 +160,10 @@ Seed = TypeVar("Seed", bound=int | list[int])
 
 
 def _used_seed(explore: bool | None, seed: Seed | None) -> Seed | int | None:
-    """The seed of the request: none for greedy actions."""
+    """The seed of the request: none for greedy actions. The league may sample by default."""
     if explore is False:
         return None
-    return random.getrandbits(63) if explore and seed is None else seed
+    return random.getrandbits(63) if seed is None else seed
 
 
 def _body(body: JsonObject, explore: bool | None, seed: Any, probabilities: bool, state: Any) -> JsonObject:

@@ -59,7 +59,8 @@ class ActionResponse:
         version: The version that chose it.
         sha256: Digest of the version's manifest.
         replica: Name of the replica that answered; for a stream, of the replica that it is connected to.
-        seed: Seed with which the action was sampled. The same version and seed give the same action again.
+        seed: Seed of the request, with which the action was sampled, unless it is greedy. The same version and seed
+            give the same action again. None with `explore=False`.
         probabilities: Action probabilities, if requested; see `Probabilities`.
         state: Recurrent state for the next observation, as an opaque token; None for policies without state.
     """

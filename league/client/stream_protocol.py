@@ -58,6 +58,8 @@ class StreamProtocol:
         """The URL of the next connection."""
         version = self._model.version
         query = f"?follow={version or CHAMPION}" if self._follow else self._model.query
+        if self._follow and self.last is not None:
+            query += f"&version={self.last.version}"  # an episode keeps the member of a mixture
         return f"{self._endpoint.websocket_url}{self._model.path}/stream{query}"
 
     @property

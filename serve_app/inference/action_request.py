@@ -1,7 +1,7 @@
 """An action request: parsed and checked, executed, and encoded as a response."""
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,8 +81,10 @@ def parse_flag(document: dict[str, Any], key: str) -> bool:
     return flag
 
 
-def pinned_version(request: DecodedActionRequest, model: str, requested: str) -> str:
+def pinned_version(request: DecodedActionRequest, model: str, requested: str, members: Collection[int] = ()) -> str:
     """The version of `model` that must answer: that of the state tokens, otherwise the requested one.
+
+    members: of the requested version, if that is a mixture.
 
     Raises InvalidState if the two differ, or if a token belongs to another league. An alias never conflicts with a
     token, because aliases move while episodes stay with their version.
@@ -95,7 +97,7 @@ def pinned_version(request: DecodedActionRequest, model: str, requested: str) ->
         if token.model.partition(".")[0] != league:
             raise InvalidState(f"state is of {token.model[:64]}, expected {model[:64]}")
     version = common_version(tokens)
-    if version_of(requested) not in (version, requested):
+    if version_of(requested) not in (version, requested) and version not in members:
         raise InvalidState(
             f"state is of version {version}, but the request is for version {requested}: an episode stays with one"
             " version"

@@ -194,12 +194,12 @@ class StreamSession:
             return self._continue(len(request.observations), is_anew or request.tokens is not None, resets)
         if is_anew or resets is not None:
             raise InvalidState("reset and state are mutually exclusive: an episode starts or continues")
-        if not self._served.policy.state:
-            raise InvalidState("state must be null: this policy is not recurrent")
         number = pinned_version(request, self._model, self._follows or str(self._served.version.number))
         served = self._served
         if int(number) != served.version.number:
             served = ServedPolicy.of(self._model, *await self._dependencies.models.find(self._model, number))
+        if not served.policy.state:
+            raise InvalidState("state must be null: this policy is not recurrent")
         model = served.version.model(served.policy)
         return served, read_state(request.tokens, model, served.version.sha256, served.policy.state)
 

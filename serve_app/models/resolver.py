@@ -1,7 +1,7 @@
 """Resolves the model and version of a request to the policy that answers it."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
@@ -52,6 +52,17 @@ class ModelResolver:
         if loaded.mixture is not None:
             loaded = acting(loaded, headers)
         return loaded, loaded.policy(ref.policy)
+
+    async def members(self, model: str, version: str) -> Collection[int]:
+        """The members of a mixture that is named by its number; none of another version or an alias.
+
+        Raises the errors of `find`.
+        """
+        ref, requested = policy_ref(model), version_of(version)
+        if not isinstance(requested, int):
+            return ()
+        loaded = self._versions.cached(ref.league, requested) or await self._versions.get(ref.league, requested)
+        return [member.number for member in loaded.members]
 
     async def query(self, function: Callable[[Registry], T]) -> T:
         """Query the registry in a thread."""

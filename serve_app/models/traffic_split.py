@@ -73,7 +73,7 @@ class TrafficSplit:
         canary = self._slots.get(league, target.slot)
         if canary is None:
             return champion
-        self.canary_requests[league, canary.number] += 1
+        self.canary_requests[league, acting(canary, headers).number] += 1
         return canary
 
 

@@ -92,7 +92,8 @@ class ActionRoute:
         document = await self._parse_large(body, model, requested) if is_large else parse_json_object(body)
         reject_unknown_keys(document, KEYS)
         request = parse_action_request(document, self._settings.max_batch)
-        requested = pinned_version(request, model, requested)
+        members = await self._models.members(model, requested) if request.tokens and any(request.tokens) else ()
+        requested = pinned_version(request, model, requested, members)
         version, policy = await self._models.find(model, requested, scope["headers"])
         response = await _response(request, body, version, policy, self._shadow.mirror_for(model, version))
         response |= {"model": model, "version": version.number, "sha256": version.sha256}

@@ -26,6 +26,8 @@ from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
+from serve_app.models.resolver import policy_ref, version_of
+from serve_app.models.version_cache import LoadedVersion
 from serve_app.routes import parsing
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import (
@@ -169,14 +171,22 @@ class StreamRoute:
         follows = query.get("follow")
         if follows is not None:
             check_alias(follows)
-            if "version" in query:
-                raise InvalidInput("version and follow are mutually exclusive")
+            if not isinstance(version_of(query.get("version", "1")), int):
+                raise InvalidInput(f"version={query['version'][:64]!r} beside follow, expected a number")
         version, policy = await self._dependencies.models.find(
             model, follows or query.get("version", CHAMPION), scope["headers"]
         )
+        if follows is not None and "version" in query:
+            version = self._member(model, follows, version_of(query["version"])) or version
+            policy = version.policy(policy_ref(model).policy)
         headers = {b"x-league-version": str(version.number), b"x-league-sha256": version.sha256, REPLICA: self._replica}
         stream = StreamSession(self._dependencies, model, (version, policy), follows, scope["headers"], scope.get(KEY))
         return stream, [(name, value.encode()) for name, value in headers.items()]
+
+    def _member(self, model: str, alias: str, number: int | str) -> LoadedVersion | None:
+        """The member of the mixture that an alias names, with which an episode continues after a reconnection."""
+        named = self._dependencies.slots.get(policy_ref(model).league, alias)
+        return next((member for member in named.members if member.number == number), None) if named else None
 
     async def _exchange_messages(self, stream: StreamSession, opened: OpenStream, receive: Receive) -> None:
         if opened.protocol is not None:

@@ -80,7 +80,7 @@ keep_replicas() {{  # a backend without replicas gets those of the last configur
     awk '
         /^[^ ]/ {{ if (known && !found) printf "%s", last[backend]; backend = ""; known = found = 0 }}
         /^backend / {{ backend = $2; known = FNR != NR }}
-        /^ *server [^ ]* [^ ]* check/ && !/ backup$/ {{
+        /^ *server [^ ]* [^ ]* (proto h2 )?check/ && !/ backup$/ {{
             if (FNR == NR) last[backend] = last[backend] $0 "\\n"; else found = 1
         }}
         FNR != NR {{ print }}
@@ -90,7 +90,8 @@ keep_replicas() {{  # a backend without replicas gets those of the last configur
 }}
 
 if [ "$1" = stand-in-for ]; then
-    read -r _ < "$here/alive.$2"  # ends when nobody holds the other end of the pipe any more
+    read -r _ <&8  # ends when nobody holds the other end of the pipe any more
+    exec 8<&-
     rm -f "$here/alive.$2"
     [ "$(cat "$here/serving")" = "$2" ] && [ ! -e "$here/{stopped}" ] || exit 0
     without_control "$here/routed.cfg" > "$here/standin.cfg"
@@ -109,8 +110,9 @@ if [ -n "$config" ]; then
         echo $$ > "$here/serving"
         cp "$config" "$here/routed.cfg"
         mkfifo "$here/alive.$$"
-        setsid "$0" stand-in-for $$ > "$here/standin.log" 2>&1 &  # Ray ends the processes of a group together
         exec 9<> "$here/alive.$$"
+        # Ray ends the processes of a group together.
+        setsid "$0" stand-in-for $$ 8< "$here/alive.$$" 9>&- > "$here/standin.log" 2>&1 &
         if [ -e "$here/{stand_in}" ]; then
             # The stand-in has the ports, so that HAProxy pauses the processes that it replaces. A listener that it
             # shares with one of them (-x) would stay paused.

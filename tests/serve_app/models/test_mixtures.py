@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from starlette.testclient import TestClient, WebSocketTestSession
+from starlette.testclient import TestClient, WebSocketDenialResponse, WebSocketTestSession
 
+from league.client.endpoint import Endpoint
+from league.client.requests import ActionRequest
+from league.client.responses import parse_model
+from league.client.stream_protocol import StreamProtocol
 from league.errors import InvalidInput
 from league.policies.loading import load
 from league.policies.onnx import OnnxPolicy
@@ -20,7 +24,7 @@ from league.registry.storage.rows import Portion
 from league.settings import Storage
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import everything, promote, publish
-from tests.support.policies.graphs import counting, masked_mlp
+from tests.support.policies.graphs import counting, masked_mlp, memoryless
 from tests.support.servers.exposition import value
 from tests.support.servers.replicas import QUICK, READ_ONLY, replica
 from tests.support.waiting import until
@@ -146,6 +150,62 @@ def test_an_episode_of_a_recurrent_member_stays_with_it(client: TestClient, regi
     assert seen == {1, 2}
 
 
+def test_an_episode_continues_with_the_number_of_its_mixture(client: TestClient, registry: Registry) -> None:
+    publish(registry, "memory", {"shared": counting()}, "run/2")
+    number = registry.publisher.publish_mixture("memory", {1: 0.5, 2: 0.5}).number
+    for _ in range(6):
+        first = act(client, "memory", observation=[1.0], version=str(number))
+        answer = act(client, "memory", observation=[1.0], version=str(number), state=first["state"])
+        assert answer["version"] == first["version"]
+    body = {"observation": [1.0], "state": first["state"]}
+    other = client.post("/v1/policies/memory/action", json=body, params={"version": str(3 - first["version"])})
+    assert (other.status_code, other.json()["code"]) == (400, "invalid_state")
+
+
+def test_an_episode_continues_in_a_stream_whose_alias_is_not_recurrent_now(
+    client: TestClient, registry: Registry
+) -> None:
+    publish(registry, "memory", {"shared": memoryless()}, "run/2")
+    state = act(client, "memory", observation=[2.0])["state"]
+    promote(registry, "memory", 2)
+    registry.changes.wait_for_alias(registry.aliases.history("memory")[0], 30)
+    with client.websocket_connect("/v1/policies/memory/stream?follow=champion") as stream:
+        answer = answer_to(stream, observation=[1.0], state=state, return_state=True)
+        assert (answer["version"], answer["action"]) == (1, 1), "the sum of the episode exceeds 2"
+        assert answer_to(stream, observation=[1.0], reset=True)["version"] == 2
+
+
+def test_a_stream_continues_with_its_member_after_reconnecting(client: TestClient, registry: Registry) -> None:
+    mix(registry, {1: 0.5, 3: 0.5})
+    request, members = ActionRequest.build(BOARD, "lists"), set()
+    for _ in range(12):
+        protocol = StreamProtocol(Endpoint("http://localhost", None, None, 5.0), parse_model("board"), follow=True)
+        seen = []
+        for connection in range(3):
+            with open_stream(client, query="?" + protocol.url.partition("?")[2]) as stream:
+                protocol.opened({"x-league-version": "1"})
+                for reset in (connection == 0, False):
+                    stream.send_text(protocol.message(request, reset))
+                    protocol.receive(request, stream.receive_text())
+                    seen.append(protocol.version)
+        assert len(set(seen)) == 1
+        members.add(seen[0])
+    assert members == {1, 3}
+
+
+@pytest.mark.parametrize(("query", "status"), [("version=champion", 400), ("version=2", 101)])
+def test_only_a_number_accompanies_follow(client: TestClient, registry: Registry, query: str, status: int) -> None:
+    """A version that is no member is ignored: the alias has moved."""
+    mix(registry, {1: 0.5, 3: 0.5})
+    if status == 101:
+        with open_stream(client, query=f"?follow=champion&{query}") as stream:
+            assert answer_to(stream, observation=BOARD)["version"] in (1, 3)
+    else:
+        with pytest.raises(WebSocketDenialResponse) as refused, open_stream(client, query=f"?follow=champion&{query}"):
+            pass
+        assert refused.value.status_code == status
+
+
 def test_a_stream_changes_its_member_when_an_episode_starts(client: TestClient, registry: Registry) -> None:
     mix(registry, {1: 0.5, 3: 0.5})
     seen = set()
@@ -188,6 +248,8 @@ def test_a_mixture_is_a_canary_and_is_compared_with_a_shadow(client: TestClient,
     registry.changes.wait_for_traffic(setting, 30)
     found = Counter(versions_by_key(client).values())
     assert found.keys() == {1, 2, 3}
+    shown = client.get("/v1/leagues/board/traffic").json()["here"]["versions"]
+    assert {each["version"]: each["as_canary"] for each in shown} == {1: 0, 2: found[2], 3: found[3]}
     setting = registry.traffic.set("board", canary=None, shadow=Portion(3, 1.0), actor="test", reason="test")
     mix(registry, {1: 0.5, 2: 0.5})
     registry.changes.wait_for_traffic(setting, 30)

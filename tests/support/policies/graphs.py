@@ -67,6 +67,22 @@ def counting() -> bytes:
     return _serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
 
 
+def memoryless() -> bytes:
+    """`counting` without the sum: the action is whether the observation exceeds 2."""
+    nodes = [
+        helper.make_node("Mul", ["observation", "zero"], ["zeros"]),
+        helper.make_node("Add", ["zeros", "limit"], ["two"]),
+        helper.make_node("Concat", ["two", "observation"], ["action_dist_inputs"], axis=1),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
+    ]
+    inputs = [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", 1])]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
+        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
+    ]
+    return _serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
+
+
 def continuous() -> bytes:
     """A graph whose action is a vector: it copies its observation."""
     nodes = [
