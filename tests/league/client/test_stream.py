@@ -35,12 +35,12 @@ NO_SERVER = "http://127.0.0.1:9"
 
 def test_a_stream_returns_the_actions_of_calls(connect: Connect, url: str) -> None:
     client, observations = connect(url), boards(8)
-    response = client.act_batch("board@2", observations)
+    response = client.act_batch("board@2", observations, explore=False)
     with client.stream("board@2") as stream:
         assert stream.version == 2
-        assert [stream.act(board) for board in observations] == response.actions
+        assert [stream.act(board, explore=False) for board in observations] == response.actions
         assert stream.last == response.response(7)
-        assert stream.act_batch(observations) == response.actions
+        assert stream.act_batch(observations, explore=False) == response.actions
         assert stream.last == response
         drawn = stream.act(observations[0], explore=True, seed=7, probabilities=True)
         alone = client.act("board@2", observations[0], explore=True, seed=7, probabilities=True)

@@ -281,7 +281,7 @@ def test_reset_and_state_contradict_each_other(read_only_client: TestClient) -> 
         assert send(stream, ONE | {"reset": True, "state": token})["code"] == "invalid_state"
     with open_stream(read_only_client) as stream:
         error = send(stream, BODY | {"state": token})
-        assert (error["code"], "not recurrent" in error["message"]) == ("invalid_state", True)
+        assert (error["code"], "expected board" in error["message"]) == ("invalid_state", True)
 
 
 HEAD = REQUEST.pack(1, 0, 0, 1, 0)
@@ -342,7 +342,7 @@ def test_values_are_checked_like_on_the_action_route(
         ("board", "?version=99", 404, "unknown_version"),
         ("board", "?follow=rival", 404, "unknown_alias"),
         ("board", "?follow=7", 400, "invalid_reference"),
-        ("board", "?version=1&follow=champion", 400, "invalid_input"),
+        ("board", "?version=best&follow=champion", 400, "invalid_input"),
         ("board.other", "", 404, "unknown_policy"),
         ("duo", "", 404, "unknown_policy"),
         ("headless", "", 503, "not_ready"),
