@@ -6,7 +6,8 @@
   half of them with equal probabilities: mixtures that an alias can serve. Versions are published only for arms that
   draw opponents from them.
 - connect_four: strength, lowest score against own past versions, and learned exploitability with opponents from the
-  league and in self-play alone, after 28 minutes with each of three seeds: more than three hours (`--minutes`).
+  league and in self-play alone, after 28 minutes on one core with each of three seeds: about two hours on two cores.
+  `--minutes` and `--seeds` measure less.
 """
 
 import argparse
@@ -31,6 +32,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from rich.console import Console
 
 from benchmarks.training.league_arms import MINUTES, compare_arms
+from benchmarks.training.league_arms import SEEDS as CONNECT_FOUR_SEEDS
 from benchmarks.training.learned import local_ray, one_thread, report_target, updates
 from examples.blotto import PAYOFF, exploitability
 from league.config.league import LeagueConfig
@@ -176,9 +178,9 @@ def _each(values: Any) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
-def connect_four(quick: bool, minutes: float = MINUTES) -> bool:
+def connect_four(quick: bool, minutes: float = MINUTES, seeds: Sequence[int] = CONNECT_FOUR_SEEDS) -> bool:
     """Compare both arms after a budget for each; see `compare_arms`."""
-    return compare_arms(minutes / 10 if quick else minutes)
+    return compare_arms(minutes / 10 if quick else minutes, seeds)
 
 
 PARTS = {"overhead": overhead, "blotto": blotto, "connect_four": connect_four}
@@ -190,10 +192,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     parser.add_argument("--quick", action="store_true", help="a tenth of the time")
     parser.add_argument("--minutes", type=float, default=MINUTES, help="of an arm of connect_four; default: 28")
+    parser.add_argument("--seeds", type=int, nargs="+", default=CONNECT_FOUR_SEEDS, help="of connect_four")
     given = parser.parse_args(arguments)
     if unknown := [part for part in given.parts if part not in PARTS]:
         parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
-    parts = PARTS | {"connect_four": partial(connect_four, minutes=given.minutes)}
+    parts = PARTS | {"connect_four": partial(connect_four, minutes=given.minutes, seeds=given.seeds)}
     one_thread()
     with local_ray(cpus=2):
         missed = [name for name in given.parts or parts if not parts[name](given.quick)]

@@ -1,16 +1,22 @@
-"""Connect four with opponents from the league, compared with self-play alone."""
+"""Connect four with opponents from the league, compared with self-play alone.
+
+Both arms of a seed train at the same time, each on one core and in a registry of its own, so that they have equal wall
+time on the same machine.
+"""
 
 import io
 import math
+import shutil
 import statistics
 import tempfile
-from contextlib import closing
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.training.learned import report_target
+from benchmarks.training.learned import one_thread, report_target, two_at_once
 from evaluation.gating.exploitability import exploitability
 from evaluation.matches.worker import MatchWorker
 from evaluation.results import ExploiterScore
@@ -18,8 +24,10 @@ from evaluation.schedules.builders import gauntlet
 from evaluation.statistics.payoff import score_interval
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from league.ray_cluster import LocalRay
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
+from league.registry.storage.manifest import Manifest
 from league.settings import Storage
 from training.runs.train import train
 
@@ -35,6 +43,17 @@ GAIN = 0.10
 INFERIOR = -50.0
 """Elo below which a policy is inferior."""
 SELF_PLAY, LEAGUE = "self-play", "league"
+ONE_CORE = LocalRay(cpus=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmJob:
+    """A training to be done, and the home of its registry."""
+
+    name: str
+    seed: int
+    minutes: float
+    home: Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,24 +67,47 @@ class Arm:
     exploiter: ExploiterScore
 
 
-def compare_arms(minutes: float) -> bool:
+def compare_arms(minutes: float, seeds: Sequence[int] = SEEDS) -> bool:
     """Print the results of all seeds, and whether the league's means meet the targets. minutes: of each training."""
     arms: dict[str, list[Arm]] = {SELF_PLAY: [], LEAGUE: []}
     scores: list[float] = []
-    for seed in SEEDS:
-        with tempfile.TemporaryDirectory() as home, closing(Registry.open(Storage.at(Path(home)))) as registry:
-            # The league's arm comes first, so that its opponents are its own versions.
-            own = {name: train_arm(registry, _config(name, seed, minutes)) for name in (LEAGUE, SELF_PLAY)}
-            for name, arm in own.items():
-                arms[name].append(arm)
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as home:
+            jobs = [ArmJob(name, seed, minutes, Path(home) / name) for name in (LEAGUE, SELF_PLAY)]
+            for job, arm in zip(jobs, two_at_once(work, jobs), strict=True):
+                arms[job.name].append(arm)
                 best = arm.exploiter
                 print(
-                    f"connect four, {name}, seed {seed}: {arm.steps:,} actions; lowest score against its past"
+                    f"connect four, {job.name}, seed {seed}: {arm.steps:,} actions; lowest score against its past"
                     f" {arm.lowest:.3f}; exploiter {best.score:.3f} [{best.low:.3f}, {best.high:.3f}]",
                     flush=True,
                 )
-            scores += _scores(registry, _config(LEAGUE, seed, minutes), own[LEAGUE].last, [own[SELF_PLAY].last])[0]
+            score = _between(jobs, [arms[job.name][-1].last for job in jobs])
+            print(f"connect four, seed {seed}: {statistics.mean(score):.3f} against self-play", flush=True)
+            scores += score
     return _targets(arms, scores)
+
+
+def work(job: ArmJob) -> Arm:
+    """Train an arm on the single core of this process."""
+    one_thread()
+    with closing(Registry.open(Storage.at(job.home))) as registry:
+        return train_arm(registry, _config(job.name, job.seed, job.minutes))
+
+
+def _between(jobs: Sequence[ArmJob], refs: Sequence[str]) -> list[float]:
+    """Play the last version of the first arm against that of the second; return its scores."""
+    with ExitStack() as stack:
+        registry, other = (stack.enter_context(closing(Registry.open(Storage.at(job.home)))) for job in jobs)
+        row = other.versions.resolve(CheckpointRef.parse(refs[1]))
+
+        def build(directory: Path, number: int) -> Manifest:
+            shutil.copytree(other.artifacts.path(row.league, row.number), directory, dirs_exist_ok=True)
+            return row.manifest.model_copy(update={"version": number, "parent": None})
+
+        opponent = registry.publisher.publish(row.league, build, source="self-play")
+        config = _config(jobs[0].name, jobs[0].seed, jobs[0].minutes)
+        return _scores(registry, config, refs[0], [opponent.ref])[0]
 
 
 def _targets(arms: dict[str, list[Arm]], scores: list[float]) -> bool:
@@ -92,11 +134,11 @@ def _targets(arms: dict[str, list[Arm]], scores: list[float]) -> bool:
 def train_arm(registry: Registry, config: LeagueConfig) -> Arm:
     """Train, play the last version against the earlier ones, and train and play its exploiter."""
     quiet = Console(file=io.StringIO())
-    versions = train(config, registry=registry, console=quiet)
+    versions = train(config, registry=registry, console=quiet, local=ONE_CORE)
     last, target = versions[-1], CheckpointRef(config.league, versions[-1].number)
     lowest = min(map(statistics.mean, _scores(registry, config, last.ref, [each.ref for each in versions[:-1]])))
     settings = config.of_exploiter(config.training.seed, None, config.training.minutes, EXPLOITER)
-    train(settings, registry=registry, parent=target, role="exploiter", target=target, console=quiet)
+    train(settings, registry=registry, parent=target, role="exploiter", target=target, console=quiet, local=ONE_CORE)
     found = exploitability(target, registry=registry, blocks=BLOCKS)
     return Arm(last.ref, last.steps, lowest, found.exploiters[0])
 
@@ -114,7 +156,7 @@ def _config(arm: str, seed: int, minutes: float) -> LeagueConfig:
     if arm == SELF_PLAY:
         opponents["league"] = None
     return config.with_training(
-        seed=seed, minutes=minutes, checkpoint_minutes=minutes / VERSIONS, opponents=opponents, strength=None
+        runners=0, seed=seed, minutes=minutes, checkpoint_minutes=minutes / VERSIONS, opponents=opponents, strength=None
     )
 
 
