@@ -166,7 +166,7 @@ def run_training_night(
     storage.export()
     registry, games = open_registry(), GameProgress(quiet)
     if (train := _trainer(registry, games, quiet)) is None:
-        raise ConfigError("training at night needs PyTorch: pip install 'policy-league[training]'")
+        raise ConfigError("training at night needs PyTorch: pip install policy-league")
     with exit_on_interrupt(), connected(None, storage), games as listener:
         night, report = training_night(
             config,

@@ -106,7 +106,7 @@ done
 if [ -n "$config" ]; then
     amend "$config"
     if has_routes "$config" && {{ [ -e "$here/routed.cfg" ] || has_replicas "$config"; }}; then
-        [ ! -e "$here/routed.cfg" ] || keep_replicas "$config"
+        [ ! -s "$here/routed.cfg" ] || keep_replicas "$config"
         echo $$ > "$here/serving"
         cp "$config" "$here/routed.cfg"
         mkfifo "$here/alive.$$"
