@@ -196,7 +196,7 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
 
         from evaluation.service.strength_process import strength_process
         from league.refs import CheckpointRef
-        from training.runs.train import start_of_exploiter, start_of_night
+        from training.runs.parent import start_of_exploiter, start_of_night
         from training.runs.train import train as run
 
         start = None if parent is None else CheckpointRef(config.league, parent)

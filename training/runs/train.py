@@ -5,17 +5,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import TypeAdapter, ValidationError
 from ray import tune
 from rich.console import Console
 
 from league.conditions import describe_selection
-from league.config.algorithms import ALGORITHMS, AnyTraining, TrainingConfig
 from league.config.league import LeagueConfig
 from league.environments.building import describe_policies
 from league.environments.building import interface as interface_of
 from league.environments.implementation import implementation
-from league.errors import ConfigError, InterfaceChanged, LeagueError, UnknownRun, one_line
+from league.errors import ConfigError, LeagueError, UnknownRun, one_line
 from league.interface import Interface
 from league.policies.loading import check_contestants, check_eligible
 from league.ray_cluster import UNLIMITED, LocalRay, check_nodes, cluster_cpus, connected, lost_nodes, node_ids
@@ -30,6 +28,7 @@ from training.rllib_compat import NotPickled, silence_tune
 from training.runs.driver_files import driver_machine
 from training.runs.error_messages import is_process_lost, training_error
 from training.runs.node_watch import NodeWatch
+from training.runs.parent import parent_version
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
 from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, pin_opponents
@@ -40,12 +39,6 @@ from training.runs.tune import Interrupted, cpu_share, fit, placement, run_confi
 
 NODE_LOSS_TIMEOUT = 45.0
 """Seconds until Ray declares a node dead that no longer answers: five health checks, with some time to spare."""
-NETWORK_SETTINGS = (
-    *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
-    *("dueling", "noisy", "distributional"),
-    *("mixer", "mixing_width", "groups"),
-)
-"""Settings that define the network: a version's weights require the same values."""
 
 
 def train(
@@ -117,7 +110,7 @@ def train(
     if exploits is not None:
         config = config.against(exploits)
         check(config, interface)
-    start = None if parent is None else _parent(registry, parent, config, interface)
+    start = None if parent is None else parent_version(registry, parent, config, interface)
     if resume:
         interrupted: RunDirectory | None = RunDirectory.resume(registry, config, role)
     else:
@@ -201,66 +194,12 @@ def _train_and_publish(
     run.complete()
 
 
-def _parent(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interface: Interface) -> VersionRow:
-    """Return the version to continue from, which must fit the league and its network."""
-    if ref.league != config.league:
-        raise ConfigError(f"--from: {ref} belongs to another league than {config.league}")
-    version = registry.versions.resolve(ref)
-    if version.mixture is not None:
-        raise ConfigError(f"--from: {version.ref} is a mixture ({version.mixture}): start from one of its members")
-    if version.manifest.interface.digest() != interface.digest():
-        raise InterfaceChanged(f"{version.ref} has other spaces or policies than the environment now")
-    check_network(version, config)
-    return version
-
-
 def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interface: Interface) -> str:
     """Return the version that an exploiter is trained against, which must be able to play in the league now."""
     if len(interface.sides) < 2:
         raise ConfigError(f"--against: league {config.league} has one side only, so a version has no opponent")
     check_eligible(str(ref), registry, config)
     return registry.versions.resolve(ref).ref
-
-
-def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueConfig) -> CheckpointRef | None:
-    """Return the version that an exploiter starts from: `ref`, or None if that cannot be trained further.
-
-    It was imported, has another network than `config` defines, or its training state was removed.
-    """
-    version = registry.versions.resolve(ref)
-    try:
-        check_network(version, config.against(version.ref))
-    except ConfigError:
-        return None
-    return ref if registry.versions.has_training(version) else None
-
-
-def start_of_night(registry: Registry, ref: CheckpointRef) -> CheckpointRef | None:
-    """Return the version that a night's training starts from: `ref`, or if that was imported, the newest version of its
-    league that can be trained further. None if there is none.
-    """
-    if registry.versions.resolve(ref).manifest.algorithm in ALGORITHMS:
-        return ref
-    for version in reversed(registry.versions.all(ref.league)):
-        trained = version.exploits is None and version.manifest.algorithm in ALGORITHMS
-        if trained and registry.versions.has_training(version):
-            return CheckpointRef(version.league, version.number)
-    return None
-
-
-def check_network(version: VersionRow, config: LeagueConfig) -> None:
-    """Raise ConfigError if `config` defines another network than the version. Missing settings have defaults."""
-    if version.manifest.algorithm not in ALGORITHMS:
-        raise ConfigError(f"{version.ref} was {version.manifest.algorithm}: it has no training state to start from")
-    try:
-        settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
-    except ValidationError as error:
-        raise ConfigError(f"{version.ref} was trained with settings of another release") from error
-    before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
-    for key in NETWORK_SETTINGS:
-        # Each algorithm has a subset of them.
-        if (was := before.get(key)) != (wanted := now.get(key)):
-            raise ConfigError(f"training.{key}: {version.ref} was trained with {was}, got {wanted}")
 
 
 def _publish_remaining(run: RunDirectory, publisher: PublishQueue) -> None:

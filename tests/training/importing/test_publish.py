@@ -16,7 +16,7 @@ from tests.support.policies.foreign_graphs import foreign
 from training.importing import checks
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
-from training.runs.train import check_network
+from training.runs.parent import check_network
 
 
 @pytest.fixture(autouse=True)

@@ -25,7 +25,8 @@ from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
 from training.export import publish as publishing
-from training.runs.train import check_network, train
+from training.runs.parent import check_network
+from training.runs.train import train
 
 SETTINGS = {"runners": 1, "train_batch_size": 256, "minibatch_size": 128, "epochs": 1, "checkpoint_every": 512}
 LEAGUE = tictactoe(steps=1024, **SETTINGS)

@@ -11,7 +11,7 @@ from league.registry.storage.manifest import EXPLOITER, Manifest
 from league.settings import Storage
 from tests.support.leagues import registries
 from tests.support.leagues.registries import LEAGUE
-from training.runs.train import start_of_night
+from training.runs.parent import start_of_night
 
 
 @pytest.fixture

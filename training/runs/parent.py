@@ -1,0 +1,72 @@
+"""Which version a run may continue from: it must fit the league and the network of the configuration."""
+
+from pydantic import TypeAdapter, ValidationError
+
+from league.config.algorithms import ALGORITHMS, AnyTraining, TrainingConfig
+from league.config.league import LeagueConfig
+from league.errors import ConfigError, InterfaceChanged
+from league.interface import Interface
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.registry.storage.rows import VersionRow
+
+NETWORK_SETTINGS = (
+    *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
+    *("dueling", "noisy", "distributional"),
+    *("mixer", "mixing_width", "groups"),
+)
+"""Settings that define the network: a version's weights require the same values."""
+
+
+def parent_version(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interface: Interface) -> VersionRow:
+    """Return the version to continue from, which must fit the league and its network."""
+    if ref.league != config.league:
+        raise ConfigError(f"--from: {ref} belongs to another league than {config.league}")
+    version = registry.versions.resolve(ref)
+    if version.mixture is not None:
+        raise ConfigError(f"--from: {version.ref} is a mixture ({version.mixture}): start from one of its members")
+    if version.manifest.interface.digest() != interface.digest():
+        raise InterfaceChanged(f"{version.ref} has other spaces or policies than the environment now")
+    check_network(version, config)
+    return version
+
+
+def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueConfig) -> CheckpointRef | None:
+    """Return the version that an exploiter starts from: `ref`, or None if that cannot be trained further.
+
+    It was imported, has another network than `config` defines, or its training state was removed.
+    """
+    version = registry.versions.resolve(ref)
+    try:
+        check_network(version, config.against(version.ref))
+    except ConfigError:
+        return None
+    return ref if registry.versions.has_training(version) else None
+
+
+def start_of_night(registry: Registry, ref: CheckpointRef) -> CheckpointRef | None:
+    """Return the version that a night's training starts from: `ref`, or if that was imported, the newest version of its
+    league that can be trained further. None if there is none.
+    """
+    if registry.versions.resolve(ref).manifest.algorithm in ALGORITHMS:
+        return ref
+    for version in reversed(registry.versions.all(ref.league)):
+        trained = version.exploits is None and version.manifest.algorithm in ALGORITHMS
+        if trained and registry.versions.has_training(version):
+            return CheckpointRef(version.league, version.number)
+    return None
+
+
+def check_network(version: VersionRow, config: LeagueConfig) -> None:
+    """Raise ConfigError if `config` defines another network than the version. Missing settings have defaults."""
+    if version.manifest.algorithm not in ALGORITHMS:
+        raise ConfigError(f"{version.ref} was {version.manifest.algorithm}: it has no training state to start from")
+    try:
+        settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
+    except ValidationError as error:
+        raise ConfigError(f"{version.ref} was trained with settings of another release") from error
+    before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
+    for key in NETWORK_SETTINGS:
+        # Each algorithm has a subset of them.
+        if (was := before.get(key)) != (wanted := now.get(key)):
+            raise ConfigError(f"training.{key}: {version.ref} was trained with {was}, got {wanted}")
