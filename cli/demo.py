@@ -74,7 +74,7 @@ def _train(config: "LeagueConfig", minutes: float) -> None:
 
 
 def _evaluate(config: "LeagueConfig") -> None:
-    from cli.nightly import run_nightly
+    from cli.evaluation.nightly import run_nightly
 
     _step(2, "Evaluate: each new version plays the champion in pairs of games with sides swapped.")
     say("A sequential test (GSPRT) decides when to stop: promote, reject or undecided.")

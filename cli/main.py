@@ -29,10 +29,12 @@ PANELS = {
         "doctor": Subcommand("cli.doctor:doctor", "Check packages, CPU, GPU, disk, registry, Ray and HAProxy."),
     },
     "Train": {
-        "check-env": Subcommand("cli.training:check_env", "Test a league's environment against the contract."),
-        "train": Subcommand("cli.training:train", "Train a league's policies and publish versions."),
-        "runs": Subcommand("cli.training:runs", "List a league's training runs, newest first."),
-        "sweep": Subcommand("cli.training:sweep", "Train with each combination of settings and report the best."),
+        "check-env": Subcommand(
+            "cli.training.check_env:check_env", "Test a league's environment against the contract."
+        ),
+        "train": Subcommand("cli.training.train:train", "Train a league's policies and publish versions."),
+        "runs": Subcommand("cli.training.runs:runs", "List a league's training runs, newest first."),
+        "sweep": Subcommand("cli.training.sweep:sweep", "Train with each combination of settings and report the best."),
     },
     "Leagues": {
         "init": Subcommand("cli.leagues.init:init", "Write a commented configuration that fits an environment."),
@@ -46,35 +48,53 @@ PANELS = {
         "remove": Subcommand("cli.leagues.removal:remove", "Remove a league, or one of its versions, with all files."),
     },
     "Evaluate": {
-        "evaluate": Subcommand("cli.evaluation:evaluate", "Play a tournament; print leaderboard and payoff matrix."),
-        "exploitability": Subcommand(
-            "cli.exploitability:exploitability", "Play a version against its exploiters; print their scores."
+        "evaluate": Subcommand(
+            "cli.evaluation.evaluate:evaluate", "Play a tournament; print leaderboard and payoff matrix."
         ),
-        "nightly": Subcommand("cli.nightly:nightly", "Test new versions, promote the best and update the ratings."),
-        "report": Subcommand("cli.report:report", "Write a league's leaderboard, verdicts and upsets as one page."),
-        "replay": Subcommand("cli.replay:replay", "Record a game as an animated image, or show it in a window."),
-        "verify": Subcommand("cli.verdicts:verify", "Recompute a verdict from the ledger and compare the results."),
-        "void": Subcommand("cli.verdicts:void", "Void a verdict, whether its test is running or complete."),
+        "exploitability": Subcommand(
+            "cli.evaluation.exploitability:exploitability", "Play a version against its exploiters; print their scores."
+        ),
+        "nightly": Subcommand(
+            "cli.evaluation.nightly:nightly", "Test new versions, promote the best and update the ratings."
+        ),
+        "report": Subcommand(
+            "cli.evaluation.report:report", "Write a league's leaderboard, verdicts and upsets as one page."
+        ),
+        "replay": Subcommand(
+            "cli.evaluation.replay:replay", "Record a game as an animated image, or show it in a window."
+        ),
+        "verify": Subcommand(
+            "cli.evaluation.verdicts:verify", "Recompute a verdict from the ledger and compare the results."
+        ),
+        "void": Subcommand("cli.evaluation.verdicts:void", "Void a verdict, whether its test is running or complete."),
     },
     "Versions": {
-        "versions": Subcommand("cli.versions:versions", "List a league's versions with their aliases and ratings."),
-        "history": Subcommand("cli.versions:history", "Show when and why an alias moved, and who moved it."),
-        "note": Subcommand("cli.versions:note", "Set or clear the note of a version."),
-        "import": Subcommand("cli.importing:import_model", "Publish a model that was trained elsewhere as a version."),
-        "export": Subcommand("cli.exporting:export", "Write the ONNX files and the manifest of a version."),
-        "promote": Subcommand(
-            "cli.versions:promote", "Make a version or a mixture the champion, or move another alias to it."
+        "versions": Subcommand(
+            "cli.versions.listing:versions", "List a league's versions with their aliases and ratings."
         ),
-        "retire": Subcommand("cli.retire:retire", "Remove files of old versions, and old access logs."),
-        "mixture": Subcommand("cli.versions:mixture", "Point an alias to the equilibrium of a league, or show it."),
-        "rollback": Subcommand("cli.versions:rollback", "Restore the previous champion."),
+        "history": Subcommand("cli.versions.aliases:history", "Show when and why an alias moved, and who moved it."),
+        "note": Subcommand("cli.versions.listing:note", "Set or clear the note of a version."),
+        "import": Subcommand(
+            "cli.versions.importing:import_model", "Publish a model that was trained elsewhere as a version."
+        ),
+        "export": Subcommand("cli.versions.exporting:export", "Write the ONNX files and the manifest of a version."),
+        "promote": Subcommand(
+            "cli.versions.aliases:promote", "Make a version or a mixture the champion, or move another alias to it."
+        ),
+        "retire": Subcommand("cli.versions.retire:retire", "Remove files of old versions, and old access logs."),
+        "mixture": Subcommand(
+            "cli.versions.aliases:mixture", "Point an alias to the equilibrium of a league, or show it."
+        ),
+        "rollback": Subcommand("cli.versions.aliases:rollback", "Restore the previous champion."),
     },
     "Serve": {
-        "serve": Subcommand("cli.serving:serve", "Serve all leagues over HTTP and gRPC until Ctrl-C."),
-        "act": Subcommand("cli.serving:act", "Request one action from a policy server, or compute it locally."),
-        "traffic": Subcommand("cli.traffic:traffic", "Show or set the canary and the shadow of a league."),
-        "replicas": Subcommand("cli.replicas:replicas", "List the serving replicas, or remove one that has ended."),
-        "keys": Subcommand("cli.keys:app", "Create, list and revoke API keys."),
+        "serve": Subcommand("cli.serving.serve:serve", "Serve all leagues over HTTP and gRPC until Ctrl-C."),
+        "act": Subcommand("cli.serving.act:act", "Request one action from a policy server, or compute it locally."),
+        "traffic": Subcommand("cli.serving.traffic:traffic", "Show or set the canary and the shadow of a league."),
+        "replicas": Subcommand(
+            "cli.serving.replicas:replicas", "List the serving replicas, or remove one that has ended."
+        ),
+        "keys": Subcommand("cli.serving.keys:app", "Create, list and revoke API keys."),
     },
 }
 SUBCOMMANDS = {name: subcommand for panel in PANELS.values() for name, subcommand in panel.items()}

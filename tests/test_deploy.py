@@ -330,7 +330,7 @@ def test_a_training_night_writes_versions_and_keeps_its_runs_on_the_volume() -> 
 
 
 def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
-    from cli.nightly import BUSY, FAULTS
+    from cli.evaluation.nightly import BUSY, FAULTS
 
     for job in JOBS:
         (rule,) = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]

@@ -95,12 +95,7 @@ def train(
             works on; a cluster whose machines do not share storage; a fault of the environment; an export that fails
             its parity check (earlier versions stay).
     """
-    if resume and parent is not None:
-        raise ConfigError("a resumed run already has its parent: use either --from or --resume")
-    if (target is not None) != (role == EXPLOITER and not resume):
-        raise ConfigError(
-            "--role exploiter and --against belong together, except in a resumed run, which keeps its target"
-        )
+    _check_options(parent, role, target, resume)
     silence_tune()
     interface = interface_of(config)
     check(config, interface)
@@ -111,18 +106,15 @@ def train(
         config = config.against(exploits)
         check(config, interface)
     start = None if parent is None else parent_version(registry, parent, config, interface)
-    if resume:
-        interrupted: RunDirectory | None = RunDirectory.resume(registry, config, role)
-    else:
-        interrupted = None if name is None else RunDirectory.find(registry, config, name)
-    if interrupted is not None and interrupted.record.complete:
+    earlier = _earlier_run(registry, config, role, resume, name)
+    if earlier is not None and earlier.record.complete:
         # Its driver may have died between the end of training and its last report.
         with suppress(UnknownRun):
-            registry.runs.end(config.league, interrupted.id, "ended")
-        return published_versions(registry, interrupted)
-    pins = {} if interrupted else pin_opponents(config, registry, interface)
+            registry.runs.end(config.league, earlier.id, "ended")
+        return published_versions(registry, earlier)
+    pins = {} if earlier else pin_opponents(config, registry, interface)
     with connected(address, registry.storage, local) as dashboard:
-        run = interrupted or RunDirectory.begin(
+        run = earlier or RunDirectory.begin(
             registry.storage,
             config,
             None if start is None else start.number,
@@ -140,6 +132,25 @@ def train(
                 _train_and_publish(run, registry, interface, progress, reporter, strength)
             strength.join()
     return published_versions(registry, run)
+
+
+def _check_options(parent: CheckpointRef | None, role: Role, target: CheckpointRef | None, resume: bool) -> None:
+    """Raise ConfigError for options that exclude each other."""
+    if resume and parent is not None:
+        raise ConfigError("a resumed run already has its parent: use either --from or --resume")
+    if (target is not None) != (role == EXPLOITER and not resume):
+        raise ConfigError(
+            "--role exploiter and --against belong together, except in a resumed run, which keeps its target"
+        )
+
+
+def _earlier_run(
+    registry: Registry, config: LeagueConfig, role: Role, resume: bool, name: str | None
+) -> RunDirectory | None:
+    """Return the run to continue: the newest one of this role, or that with this id. None to begin a new one."""
+    if resume:
+        return RunDirectory.resume(registry, config, role)
+    return None if name is None else RunDirectory.find(registry, config, name)
 
 
 def _describe(

@@ -2,7 +2,7 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from cli.serving import hints
+from cli.serving.serve import hints
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.command import League

@@ -10,7 +10,7 @@ def test_a_league_is_reported_on_one_page(
     league: League, registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     league("evaluate", "tictactoe", "--blocks", "4", "--workers", "0")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     monkeypatch.chdir(tmp_path)
     result = league("report", "tictactoe")
     assert result.code == 0, result.err

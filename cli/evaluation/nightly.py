@@ -3,14 +3,15 @@
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cli.interrupt import exit_on_interrupt
 from cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
 from cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
-from cli.training import exit_on_interrupt
 from configs import find, names
 from league.errors import AlreadyRunning, ConfigError, LeagueError, UnknownLeague, one_line
 from league.files import disk_errors
@@ -67,44 +68,75 @@ def nightly(
     holds the lock of a league.
     """
     from evaluation.reporting.webhook import deliver
-    from league.ray_cluster import ray_session
 
-    configs, at_once = _configs(leagues or ()), workers_for(workers, address)
-    reports, nights, faults, invalid, busy = [], [], list[str](), list[str](), False
+    configs, at_once, outcome = _configs(leagues or ()), workers_for(workers, address), _Outcome()
     for config in configs:
         try:
-            with ray_session(address):
-                if train:
-                    night, report = run_training_night(config, at_once, quiet=as_json)
-                    nights.append(night)
-                else:
-                    report = run_nightly(config, at_once, quiet=as_json)
+            _run(config, train, at_once, address, as_json, outcome)
         except LeagueError as error:
             # The remaining leagues are still processed.
-            sentence = f"{config.league}: {one_line(error)}"
-            match error:
-                case AlreadyRunning():
-                    busy = True
-                case ConfigError():
-                    invalid.append(sentence)
-                case _:
-                    faults.append(sentence)
-            complain(f"league: {sentence}")
-            continue
-        if train:
-            faults += [f"{config.league}: {fault}" for fault in faults_of(nights[-1])]
-        if report is not None:
-            reports.append(report)
-            faults += [f"{config.league}: {fault}" for fault in report.faults]
+            outcome.fail(config.league, error)
     if as_json:
-        documents = {"nights": [night_document(night) for night in nights]} if train else {}
-        emit({"leagues": [report.to_json() for report in reports], "faults": [*faults, *invalid]} | documents)
-    summary = [sentence for report in reports for sentence in summary_of(report)]
-    summary += [sentence for night in nights for sentence in summary_of_night(night)]
+        documents = {"nights": [night_document(night) for night in outcome.nights]} if train else {}
+        emit({"leagues": [report.to_json() for report in outcome.reports], "faults": outcome.errors} | documents)
     if webhook:
-        deliver(webhook, [*summary, *faults, *invalid], reports)
-    if faults or invalid or busy:
-        sys.exit(FAULTS if faults else INVALID if invalid else BUSY)
+        deliver(webhook, [*outcome.summary(), *outcome.errors], outcome.reports)
+    if outcome.exit_code:
+        sys.exit(outcome.exit_code)
+
+
+@dataclass(slots=True)
+class _Outcome:
+    """The results and errors of all leagues."""
+
+    reports: "list[NightlyReport]" = field(default_factory=list)
+    nights: "list[TrainingNightRow]" = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    invalid: list[str] = field(default_factory=list)
+    busy: bool = False
+
+    @property
+    def errors(self) -> list[str]:
+        return [*self.faults, *self.invalid]
+
+    @property
+    def exit_code(self) -> int:
+        return FAULTS if self.faults else INVALID if self.invalid else BUSY if self.busy else 0
+
+    def fail(self, league: str, error: LeagueError) -> None:
+        """Print and record why a league's run ended early."""
+        sentence = f"{league}: {one_line(error)}"
+        match error:
+            case AlreadyRunning():
+                self.busy = True
+            case ConfigError():
+                self.invalid.append(sentence)
+            case _:
+                self.faults.append(sentence)
+        complain(f"league: {sentence}")
+
+    def summary(self) -> list[str]:
+        """Summarise the results, one sentence each."""
+        sentences = [sentence for report in self.reports for sentence in summary_of(report)]
+        return sentences + [sentence for night in self.nights for sentence in summary_of_night(night)]
+
+
+def _run(
+    config: "LeagueConfig", train: bool, workers: int | None, address: str | None, quiet: bool, outcome: _Outcome
+) -> None:
+    """Process one league, and add its results and the errors of its steps to `outcome`."""
+    from league.ray_cluster import ray_session
+
+    with ray_session(address):
+        if train:
+            night, report = run_training_night(config, workers, quiet)
+            outcome.nights.append(night)
+            outcome.faults += [f"{config.league}: {fault}" for fault in faults_of(night)]
+        else:
+            report = run_nightly(config, workers, quiet)
+    if report is not None:
+        outcome.reports.append(report)
+        outcome.faults += [f"{config.league}: {fault}" for fault in report.faults]
 
 
 def run_nightly(config: "LeagueConfig", workers: int | None = CORES, quiet: bool = False) -> "NightlyReport":

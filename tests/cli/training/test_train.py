@@ -12,7 +12,7 @@ import httpx
 import pytest
 import yaml
 
-from cli.training import next_step
+from cli.training.train import next_step
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.runtime.haproxy import free_ports

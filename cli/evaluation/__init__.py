@@ -1,0 +1,1 @@
+"""Commands that play, judge and report."""
