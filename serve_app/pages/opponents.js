@@ -6,6 +6,7 @@ import { Table } from "./components.js";
 import { percent, shortRef } from "./format.js";
 
 const PREFIX = "opponents/";
+const RARE = 0.0005;
 const METRICS = [["share", "Share of the episodes"], ["score", "Score of the learner"]];
 
 export const isOpponentCurve = (name) => name.startsWith(PREFIX);
@@ -21,7 +22,7 @@ export function Opponents({ curves, points }) {
       ${latest.map(({ ref, share, score }) => html`<tr key=${ref}><th scope="row"><span class="ref">${shortRef(ref)}</span></th>
         <td class="number">${percent(share)}</td><td class="number">${percent(score)}</td></tr>`)}
     <//>
-    <p class="muted small">The remaining episodes are self-play. Scores are estimates from recent training games, in which a draw counts ½.</p>
+    <p class="muted small">The remaining episodes are self-play. Shares and scores are estimates from recent training games, in which a draw counts ½.</p>
     ${x.length > 0 && html`<div class="curves">${METRICS.map(([metric, name]) => html`<${MetricChart} key=${metric} name=${name} x=${x}
       lines=${latest.map(({ ref }) => ({ name: shortRef(ref), values: points.map((point) => point.curves[`${PREFIX}${ref}/${metric}`] ?? null) }))} />`)}</div>`}
   </section>`;
@@ -33,7 +34,7 @@ function MetricChart({ name, x, lines }) {
     <${DataTable} x=${x} lines=${lines} xName="steps" caption=${name} format=${percent} /></article>`;
 }
 
-/** [{ref, share, score}], the most frequent first. */
+/** [{ref, share, score}] of recent episodes, the most frequent first. */
 function opponentsOf(curves) {
   const found = new Map();
   for (const [name, value] of Object.entries(curves)) {
@@ -42,5 +43,6 @@ function opponentsOf(curves) {
     const ref = name.slice(PREFIX.length, end);
     found.set(ref, { ref, ...found.get(ref), [name.slice(end + 1)]: value });
   }
-  return [...found.values()].sort((one, other) => (other.share ?? 0) - (one.share ?? 0));
+  // Opponents that are no longer drawn have a share that approaches 0.
+  return [...found.values()].filter(({ share }) => (share ?? 0) >= RARE).sort((one, other) => (other.share ?? 0) - (one.share ?? 0));
 }

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.utils.metrics import NUM_EPISODES
 
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
@@ -20,7 +19,7 @@ from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvR
 from training.sampling.self_play import OPPONENTS, SCORE
 
 SHARE = "share"
-"""Metric of an opponent: its share of the finished episodes."""
+"""Metric of an opponent: its share of the recent episodes."""
 
 
 class LeagueAlgorithm(NoResultsDirectory, Algorithm):
@@ -52,10 +51,10 @@ class LeagueAlgorithm(NoResultsDirectory, Algorithm):
 
         results: the runners' metrics. actions: of all agents in the update.
         """
-        episodes = sum(float(result[NUM_EPISODES]) for result in results)
-        for ref, games in self.opponents.add(results, actions).items():
+        self.opponents.add(results, actions)
+        for ref, share in self.opponents.shares().items():
             self.metrics.log_value((OPPONENTS, ref, SCORE), self.opponents.score(ref), window=1)
-            self.metrics.log_value((OPPONENTS, ref, SHARE), games / max(episodes, 1.0), window=1)
+            self.metrics.log_value((OPPONENTS, ref, SHARE), share, window=1)
         self.opponents.draw()
 
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from ray.rllib.utils.metrics import NUM_EPISODES
 
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
@@ -40,6 +41,7 @@ class LeagueOpponents:
         self.candidates: tuple[str, ...] = ()
         """Versions by age, the newest last."""
         self._scores: Scores = {}
+        self._episodes = 0.0
         self._priors: dict[str, float] = {}
         self._rows: dict[str, Scores] = {}
         self._unpublished: dict[str, Scores] = {}
@@ -70,23 +72,26 @@ class LeagueOpponents:
         games, score = self._scores.get(ref, (0.0, 0.0))
         return shrunk(games, score, self._priors.get(ref, UNKNOWN))
 
-    def add(self, results: Sequence[Mapping[str, Any]], actions: int) -> dict[str, float]:
-        """Add the games in the metrics of all runners, and return their number by opponent.
+    def shares(self) -> dict[str, float]:
+        """Return each opponent's share of the recent episodes, 0 for those that were not drawn for long."""
+        return {ref: games / max(self._episodes, 1.0) for ref, (games, _) in self._scores.items()}
+
+    def add(self, results: Sequence[Mapping[str, Any]], actions: int) -> None:
+        """Add the episodes in the metrics of all runners, and the games against opponents among them.
 
         actions: of all agents since the last call.
         """
         decay = 0.5 ** (actions / HALF_LIFE)
         self._scores = {ref: (games * decay, score * decay) for ref, (games, score) in self._scores.items()}
-        played: dict[str, float] = {}
+        self._episodes *= decay
         for result in results:
+            self._episodes += float(result[NUM_EPISODES])
             for ref, values in result.get(OPPONENTS, {}).items():
                 new, won = float(values[GAMES]), float(values[SCORE])
                 if isnan(new) or not new:
                     continue  # RLlib keeps the keys of earlier updates.
                 games, score = self._scores.get(ref, (0.0, 0.0))
                 self._scores[ref] = games + new, score + won
-                played[ref] = played.get(ref, 0.0) + new
-        return played
 
     def refresh(self, *, checkpoint: str | None = None, parent: int | None = None) -> None:
         """Read the candidates and their results from the registry.
@@ -130,6 +135,7 @@ class LeagueOpponents:
         return {
             "candidates": self.candidates,
             "scores": self._scores,
+            "episodes": self._episodes,
             "priors": self._priors,
             "rows": self._rows,
             "unpublished": self._unpublished,
@@ -140,6 +146,8 @@ class LeagueOpponents:
         """Restore what `get_state` returned."""
         self.candidates, self._payoff = state["candidates"], state["payoff"]
         self._scores, self._priors = dict(state["scores"]), dict(state["priors"])
+        # Checkpoints of earlier releases have the games only.
+        self._episodes = state.get("episodes", sum(games for games, _ in self._scores.values()))
         self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
 
     def _versions(self, registry: Registry) -> dict[str, str]:

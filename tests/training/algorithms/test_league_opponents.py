@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ray.rllib.utils.metrics import NUM_EPISODES
 
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
@@ -28,10 +29,10 @@ def opponents_of(registry: Registry, fixed: tuple[str, ...] = (), **league: Any)
     return LeagueOpponents(config, registries.interface(), registry.storage)
 
 
-def metrics(**results: tuple[float, float]) -> list[dict[str, Any]]:
-    """Of one runner: version number → (games, score)."""
+def metrics(episodes: float = 0.0, **results: tuple[float, float]) -> list[dict[str, Any]]:
+    """Of one runner: its episodes, and version number → (games, score)."""
     played = {f"tictactoe@{ref[1:]}": {"games": games, "score": score} for ref, (games, score) in results.items()}
-    return [{"opponents": played}]
+    return [{NUM_EPISODES: episodes, "opponents": played}]
 
 
 def publish_exploiter(registry: Registry, source: str, target: str) -> None:
@@ -102,11 +103,23 @@ def test_versions_with_another_interface_are_no_candidates(registry: Registry) -
 
 def test_scores_decay_towards_the_prior(registry: Registry) -> None:
     opponents = opponents_of(registry)
-    assert opponents.add(metrics(v1=(20.0, 20.0), v2=(float("nan"), 0.0)), 100) == {"tictactoe@1": 20.0}
+    opponents.add(metrics(v1=(20.0, 20.0), v2=(float("nan"), 0.0)), 100)
     assert opponents.score("tictactoe@1") == pytest.approx((20 + PRIOR_GAMES / 2) / (20 + PRIOR_GAMES))
     opponents.add([], HALF_LIFE)
     assert opponents.score("tictactoe@1") == pytest.approx((10 + PRIOR_GAMES / 2) / (10 + PRIOR_GAMES))
     assert opponents.score("tictactoe@2") == pytest.approx(0.5)
+
+
+def test_the_shares_of_opponents_that_are_no_longer_drawn_vanish(registry: Registry) -> None:
+    opponents = opponents_of(registry)
+    opponents.add(metrics(100.0, v1=(50.0, 20.0)), 0)
+    assert opponents.shares() == {"tictactoe@1": 0.5}
+    restored = opponents_of(registry)
+    restored.set_state(opponents.get_state())
+    for each in (opponents, restored):
+        for _ in range(20):
+            each.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
+        assert each.shares() == pytest.approx({"tictactoe@1": 0.0, "tictactoe@2": 0.5}, abs=1e-5)
 
 
 def test_the_learners_scores_become_those_of_its_checkpoint(registry: Registry) -> None:
