@@ -1,7 +1,6 @@
 """`league nightly`: gate and promotion of new versions, run by a scheduler."""
 
 import sys
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -13,7 +12,16 @@ from cli.interrupt import exit_on_interrupt
 from cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
 from cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
 from configs import find, names
-from league.errors import AlreadyRunning, ConfigError, LeagueError, UnknownLeague, one_line
+from league.errors import (
+    AlreadyRunning,
+    ConfigError,
+    InvalidInput,
+    LeagueArchived,
+    LeagueError,
+    NotFound,
+    UnknownLeague,
+    one_line,
+)
 from league.files import disk_errors
 from league.refs import check_slug
 from league.settings import Storage
@@ -69,13 +77,17 @@ def nightly(
     """
     from evaluation.reporting.webhook import deliver
 
-    configs, at_once, outcome = _configs(leagues or ()), workers_for(workers, address), _Outcome()
-    for config in configs:
+    registry, at_once, outcome = open_registry(), workers_for(workers, address), _Outcome()
+    for name in leagues or _registered(registry):
+        league = name
         try:
+            # Read when its turn comes: other leagues may take hours, in which it may be registered again.
+            config = _config(registry, name)
+            league = config.league
             _run(config, train, at_once, address, as_json, outcome)
         except LeagueError as error:
             # The remaining leagues are still processed.
-            outcome.fail(config.league, error)
+            outcome.fail(league, error)
     if as_json:
         documents = {"nights": [night_document(night) for night in outcome.nights]} if train else {}
         emit({"leagues": [report.to_json() for report in outcome.reports], "faults": outcome.errors} | documents)
@@ -104,12 +116,15 @@ class _Outcome:
         return FAULTS if self.faults else INVALID if self.invalid else BUSY if self.busy else 0
 
     def fail(self, league: str, error: LeagueError) -> None:
-        """Print and record why a league's run ended early."""
+        """Print and record why a league's run ended early. An archived league is not an error."""
         sentence = f"{league}: {one_line(error)}"
         match error:
+            case LeagueArchived():
+                complain(f"{league} is skipped: {one_line(error)}")
+                return
             case AlreadyRunning():
                 self.busy = True
-            case ConfigError():
+            case InvalidInput() | NotFound():
                 self.invalid.append(sentence)
             case _:
                 self.faults.append(sentence)
@@ -311,19 +326,11 @@ def _gain(gain: "Confirmation") -> str:
     )
 
 
-def _configs(named: Sequence[str]) -> "list[LeagueConfig]":
-    """Return the configurations of the named leagues and files; if none is named, of all that are not archived."""
-    registry = open_registry()
-    if not named:
-        rows = registry.leagues.all()
-        for row in rows:
-            if row.archived_at is not None:
-                complain(f"{row.slug} is archived and skipped.")
-        found = [row.config for row in rows if row.archived_at is None]
-        if not rows:
-            say("No league is registered yet. Name a configuration, such as connect_four or a YAML file.")
-        return found
-    return [_config(registry, name) for name in named]
+def _registered(registry: "Registry") -> list[str]:
+    """The names of all registered leagues."""
+    if not (registered := list(registry.leagues.names())):
+        say("No league is registered yet. Name a configuration, such as connect_four or a YAML file.")
+    return registered
 
 
 def _config(registry: "Registry", name: str) -> "LeagueConfig":

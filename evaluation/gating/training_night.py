@@ -138,12 +138,16 @@ def _gate(night: _Night) -> dict[str, Any]:
 
 
 def _nightly_run(night: _Night) -> NightlyReport:
-    """Run the gate, once no other nightly run of the league is active."""
+    """Run the gate, once no other nightly run of the league is active.
+
+    The configuration is the one that is registered now: a person may have changed it while the night trained.
+    """
     waits = False
     while True:
+        config = night.registry.leagues.get(night.config.league).config
         try:
             return nightly(
-                night.config, registry=night.registry, train=night.train, workers=night.workers, listener=night.listener
+                config, registry=night.registry, train=night.train, workers=night.workers, listener=night.listener
             )
         except AlreadyRunning as error:
             if not waits:

@@ -155,7 +155,9 @@ def conclude(
     seen = gate_result(registry, verdict)
     if verdict.outcome is not None:
         return report_of(registry, verdict, verdict.outcome, seen, (verdict.evidence or {}).get("note"))
-    if seen.outcome != "promote" and (obstacle := _obstacle(registry, verdict)) is not None:
+    # Whether the champion moved before a promotion is decided when it moves.
+    obstacle = _changed_conditions(registry, verdict) if seen.outcome == "promote" else _obstacle(registry, verdict)
+    if obstacle is not None:
         return _close(registry, verdict, VOID, seen, note=obstacle)
     assert seen.outcome is not None, "a schedule ends with its test"
     refused = promote(registry, verdict, _reason(verdict, seen)) if seen.outcome == "promote" else seen.note
@@ -228,15 +230,22 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
     if now != tested_champion(verdict):
         holder = "there is no champion" if now is None else f"the champion is {verdict.league}@{now}"
         return f"{holder} now, but the test was against {verdict.champion}"
-    then, current = (
-        Ledger(registry).schedule(verdict.schedule).conditions,
-        registry.leagues.get(verdict.league).conditions,
-    )
-    if then.game_digest != current.game_digest:
-        return "the league's game has changed"
-    if then.actions != current.actions:
-        return f"the league plays with {current.actions} actions now, but the test was with {then.actions} ones"
+    if (changed := _changed_conditions(registry, verdict)) is not None:
+        return changed
     return None if now is None else _below_floor(registry, verdict, now)
+
+
+def _changed_conditions(registry: Registry, verdict: VerdictRow) -> str | None:
+    """Why the games of this verdict do not count any more: the league's game or selection of actions has changed."""
+    if is_applied(registry, verdict):
+        return None
+    then = Ledger(registry).schedule(verdict.schedule).conditions
+    now = registry.leagues.get(verdict.league).conditions
+    if then.game_digest != now.game_digest:
+        return "the league's game has changed"
+    if then.actions != now.actions:
+        return f"the league plays with {now.actions} actions now, but the test was with {then.actions} ones"
+    return None
 
 
 def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str | None:

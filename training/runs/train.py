@@ -58,8 +58,8 @@ def train(
 ) -> list[VersionRow]:
     """Train `config` until its budget (`training.steps`, `training.minutes`) is spent.
 
-    Registers the league, runs one Ray Tune trial, shows its progress, records it in the registry, writes TensorBoard
-    files to `<home>/runs/<league>/<run>`, and publishes a version at each checkpoint.
+    Registers the league unless the run has a `name`, runs one Ray Tune trial, shows its progress, records it in the
+    registry, writes TensorBoard files to `<home>/runs/<league>/<run>`, and publishes a version at each checkpoint.
 
     If a node of the cluster is lost, the run continues on the others from its newest version. If one is drained, or
     nodes join that make it faster, its state is published and it continues from there.
@@ -79,7 +79,7 @@ def train(
             saved on this machine but not published are published first. With a checkpoint interval in steps and one
             runner, the versions equal those of an uninterrupted run.
         name: The id of the run, by default a new one. A run with this id continues with the settings that it began
-            with; if it is complete, nothing is trained.
+            with; if it is complete, nothing is trained. Its league must be registered.
         address: A running Ray cluster. None uses the Ray that this process is connected to, or starts one.
         local: Limits of a Ray that is started; it ends with the run.
         config_path: The file of `config`; its git commit is recorded in the manifests.
@@ -100,7 +100,9 @@ def train(
     interface = interface_of(config)
     check(config, interface)
     check_contestants(config, interface, registry)
-    registry.leagues.register(config, interface)
+    if name is None:
+        # A run with an id has other settings than its league: the seed of a night, the budget of an exploiter.
+        registry.leagues.register(config, interface)
     exploits = None if target is None else _target(registry, target, config, interface)
     if exploits is not None:
         config = config.against(exploits)

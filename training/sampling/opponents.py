@@ -14,6 +14,7 @@ from league.interface import Interface
 from league.policies.bots import Bot
 from league.policies.loading import contestant, players
 from league.policies.onnx import OnnxPolicy
+from league.policies.open_inference import OpenInferencePolicy
 from league.policies.policy import Policy
 from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
@@ -183,7 +184,7 @@ class Opponents:
         for policy_id, policy in loaded.items():
             opponent = OpponentPolicy(ref, policy_id)
             self._policies[opponent] = policy
-            if isinstance(policy, OnnxPolicy | Bot) and (initial := policy.initial_state(1)):
+            if isinstance(policy, OnnxPolicy | OpenInferencePolicy | Bot) and (initial := policy.initial_state(1)):
                 first = {key: np.asarray(rows[0], rows.dtype) for key, rows in initial.items()}
                 self._recurrent_states[opponent] = RecurrentStates(first, self._num_envs, len(self._interface.agents))
 

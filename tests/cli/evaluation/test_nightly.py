@@ -115,6 +115,19 @@ def test_a_failing_league_does_not_affect_the_others(league: League, registry: R
     assert "tictactoe: 3 tested" in failed.out
 
 
+def test_unknown_and_archived_leagues_do_not_prevent_the_others(league: League, registry: Registry) -> None:
+    idle = registry.leagues.get("tictactoe")
+    registry.leagues.register(idle.config.model_copy(update={"league": "idle"}), idle.interface)
+    registry.leagues.archive("idle")
+    result = league("nightly", "idle", "nothing", "tictactoe", "--workers", "0", "--json")
+    assert result.code == 2
+    assert result.err.startswith("idle is skipped: league idle is archived")
+    assert "league: nothing: " in result.err
+    assert [report["league"] for report in result.json["leagues"]] == ["tictactoe"]
+    assert len(result.json["faults"]) == 1
+    assert league("nightly", "idle", "tictactoe", "--workers", "0").code == 0
+
+
 def test_a_version_that_cannot_be_tested_gives_exit_code_1(league: League, registry: Registry) -> None:
     (registry.artifacts.root / "tictactoe" / "2" / "shared.onnx").write_bytes(b"not a graph")
     result = league("nightly", "--workers", "0", "--json")

@@ -47,3 +47,25 @@ def test_an_open_verdict_becomes_void_and_ratings_start_anew(tmp_path: Path) -> 
     assert verify(again.id, registry=registry, replays=4).replayed == 4
     assert compute_leaderboard(registry, tictactoe.LEAGUE)
     registry.close()
+
+
+def test_games_before_a_change_promote_nobody(tmp_path: Path) -> None:
+    registry = tictactoe.registry(tmp_path, play={"opening_plies": 2, "num_envs": 8}, gate=GATE)
+    tictactoe.publish(registry, tictactoe.graph(wins=True, blocks=True))
+    opened = open_verdict(registry, registry.leagues.get(tictactoe.LEAGUE), 1, "script:random")
+    is_registered = False
+
+    def change(_: object) -> None:
+        nonlocal is_registered
+        if not is_registered:
+            register(registry, actions="sampled")
+        is_registered = True
+
+    report = conclude(registry, opened, listener=change)
+    assert is_registered
+    assert (report.outcome, report.note) == (
+        "void",
+        "the league plays with sampled actions now, but the test was with greedy ones",
+    )
+    assert registry.aliases.current(tictactoe.LEAGUE) == {}
+    registry.close()

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from league.config.opponents import OpponentConfig
+from league.environments.stepping import Batch
 from league.errors import EnvironmentMismatch, InvalidReference, RemoteError, UnknownPolicy
 from league.interface import AgentInterface, Interface
 from league.policies.loading import contestant, pinned, requested
@@ -13,6 +15,7 @@ from league.settings import Storage
 from league.spaces import Box, Discrete
 from tests.support.clients.protocol_observations import observations, policy_of
 from tests.support.servers.protocol_servers import Address
+from training.sampling.opponents import OpponentPolicy, Opponents
 
 
 def interface_of(storage: Storage, league: str) -> Interface:
@@ -53,6 +56,21 @@ def test_recurrent_state_is_sent_back(replica: Address, leagues: Storage) -> Non
         state = answer.state
         actions.append(answer.actions.tolist())
     assert actions == [[0, 0], [0, 0], [1, 1], [1, 1]]
+
+
+def test_a_recurrent_model_remembers_as_an_opponent_in_training(replica: Address, leagues: Storage) -> None:
+    ref = str(remote(replica, "memory"))
+    interface = interface_of(leagues, "memory")
+    opponents = Opponents([OpponentConfig(ref=ref, share=1.0)], interface, None, num_envs=2)
+    opponent = OpponentPolicy(ref, interface.policy_ids[0])
+    batch = Batch(np.arange(2), np.zeros(2, np.int64), {"observation": np.ones((2, 1), np.float32)}, np.zeros(2))
+
+    def act() -> list[int]:
+        return opponents.act(opponent, batch, np.random.default_rng(0)).tolist()
+
+    assert [act() for _ in range(3)] == [[0, 0], [0, 0], [1, 1]]
+    opponents.forget(np.array([0]))
+    assert act() == [0, 1]
 
 
 def test_a_remote_model_is_pinned_to_the_version_that_answers(replica: Address, leagues: Storage) -> None:

@@ -104,6 +104,14 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
         train(LEAGUE, registry=registry, resume=True)
 
 
+def test_the_run_of_a_night_does_not_change_the_settings_of_its_league(trained: Trained) -> None:
+    registry = trained.registry
+    before = registry.leagues.get("tictactoe").config
+    again = train(LEAGUE.with_training(steps=64, seed=5), registry=registry, name=trained.versions[0].run)
+    assert [version.number for version in again] == [1, 2], "the run is complete"
+    assert registry.leagues.get("tictactoe").config == before
+
+
 @pytest.mark.slow
 def test_continued_training_has_a_parent(trained: Trained) -> None:
     first, second = train(LEAGUE, registry=trained.registry, parent=CheckpointRef("tictactoe", 1))
