@@ -30,7 +30,7 @@ export function Opponents({ curves, points }) {
 
 function MetricChart({ name, x, lines }) {
   return html`<article><h4>${name}</h4>
-    <${Chart} label="${name} of ${lines.length} opponents. The table above lists the latest values." x=${x} lines=${lines} xName="steps" height=${220} format=${percent} />
+    <${Chart} label="${name} of ${lines.length} opponents. The table above lists the latest values." x=${x} lines=${lines} xName="steps" yName=${name} height=${220} format=${percent} />
     <${DataTable} x=${x} lines=${lines} xName="steps" caption=${name} format=${percent} /></article>`;
 }
 
