@@ -4,11 +4,13 @@ import dataclasses
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -27,6 +29,7 @@ from tests.support.waiting import until
 from training.export import publish as publishing
 from training.runs.parent import check_network
 from training.runs.train import train
+from training.runs.tune import Interrupted
 
 SETTINGS = {"runners": 1, "train_batch_size": 256, "minibatch_size": 128, "epochs": 1, "checkpoint_every": 512}
 LEAGUE = tictactoe(steps=1024, **SETTINGS)
@@ -102,6 +105,19 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
     assert of_agents == {"agents/player_1/return", "agents/player_2/return"}
     with pytest.raises(NotFound, match="complete"):
         train(LEAGUE, registry=registry, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "how"), [(None, "To continue: --resume."), ("night-1", "To continue, run the same command again.")]
+)
+def test_an_interrupted_run_says_how_to_continue_it(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch, name: str | None, how: str
+) -> None:
+    """`league nightly` has no `--resume`."""
+    monkeypatch.setattr("training.runs.train.connected", lambda *_: nullcontext())
+    monkeypatch.setattr("training.runs.train._attempt", lambda *_: False)
+    with pytest.raises(Interrupted, match=re.escape(how)):
+        train(LEAGUE, registry=registry, name=name, console=Console(quiet=True))
 
 
 @pytest.mark.slow
