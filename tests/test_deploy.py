@@ -357,7 +357,7 @@ def size(quantity: str) -> int:
     return int(quantity[:-2]) * MEMORY[quantity[-2:]]
 
 
-@pytest.mark.parametrize("pod", [*POD_SPECS[2:]], ids=["nightly", "training night", "elastic head", "elastic workers"])
+@pytest.mark.parametrize("pod", POD_SPECS[2:], ids=["nightly", "training night", "elastic head", "elastic workers"])
 def test_shared_memory_holds_the_object_store_of_ray(pod: Any) -> None:
     """Otherwise Ray uses the container's disk."""
     from ray._private.ray_constants import DEFAULT_OBJECT_STORE_MEMORY_PROPORTION
