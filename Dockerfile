@@ -1,4 +1,4 @@
-# Two images: `server` plays games and serves actions, without PyTorch; `trainer` does everything.
+# Two images: `server` plays games and serves actions, without PyTorch; `trainer` also trains.
 #
 #     docker build --target server --tag policy-league:0.1.0 .
 #     docker build --target trainer --tag policy-league-trainer:0.1.0 .
@@ -50,7 +50,7 @@ FROM wheel AS trainer-packages
 RUN apt-get update && apt-get install --yes --no-install-recommends build-essential swig && rm -rf /var/lib/apt/lists/*
 RUN python -m venv /opt/league \
     && wheel=$(echo /dist/*.whl) \
-    && /opt/league/bin/pip install --no-cache-dir --constraint constraints.txt "${wheel}[environments,postgres]"
+    && /opt/league/bin/pip install --no-cache-dir --constraint constraints.txt "${wheel}[environments,object-store,openspiel,postgres]"
 
 FROM runtime AS trainer
 COPY --from=trainer-packages /opt/league /opt/league

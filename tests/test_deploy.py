@@ -3,6 +3,7 @@
 import gzip
 import json
 import re
+import signal
 import subprocess
 import sys
 import tomllib
@@ -297,10 +298,11 @@ def test_each_serving_setting_is_documented_with_its_default() -> None:
 JOBS = OBJECTS[2:]
 NIGHTLY = ["league", "nightly"]
 TRAINING_NIGHT = [*NIGHTLY, "--train", "connect_four", "leduc_holdem"]
+WITHOUT_TRAINING = [*NIGHTLY, "connect_four"]
 
 
 @pytest.mark.parametrize(
-    ("job", "command"), zip(JOBS, [NIGHTLY, TRAINING_NIGHT], strict=True), ids=["nightly", "training night"]
+    ("job", "command"), zip(JOBS, [WITHOUT_TRAINING, TRAINING_NIGHT], strict=True), ids=["nightly", "training night"]
 )
 def test_the_nightly_jobs_use_the_registry_of_the_cluster(job: Any, command: list[str]) -> None:
     pod = job["spec"]["jobTemplate"]["spec"]["template"]["spec"]
@@ -327,18 +329,59 @@ def test_a_training_night_writes_versions_and_keeps_its_runs_on_the_volume() -> 
     assert all(path.is_relative_to(mount["mountPath"]) for path in (storage.home, storage.artifacts))
     assert set(TRAINING_NIGHT[3:]) <= set(names())
     assert "trainer" in container["image"], "the server's image has no PyTorch"
+    assert pod["terminationGracePeriodSeconds"] >= 120, "training ends after an update, and is published"
+
+
+@pytest.mark.parametrize("league", WITHOUT_TRAINING[2:])
+def test_the_job_without_training_runs_leagues_that_the_image_of_the_server_can_test(league: str) -> None:
+    program = f"""if True:
+        import sys
+        for name in {sorted(ONLY_IN_TRAINER)}:
+            sys.modules[name] = None  # imports of it fail
+        from configs import find
+        from league.config.league import LeagueConfig
+        from league.environments.building import interface
+        from league.policies.loading import configured_contestants
+        config = LeagueConfig.load(find({league!r}))
+        interface(config)
+        assert not config.gate.exploiters.count and not configured_contestants(config)
+    """
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert process.returncode == 0, process.stderr
+
+
+MEMORY = {"Gi": 2**30, "Mi": 2**20}
+
+
+def size(quantity: str) -> int:
+    return int(quantity[:-2]) * MEMORY[quantity[-2:]]
+
+
+@pytest.mark.parametrize("pod", POD_SPECS[2:], ids=["nightly", "training night", "elastic head", "elastic workers"])
+def test_shared_memory_holds_the_object_store_of_ray(pod: Any) -> None:
+    """Otherwise Ray uses the container's disk."""
+    from ray._private.ray_constants import DEFAULT_OBJECT_STORE_MEMORY_PROPORTION
+
+    (container,) = pod["containers"]
+    (volume,) = [volume["emptyDir"] for volume in pod["volumes"] if volume["name"] == "shared-memory"]
+    limit = size(container["resources"]["limits"]["memory"])
+    assert volume["medium"] == "Memory"
+    assert DEFAULT_OBJECT_STORE_MEMORY_PROPORTION * limit < size(volume["sizeLimit"]) < limit
 
 
 def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
     from cli.evaluation.nightly import BUSY, FAULTS
+    from cli.interrupt import INTERRUPTED
 
-    for job in JOBS:
-        (rule,) = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
-        assert rule["onExitCodes"]["values"] == [FAULTS, 2]
+    for job, if_busy in zip(JOBS, ("Ignore", "Count"), strict=True):
+        rules = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
+        found = {tuple(rule["onExitCodes"]["values"]): rule["action"] for rule in rules}
+        assert found == {(FAULTS, 2): "FailJob", (BUSY,): if_busy}
     crontab = (ROOT / "deploy/nightly/crontab").read_text()
     for unit, command in ("league-nightly", NIGHTLY), ("league-training-night", TRAINING_NIGHT):
         service, timer = ((ROOT / f"deploy/nightly/{unit}.{kind}").read_text() for kind in ("service", "timer"))
-        assert f"SuccessExitStatus={BUSY}\n" in service
+        assert f"SuccessExitStatus={signal.SIGTERM:d} {BUSY} {INTERRUPTED}\n" in service, "Ray exits with the signal"
+        assert "\nKillMode=mixed\n" in service, "a signal to Ray's processes would end training before it is saved"
         assert re.search(rf"^ExecStart=\S+/\.venv/bin/{' '.join(command)}$", service, flags=re.M)
         assert re.search(r"^OnCalendar=\*-\*-\* \d\d:\d\d$", timer, flags=re.M)
         assert re.search(rf"^(\S+ ){{5}}cd .* \.venv/bin/{' '.join(command)} >> ", crontab, flags=re.M)
@@ -346,6 +389,17 @@ def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
 
 TRAINING = {"onnx", "onnxscript", "tensorboard", "torch"}
 """Dependencies that only training imports."""
+TRAINER_EXTRAS = ["environments", "object-store", "openspiel", "postgres"]
+ONLY_IN_TRAINER = {*TRAINING, "pyspiel", "ray.rllib", "ray.tune", "rlcard"}
+"""Modules that the server's image lacks."""
+
+
+def test_the_trainer_image_has_the_documented_extras() -> None:
+    (extras,) = re.findall(r"\$\{wheel\}\[(\S+)\]", (ROOT / "Dockerfile").read_text())
+    assert extras.split(",") == TRAINER_EXTRAS
+    assert set(TRAINER_EXTRAS) <= PROJECT["optional-dependencies"].keys()
+    (documented,) = re.findall(r"`trainer` also trains, and has the extras\s+([^.]*)\.", OPERATIONS)
+    assert re.findall(r"`([\w-]+)`", documented) == TRAINER_EXTRAS
 
 
 def test_the_server_image_has_all_dependencies_except_those_of_training() -> None:

@@ -80,6 +80,17 @@ def test_each_command_is_in_the_readme() -> None:
     assert [name for name in COMMANDS if f"league {name}" not in text] == []
 
 
+def test_each_json_document_is_described() -> None:
+    headings = " ".join(re.findall(r"^## (.+)$", (DOCS / "json.md").read_text(), flags=re.M))
+    missing = [
+        name
+        for name, command in COMMANDS.items()
+        for each in (command.commands.values() if isinstance(command, TyperGroup) else [command])
+        if any("--json" in parameter.opts for parameter in each.params) and f"league {name}" not in headings
+    ]
+    assert missing == []
+
+
 def test_the_readme_is_short() -> None:
     assert len(README.read_text().splitlines()) <= 120
 

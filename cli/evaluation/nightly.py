@@ -50,7 +50,9 @@ def nightly(
     train: Annotated[
         bool,
         typer.Option(
-            "--train", help="First train from the champion; afterwards train and measure an exploiter of the new one."
+            "--train",
+            help="Train from the champion before the tests; after them, train an exploiter of the champion and measure"
+            " its score.",
         ),
     ] = False,
     workers: ClusterWorkers = None,
@@ -213,7 +215,9 @@ def run_training_night(
     storage.export()
     registry, games = open_registry(), GameProgress(quiet)
     if (train := _trainer(registry, games, quiet)) is None:
-        raise ConfigError("training at night needs PyTorch: pip install policy-league")
+        raise ConfigError(
+            "--train requires PyTorch, which is not installed: use the trainer image, or pip install policy-league"
+        )
     with exit_on_interrupt(), connected(None, storage), games as listener:
         night, report = training_night(
             config,

@@ -151,7 +151,7 @@ def _nightly_run(night: _Night) -> NightlyReport:
             )
         except AlreadyRunning as error:
             if not waits:
-                night.announce(f"{night.config.league}: {error}; the night waits for its end")
+                night.announce(f"{night.config.league}: {error}; waiting until it ends")
             waits = True
             time.sleep(WAIT)
 

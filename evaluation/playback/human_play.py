@@ -25,7 +25,7 @@ from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput, one_line
 from league.interface import Interface
-from league.policies.loading import baselines, eligible
+from league.policies.loading import baselines, configured_scripts, eligible
 from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.registry.registry import Registry
@@ -85,12 +85,13 @@ def playability(config: LeagueConfig, registry: Registry, interface: Interface, 
         if row.mixture is not None and row.aliases and row.manifest.environment_digest == config.environment.digest()
     ]
     versions = [version.ref for version in reversed(eligible(registry, league))]
+    scripts = dict.fromkeys([*baselines(config, interface), *configured_scripts(config, interface)])
     return Playability(
         league=league,
         playable=bool(playable_agents),
         why=why,
         agents=playable_agents,
-        opponents=(*mixtures, *versions[:MOST_OPPONENTS], *baselines(config, interface)),
+        opponents=(*mixtures, *versions[:MOST_OPPONENTS], *scripts),
         draws=hooks.draws,
         board=hooks.declared.board,
         reveals=hooks.draws and not hooks.has_views and interface.hidden_information and len(interface.agents) > 1,

@@ -32,9 +32,9 @@ class LeagueOpponentsConfig(Part):
     share: float = Field(default=0.5, gt=0, le=1)
     """Fraction of the episodes. Without a version, these episodes are self-play, too."""
     sampling: Sampling = "pfsp"
-    """How opponents are drawn. latest: the newest version, exploiters apart. uniform: all candidates alike. pfsp: by
-    the probability x that the learner beats them. nash, alpha_rank: by their shares in the payoff matrix of the
-    candidates."""
+    """How opponents are drawn. latest: the newest version that is not an exploiter. uniform: all candidates alike.
+    pfsp: by the probability x that the learner beats them. nash, alpha_rank: by their shares in the payoff matrix of
+    the candidates."""
     weighting: Weighting = "power"
     """With pfsp, the weight of an opponent. power: (1 - x)^power. variance: x(1 - x). linear_capped: min(½, 1 - x)."""
     power: float = Field(default=2.0, gt=0)

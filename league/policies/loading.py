@@ -294,8 +294,18 @@ def _errors_of_contestants(
 
 def configured_contestants(config: LeagueConfig) -> list[str]:
     """Return the bots and remote models among the anchors and opponents of a configuration."""
+    return [ref for ref in _anchors_and_opponents(config) if _is_bot(ref) or _is_remote(ref)]
+
+
+def configured_scripts(config: LeagueConfig, interface: Interface) -> list[str]:
+    """Return the scripts among the anchors and opponents of a configuration that can play, except bots."""
+    scripts = (ref for ref in _anchors_and_opponents(config) if ref.startswith("script:") and not _is_bot(ref))
+    return [ref for ref in scripts if _plays(ref, interface)]
+
+
+def _anchors_and_opponents(config: LeagueConfig) -> list[str]:
     named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents.fixed]
-    return [ref for ref in dict.fromkeys(named) if _is_bot(ref) or _is_remote(ref)]
+    return list(dict.fromkeys(named))
 
 
 def baselines(config: LeagueConfig, interface: Interface) -> list[str]:
@@ -308,7 +318,7 @@ def baselines(config: LeagueConfig, interface: Interface) -> list[str]:
 def _plays(ref: str, interface: Interface) -> bool:
     try:
         check_plays(ScriptRef.parse(ref), interface)
-    except EnvironmentMismatch:
+    except (ConfigError, EnvironmentMismatch, UnknownPolicy):
         return False
     return True
 

@@ -5,7 +5,7 @@ import { apiPath, request } from "./api.js";
 import { useChangeToken, useData, useList, useMissingScope } from "./data.js";
 import { Await, EmptyState, Form, leaguePath, Progress, ShowMore, State, Table, Time, useTitle } from "./components.js";
 import { navigate } from "./router.js";
-import { shortRef } from "./format.js";
+import { mixture, shortRef } from "./format.js";
 
 export function Evaluations({ league }) {
   const evaluations = useList(apiPath(league, "evaluations"), "evaluations", useChangeToken("evaluation", "evaluations"));
@@ -73,13 +73,16 @@ export function NewEvaluation({ league, about }) {
 function Tournament({ league, champion, baselines }) {
   const [schedule, setSchedule] = useState("round_robin");
   const versions = useData(apiPath(league, "versions"));
-  const refs = versions.data && [...baselines, ...versions.data.versions.map((each) => `${league}@${each.version}`).reverse()];
+  const contestants = versions.data && [
+    ...baselines.map((ref) => ({ ref })),
+    ...versions.data.versions.filter((each) => !each.retired_at).map((each) => ({ ref: `${league}@${each.version}`, role: roleOf(each) })).reverse(),
+  ];
   return html`
     <label class="field">Schedule <select name="schedule" value=${schedule} onChange=${(event) => setSchedule(event.target.value)}>
       ${SCHEDULES.map(([name, label]) => html`<option value=${name}>${label}</option>`)}</select></label>
-    <${Await} result=${versions}>${refs && html`
-      <${Choice} name="contestants" legend="Contestants" none="all versions" refs=${refs} champion=${champion} />
-      ${schedule === "gauntlet" && html`<${Choice} name="against" legend="Against" none="the champion and the baselines" refs=${refs} champion=${champion} />`}`}<//>
+    <${Await} result=${versions}>${contestants && html`
+      <${Choice} name="contestants" legend="Contestants" none="all versions" choices=${contestants} champion=${champion} />
+      ${schedule === "gauntlet" && html`<${Choice} name="against" legend="Against" none="the champion and the baselines" choices=${contestants} champion=${champion} />`}`}<//>
     <fieldset class="budget"><legend>Budget</legend>
       <label class="field">Blocks per pair <input name="blocks" type="number" min="1" max="100000" placeholder="32" /></label>
       <label class="field">Maximum games <input name="games" type="number" min="2" placeholder="no limit" /></label>
@@ -89,16 +92,21 @@ function Tournament({ league, champion, baselines }) {
     </fieldset>`;
 }
 
-/** A selection of versions and scripts; an empty selection stands for the default, described by `none`. */
-function Choice({ name, legend, none, refs, champion }) {
+/** The role of an exploiter or a mixture as text. */
+function roleOf({ exploits, members }) {
+  return exploits ? `exploiter of ${shortRef(exploits)}` : members && mixture(members);
+}
+
+/** A selection among `choices`, {ref, role}; an empty selection stands for the default, described by `none`. */
+function Choice({ name, legend, none, choices, champion }) {
   const [selected, setSelected] = useState(new Set());
   const [filter, setFilter] = useState("");
   const toggle = (ref) => setSelected((previous) => { const next = new Set(previous); if (!next.delete(ref)) next.add(ref); return next; });
   return html`<fieldset><legend>${legend}: ${selected.size ? `${selected.size} selected` : none}</legend>
-    ${refs.length > 12 && html`<input type="search" aria-label="Filter ${legend.toLowerCase()}" placeholder="Filter" value=${filter} onInput=${(event) => setFilter(event.target.value)} />`}
-    <div class="refs" tabindex=${refs.length > 12 ? 0 : null} role="group" aria-label=${legend}>${refs.map((ref) => html`
+    ${choices.length > 12 && html`<input type="search" aria-label="Filter ${legend.toLowerCase()}" placeholder="Filter" value=${filter} onInput=${(event) => setFilter(event.target.value)} />`}
+    <div class="refs" tabindex=${choices.length > 12 ? 0 : null} role="group" aria-label=${legend}>${choices.map(({ ref, role }) => html`
       <label key=${ref} class="pick" hidden=${!ref.includes(filter.trim())}><input type="checkbox" name=${name} value=${ref} checked=${selected.has(ref)} onChange=${() => toggle(ref)} />
-        <span class="ref">${shortRef(ref)}</span>${ref.endsWith(`@${champion}`) && html`<span aria-hidden="true"> ★</span><span class="visually-hidden"> champion</span>`}</label>`)}</div>
+        <span class="ref">${shortRef(ref)}</span>${role && html` <span class="muted small">${role}</span>`}${ref.endsWith(`@${champion}`) && html`<span aria-hidden="true"> ★</span><span class="visually-hidden"> champion</span>`}</label>`)}</div>
   </fieldset>`;
 }
 

@@ -29,9 +29,9 @@ function Charts({ nights }) {
       <${Chart} label="Ratings of the champions of ${rated.length} nights. Last: ${last.rated.champion} with ${signed(last.rated.rating)} Elo." xName="night" yName="Elo"
         x=${rated.map((night) => night.night)} lines=${[{ name: "rating of the champion", values: rated.map((night) => night.rating), dots: true }]}
         intervals=${rated.map((night) => night.interval)} format=${(value) => signed(value)} />
-      <p class="muted small">Today's ratings of the champions of that time, on one scale, with 95 % intervals.</p></article>`}
+      <p class="muted small">Current rating of the champion after each night, with 95 % intervals.</p></article>`}
     ${measured.length > 0 && html`<article><h3>Learned exploitability</h3>
-      <${Chart} label="Scores of exploiters in ${measured.length} nights. Last: ${percent(last.measured.score)}, 95 % interval ${range(last.measured)}." xName="night"
+      <${Chart} label="Scores of exploiters in ${measured.length} nights. Last: ${percent(last.measured.score)}, 95 % interval ${range(last.measured)}." xName="night" yName="score"
         x=${measured.map((night) => night.night)} lines=${[{ name: "score of the exploiter", values: measured.map((night) => night.exploitability.score), dots: true }]}
         intervals=${measured.map(({ exploitability: { low, high } }) => [low, high])} thresholds=${[{ name: "even", value: 0.5, tone: "muted" }]} format=${(share) => percent(share, 0)} />
       <p class="muted small">The score of the best exploiter against the champion, with its interval. A best response scores at least the lower end. The return gain is its mean return minus that of the champion.</p></article>`}

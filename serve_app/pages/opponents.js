@@ -23,14 +23,14 @@ export function Opponents({ curves, points }) {
         <td class="number">${percent(share)}</td><td class="number">${percent(score)}</td></tr>`)}
     <//>
     <p class="muted small">The remaining episodes are self-play. Shares and scores are estimates from recent training games, in which a draw counts ½.</p>
-    ${x.length > 0 && html`<div class="curves">${METRICS.map(([metric, name]) => html`<${MetricChart} key=${metric} name=${name} x=${x}
+    ${x.length > 0 && html`<div class="curves">${METRICS.map(([metric, name]) => html`<${MetricChart} key=${metric} metric=${metric} name=${name} x=${x}
       lines=${latest.map(({ ref }) => ({ name: shortRef(ref), values: points.map((point) => point.curves[`${PREFIX}${ref}/${metric}`] ?? null) }))} />`)}</div>`}
   </section>`;
 }
 
-function MetricChart({ name, x, lines }) {
+function MetricChart({ metric, name, x, lines }) {
   return html`<article><h4>${name}</h4>
-    <${Chart} label="${name} of ${lines.length} opponents. The table above lists the latest values." x=${x} lines=${lines} xName="steps" height=${220} format=${percent} />
+    <${Chart} label="${name} of ${lines.length} opponents. The table above lists the latest values." x=${x} lines=${lines} xName="steps" yName=${metric} height=${220} format=${percent} />
     <${DataTable} x=${x} lines=${lines} xName="steps" caption=${name} format=${percent} /></article>`;
 }
 

@@ -47,7 +47,7 @@ function NewGame({ league, about, playable }) {
     navigate(fragmentOf({ opponent: fields.get("opponent"), agent: fields.get("agent"), seed, actions: [] }));
   };
   return html`<form class="narrow" onSubmit=${start}>
-    <p class="muted">You play one agent. The opponent plays all others and always takes its best action.</p>
+    <p class="muted">You play one agent. The opponent plays all others. As in the matches of this league, versions ${about.actions === "sampled" ? "sample their actions" : "take their most likely actions"}.</p>
     <label class="field">Opponent <select name="opponent">
       ${about.champion != null && html`<option value="${league}@champion">${league}@champion (version ${about.champion})</option>`}
       ${playable.opponents.map((ref) => html`<option value=${ref}>${ref}</option>`)}

@@ -5,6 +5,9 @@ import { apiPath, request } from "./api.js";
 import { useChangeToken, useData, useMissingScope } from "./data.js";
 import { Await, Dialog, ErrorNotice, Form, notify, Time } from "./components.js";
 
+/** Whether a version can become champion: exploiters and retired versions cannot. */
+export const canBePromoted = ({ role, retired_at: retiredAt }) => role !== "exploiter" && !retiredAt;
+
 /** The buttons in the title of a league. */
 export function Promotions({ league, champion }) {
   const [open, setOpen] = useState(null);
@@ -28,7 +31,7 @@ export function Promote({ league, champion, version = null, onClose }) {
     notify(`Promoted ${league}@${selected} to champion.`);
     onClose();
   };
-  const others = versions.data?.versions.filter((each) => each.version !== current).reverse();
+  const others = versions.data?.versions.filter((each) => each.version !== current && canBePromoted(each)).reverse();
   return html`<${Dialog} title=${version == null ? `Promote a version of ${league}` : `Promote ${league}@${version}`} onClose=${onClose}>
     <${Form} submit=${submit} label=${selected == null ? "Promote" : `Promote @${selected}`} onCancel=${onClose} disabled=${selected == null}>
       ${version == null && html`<${Await} result=${versions}><label class="field">Version

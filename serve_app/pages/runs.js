@@ -75,7 +75,7 @@ function Curves({ points }) {
 
 function MetricChart({ metric: { name, lines }, x }) {
   const values = lines.map((line) => `${line.name}: ${short(line.values.findLast((value) => value != null))}`);
-  return html`<article><h3>${name}</h3><${Chart} label="${name} over ${count(x.at(-1))} steps. Latest values: ${values.join("; ")}." x=${x} lines=${lines} xName="steps" height=${200} />
+  return html`<article><h3>${name}</h3><${Chart} label="${name} over ${count(x.at(-1))} steps. Latest values: ${values.join("; ")}." x=${x} lines=${lines} xName="steps" yName=${name} height=${200} />
     <${DataTable} x=${x} lines=${lines} xName="steps" caption=${name} /></article>`;
 }
 

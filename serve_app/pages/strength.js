@@ -1,4 +1,4 @@
-// The strength of a run's versions: their scores against the champion and an anchor, one chart per opponent.
+// The strength of a run's versions: their scores, one chart per opponent.
 
 import { html } from "./vendor/preact-htm.js";
 import { Chart } from "./chart.js";
@@ -13,7 +13,7 @@ export function Strength({ league, rows }) {
   const byOpponent = Map.groupBy(rows, (row) => row.opponent);
   return html`<section aria-labelledby="strength">
     <h3 id="strength">Strength</h3>
-    <p class="muted small">Mean scores of this run's versions in games against the champion and an anchor. Bars show 95 % intervals. All versions play the same openings. These games count in no rating or verdict.</p>
+    <p class="muted small">Mean scores of this run's versions against the opponents below, with 95 % intervals. All versions play the same openings. These games do not affect ratings or verdicts.</p>
     <div class="curves">${[...byOpponent].map(([opponent, own]) => html`<${OpponentChart} key=${opponent} opponent=${opponent} rows=${own} />`)}</div>
     <details class="numbers"><summary>Show as table</summary>
       <${Table} caption="Strength of the versions" head=${[["Version"], ["Steps", "number"], ["Opponent"], ["Score", "number"], ["95 % interval"], ["Games", "number"]]}>
@@ -29,7 +29,7 @@ function OpponentChart({ opponent, rows }) {
   const last = rows.at(-1);
   const label = `Scores against ${opponent}. Version ${last.version}: ${percent(last.score)}, 95 % interval ${range(last)}.`;
   return html`<article><h4>against ${shortRef(opponent)}</h4>
-    <${Chart} label=${label} x=${rows.map((row) => row.steps)} xName="total steps" height=${220} format=${(share) => percent(share, 0)} thresholds=${EVEN}
+    <${Chart} label=${label} x=${rows.map((row) => row.steps)} xName="total steps" yName="score" height=${220} format=${(share) => percent(share, 0)} thresholds=${EVEN}
       lines=${[{ name: "score", values: rows.map((row) => row.score), dots: true }]} intervals=${rows.map((row) => [row.low, row.high])} /></article>`;
 }
 

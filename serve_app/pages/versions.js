@@ -6,7 +6,7 @@ import { Chart } from "./chart.js";
 import { useChangeToken, useData, useList, useMissingScope } from "./data.js";
 import { EditNote, Note } from "./note.js";
 import { Await, Badge, EmptyState, Ref, ShowMore, Table, Time } from "./components.js";
-import { Promote } from "./promotion.js";
+import { canBePromoted, Promote } from "./promotion.js";
 import { count, interval, mixture, plural, short, signed } from "./format.js";
 
 export function Versions({ league, about }) {
@@ -53,6 +53,7 @@ function Row({ league, version: each, rated, champion, promote, edit, disabledRe
   return html`<tr class=${each.version === champion ? "champion-row" : ""}>
     <th scope="row"><${Ref} value="${league}@${each.version}" champion=${champion} />${others.map((alias) => html` <${Badge}>${alias}<//>`)}
       ${each.exploits && html` <${Badge}>exploiter of ${each.exploits}<//>`}
+      ${each.retired_at && html` <${Badge}>retired<//>`}
       ${each.members && html` <span class="muted small">${mixture(each.members)}</span>`}</th>
     <td class="number strong">${signed(rated?.rating)}</td>
     <td class="nowrap muted">${interval(rated?.interval)}</td>
@@ -62,7 +63,7 @@ function Row({ league, version: each, rated, champion, promote, edit, disabledRe
     <td>${each.parent == null ? html`<span class="muted">–</span>` : `@${each.parent}`}</td>
     <td class="nowrap"><${Time} at=${each.created_at} /></td>
     <td class="wrap"><${Note} note=${each.note} name="${league}@${each.version}" edit=${() => edit(each)} disabledReason=${disabledReason} /></td>
-    <td>${each.version !== champion && each.role !== "exploiter" && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
+    <td>${each.version !== champion && canBePromoted(each) && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
       aria-label="Promote ${league}@${each.version}">Promote …</button>`}</td>
   </tr>`;
 }

@@ -92,6 +92,31 @@ def test_a_promotion_fails_if_the_champion_has_changed(tab: Tab, served: Served)
     served.registry.aliases.rollback(LEAGUE, actor="cli", reason="as it was")
 
 
+def test_exploiters_and_retired_versions_cannot_be_promoted(tab: Tab) -> None:
+    changes = {1: {"role": "exploiter", "exploits": f"{LEAGUE}@3"}, 2: {"retired_at": "2026-11-21T04:12:09+00:00"}}
+
+    def change(route: Route) -> None:
+        reply = route.fetch()
+        found = reply.json()
+        versions = [version | changes.get(version["version"], {}) for version in found["versions"]]
+        route.fulfill(response=reply, json=found | {"versions": versions})
+
+    tab.page.route(re.compile(rf"/v1{L}/versions(\?|$)"), change)
+    page = tab.open(f"{L}/versions")
+    expect(page.get_by_role("row").filter(has_text=f"{LEAGUE}@2")).to_contain_text("retired")
+    for version in (1, 2):
+        expect(page.get_by_role("button", name=f"Promote {LEAGUE}@{version}")).to_have_count(0)
+    page.get_by_role("button", name="Promote …", exact=True).click()
+    dialog = page.get_by_role("dialog", name=f"Promote a version of {LEAGUE}")
+    expect(dialog.get_by_label("Version")).to_be_visible()
+    for version in (1, 2):
+        expect(dialog.get_by_role("option", name=f"{LEAGUE}@{version}")).to_have_count(0)
+
+    page = tab.open(f"{L}/evaluations/new")
+    expect(page.get_by_label("@1 exploiter of @3")).to_be_visible()
+    expect(page.get_by_label("@2", exact=True)).to_have_count(0)
+
+
 def test_a_key_without_the_scope_gets_an_error(tab: Tab, served: Served) -> None:
     page = tab.open(L)
     page.get_by_role("button", name="Roll back …").click()

@@ -41,7 +41,7 @@ PAGES = {
     f"{L}/nights": (r"Strength", r"Learned exploitability", r"60\.0 %\s*50\.0 % to 90\.0 %\s*\+0\.20\s*0\.00 to 0\.80"),
     f"/leagues/{NAMED}": (r"The game of this league has changed", r"2 matches", r"play\.opening_plies: 4 → 0"),
     f"/leagues/{NAMED}/payoff": (r"The game of this league has changed", r"No games yet"),
-    f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your agent"),
+    f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your agent", r"versions take their most likely actions"),
     f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
     f"{L}/nothing": (r"Page not found",),
 }

@@ -180,6 +180,12 @@ def test_the_page_shows_colors_and_warns_of_pictures_that_show_everything(tab: T
     expect(page.locator(".notice")).to_contain_text("what is hidden from player_1")
 
 
+def test_the_page_says_how_versions_select_actions(tab: Tab) -> None:
+    page = open_game(tab, HIDDEN, "player_1")
+    page.get_by_role("button", name="Change opponent").click()
+    expect(page.get_by_text("As in the matches of this league, versions sample their actions.")).to_be_visible()
+
+
 @pytest.mark.parametrize("agent", VIEWS_OF_AGENTS)
 def test_each_seat_sees_its_own_view(tab: Tab, agent: str) -> None:
     page = open_game(tab, VIEWS, agent)

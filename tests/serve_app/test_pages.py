@@ -82,6 +82,12 @@ def test_scripts_insert_no_html_and_import_existing_files(path: Path) -> None:
         assert (path.parent / name).is_file(), name
 
 
+def test_charts_name_their_axes() -> None:
+    charts = [chart for path in SCRIPTS for chart in re.findall(r"<\$\{Chart\} (.+?)/>", path.read_text(), re.DOTALL)]
+    assert charts
+    assert [chart for chart in charts if "xName=" not in chart or "yName=" not in chart] == []
+
+
 def test_vendored_files_have_their_licence() -> None:
     readme = (FILES / "vendor" / "README.md").read_text()
     for path in (FILES / "vendor").iterdir():

@@ -31,7 +31,7 @@ from training.runs.node_watch import NodeWatch
 from training.runs.parent import parent_version
 from training.runs.progress import TrainingProgress
 from training.runs.publish_queue import PublishQueue, published_versions
-from training.runs.run_directory import CHECKPOINTS, START, STOP_FILE, RunDirectory, pin_opponents
+from training.runs.run_directory import CHECKPOINTS, OWN_ID, START, STOP_FILE, RunDirectory, pin_opponents
 from training.runs.run_reporter import RunReporter
 from training.runs.strength_queue import Measure, StrengthQueue
 from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
@@ -203,7 +203,8 @@ def _train_and_publish(
     publisher.join()
     if not spent:
         published = ", ".join(version.ref for version in published_versions(registry, run)) or "nothing yet"
-        raise Interrupted(f"Ended early. Published: {published}. TensorBoard: {run.path}. To continue: --resume.")
+        how = "To continue: --resume." if OWN_ID.fullmatch(run.id) else "To continue, run the same command again."
+        raise Interrupted(f"Ended early. Published: {published}. TensorBoard: {run.path}. {how}")
     run.complete()
 
 

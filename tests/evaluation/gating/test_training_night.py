@@ -229,7 +229,7 @@ def test_a_night_waits_for_another_nightly_run(registry: Registry, monkeypatch: 
 
     def announce(sentence: str) -> None:
         said.append(sentence)
-        if sentence.endswith("the night waits for its end"):
+        if sentence.endswith("waiting until it ends"):
             other.release()
 
     other.acquire()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from base64 import b64decode
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -272,6 +273,21 @@ def test_agents_have_the_declared_names_keys_and_colors(tmp_path: Path) -> None:
     assert first.keys == {"ArrowLeft": 0, "a": 0, "ArrowRight": 8, "d": 4}, "declared keys precede; 99 is no action"
     assert (first.color, second.color) == ("red", None)
     assert found.board == ((0, None), (1, 2))
+
+
+def test_scripts_of_the_configuration_are_offered_if_they_can_play(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyspiel", None)  # `mcts_100` needs it
+    opponents = [{"ref": f"script:{name}", "share": 0.1} for name in ("solver", "one_ply")]
+    config = tictactoe.config(
+        gate={"anchors": ["script:minimax_2", "script:mirror", "script:mcts_100"]}, training={"opponents": opponents}
+    )
+    described = interface(config)
+    with closing(tictactoe.registry(tmp_path)) as registry:
+        registry.leagues.register(config, described)
+        found = playability(config, registry, described, environment_hooks(config.environment))
+    assert found.opponents == ("script:random", "script:one_ply", "script:minimax_2", "script:solver")
 
 
 def test_mixtures_of_another_environment_are_not_offered(tmp_path: Path) -> None:

@@ -4,11 +4,13 @@ import dataclasses
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from league.config.league import LeagueConfig
+from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError, NotFound, ParityError, UnknownVersion
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
@@ -27,6 +30,7 @@ from tests.support.waiting import until
 from training.export import publish as publishing
 from training.runs.parent import check_network
 from training.runs.train import train
+from training.runs.tune import Interrupted
 
 SETTINGS = {"runners": 1, "train_batch_size": 256, "minibatch_size": 128, "epochs": 1, "checkpoint_every": 512}
 LEAGUE = tictactoe(steps=1024, **SETTINGS)
@@ -110,6 +114,20 @@ def test_the_run_of_a_night_does_not_change_the_settings_of_its_league(trained: 
     again = train(LEAGUE.with_training(steps=64, seed=5), registry=registry, name=trained.versions[0].run)
     assert [version.number for version in again] == [1, 2], "the run is complete"
     assert registry.leagues.get("tictactoe").config == before
+
+
+@pytest.mark.parametrize(
+    ("name", "how"), [(None, "To continue: --resume."), ("night-1", "To continue, run the same command again.")]
+)
+def test_an_interrupted_run_says_how_to_continue_it(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch, name: str | None, how: str
+) -> None:
+    """`league nightly` has no `--resume`."""
+    registry.leagues.register(LEAGUE, interface(LEAGUE))
+    monkeypatch.setattr("training.runs.train.connected", lambda *_: nullcontext())
+    monkeypatch.setattr("training.runs.train._attempt", lambda *_: False)
+    with pytest.raises(Interrupted, match=re.escape(how)):
+        train(LEAGUE, registry=registry, name=name, console=Console(quiet=True))
 
 
 @pytest.mark.slow
