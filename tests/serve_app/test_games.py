@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from evaluation.matches.tournament import evaluate
 from evaluation.service.game_worker_pool import GameWorkerPool
 from league.environments.building import interface
-from league.errors import GameHung, LeagueError, NoEvaluationService, NotReady, Overloaded, WorkerLost
+from league.errors import GameHung, LeagueError, NoEvaluationService, NotReady, Overloaded, RemoteError, WorkerLost
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match
@@ -223,6 +223,7 @@ def test_a_league_without_matches_can_be_played_with_scripts(client: TestClient)
         (Overloaded("too many"), 429, "overloaded"),
         (GameHung("it hangs"), 504, "game_hung"),
         (WorkerLost("it died"), 500, "worker_lost"),
+        (RemoteError("it is unreachable"), 502, "remote_error"),
     ],
 )
 def test_errors_of_the_evaluation_service_keep_their_status(

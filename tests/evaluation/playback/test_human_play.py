@@ -25,7 +25,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
-from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput
+from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput, RemoteError
 from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
@@ -222,6 +222,16 @@ def test_an_opponent_without_a_legal_action_forfeits() -> None:
     state = play_request(TICTACTOE, players, "player_1", [1, 5, 8])
     assert state.forfeits == ({"agent": "player_2", "ref": "script:random", "reason": "illegal_action"},)
     assert state.score == 1.0
+
+
+def test_an_unreachable_opponent_does_not_forfeit() -> None:
+    class Unreachable(Scripted):
+        def act(self, observations: Arrays, *, state: Any = None, explore: bool = False, rng: Any = None) -> Actions:
+            raise RemoteError("http://127.0.0.1:9/v2/models/board cannot be reached")
+
+    players = all_agents(league_and_environment(TICTACTOE)[1], Unreachable([]))
+    with pytest.raises(RemoteError, match="cannot be reached"):
+        play_request(TICTACTOE, players, "player_1", [4])
 
 
 def test_an_exception_of_the_environment_is_reported() -> None:
