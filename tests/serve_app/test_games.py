@@ -254,8 +254,8 @@ def test_games_under_other_conditions_are_other_requests(tmp_path: Path) -> None
     registry, service = tictactoe.registry(tmp_path), RecordingEvaluation()
     server = Replica(Registry.open(registry.storage), QUICK, "replica-1", evaluation_client=service)
     with local_client(server) as client:
-        for play in ({}, {}, {"actions": "sampled"}, {"actions": "sampled", "opening_plies": 3}):
-            league = tictactoe.config(play={"opening_plies": 2} | play)
+        for actions, plies in (("greedy", 2), (None, 2), ("sampled", 2), ("sampled", 3)):
+            league = tictactoe.config(play={"actions": actions, "opening_plies": plies})
             registry.leagues.register(league, interface(league))
             reply = client.post(PLAY, json={"opponent": "script:random", "agent": "player_1"})
             assert reply.status_code == 200
