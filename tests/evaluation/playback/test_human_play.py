@@ -174,6 +174,15 @@ def test_probabilities_are_returned_on_request_only() -> None:
     assert play_request(TICTACTOE, scripted_players(described), "player_2", chances=True).chances == ()
 
 
+def test_the_action_of_an_opponent_without_a_distribution_is_certain() -> None:
+    _, described, _ = league_and_environment(TICTACTOE)
+    players = all_agents(described, OnnxPolicy(tictactoe.graph(wins=True), has_distribution=False))
+    state = play_request(TICTACTOE, players, "player_2", chances=True)
+    (move,) = state.steps[1].moves
+    assert move.chances == ((move.action, 1.0),)
+    assert [chance for _, chance in state.chances] == [1.0]
+
+
 def test_the_state_has_the_legal_actions_of_the_person() -> None:
     players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph()))
     first = play_request(TICTACTOE, players, "player_1")
