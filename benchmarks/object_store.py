@@ -26,6 +26,7 @@ from benchmarks.leagues.served_league import LEAGUE, builder, fill
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest
 from league.settings import Storage
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.version_cache import load
 from tests.support.servers import object_store
 
@@ -118,13 +119,13 @@ def _loads(home: Path, endpoint: str, megabytes: int) -> bool:
     os.environ |= object_store.variables(proxy.url)
     replica = Storage(home / "replica", database, url)
     registry = Registry.open(replica)
-    load(registry, LEAGUE, number, INLINE)
+    load(registry, LEAGUE, number, INLINE, ActionSelections())
     received = proxy.received / 1e6
-    cached = _times(lambda: load(registry, LEAGUE, number, INLINE))
+    cached = _times(lambda: load(registry, LEAGUE, number, INLINE, ActionSelections()))
     again = proxy.received / 1e6 - received
     os.environ |= object_store.variables(endpoint)
     directory = fill(Registry.open(Storage.at(home / "directory")), 1, LARGE)
-    local = _times(lambda: load(directory, LEAGUE, 1, INLINE))
+    local = _times(lambda: load(directory, LEAGUE, 1, INLINE, ActionSelections()))
     print(f"bytes received for a version with {megabytes} MB of training state: {received:.2f} MB", end="")
     print(f"   (at most {TO_TRANSFER:g}); for the cached loads {again:.2f} MB")
     print(f"cached load of 1 MB with ONNX Runtime and warm-up: median {_shown(cached)}", end="")

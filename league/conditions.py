@@ -68,13 +68,13 @@ def _short(value: Any) -> str | None:
 
 
 def action_selection(config: "LeagueConfig", interface: "Interface") -> ActionSelection:
-    """Return `play.actions`, by default `sampled` if the environment hides information from opponents.
+    """Return `play.actions`, by default `default_selection`."""
+    return config.play.actions or default_selection(interface.hidden_information, len(interface.sides))
 
-    A single side has no opponents.
-    """
-    if config.play.actions is not None:
-        return config.play.actions
-    return "sampled" if interface.hidden_information and len(interface.sides) > 1 else "greedy"
+
+def default_selection(hidden_information: bool, sides: int) -> ActionSelection:
+    """Return `sampled` if the environment hides information from opponents. A single side has no opponents."""
+    return "sampled" if hidden_information and sides > 1 else "greedy"
 
 
 def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:

@@ -136,11 +136,12 @@ GameOperation = RecordingRequest | VideoRequest | PlayabilityRequest | HumanPlay
 class GameRequest(_Request):
     """One operation on a league's games.
 
-    environment: digest of the league's environment. Equal requests therefore have equal responses.
+    conditions: name of the league's conditions, the game and how versions select actions. Equal requests therefore
+    have equal responses.
     """
 
     league: str
-    environment: str
+    conditions: str
     operation: Annotated[GameOperation, Field(discriminator="kind")]
 
     @property

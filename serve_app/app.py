@@ -39,6 +39,7 @@ from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.registry_connection import RegistryConnection
 from serve_app.models.registry_watcher import RegistryWatcher
@@ -175,8 +176,9 @@ class Replica:
         self.registry = registry
         self.settings = settings
         self.replica = replica
+        selections = ActionSelections()
         self.versions = VersionCache(
-            partial(load, registry, inline=settings.inline),
+            partial(load, registry, inline=settings.inline, selections=selections),
             settings.cached_versions,
             settings.retry,
             settings.load_timeout,
@@ -195,6 +197,7 @@ class Replica:
             self.connection,
             self.alias_slots,
             self.traffic,
+            selections,
             self.api_keys.update,
             replica,
             process or this_process(),

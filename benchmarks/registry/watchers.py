@@ -13,6 +13,7 @@ from pathlib import Path
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.access.api_keys import ApiKeyCache
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.registry_connection import RegistryConnection
 from serve_app.models.registry_watcher import RegistryWatcher
@@ -29,7 +30,16 @@ def watcher(storage: Storage, name: str) -> tuple[RegistryWatcher, RegistryConne
     slots = AliasSlots(VersionCache(load, settings.cached_versions, settings.retry, settings.load_timeout))
     connection = RegistryConnection(Registry.open(storage, create=False, listens=True))
     return (
-        RegistryWatcher(connection, slots, TrafficSplit(slots), ApiKeyCache().update, name, this_process(), settings),
+        RegistryWatcher(
+            connection,
+            slots,
+            TrafficSplit(slots),
+            ActionSelections(),
+            ApiKeyCache().update,
+            name,
+            this_process(),
+            settings,
+        ),
         connection,
     )
 

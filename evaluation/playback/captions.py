@@ -108,7 +108,7 @@ def _action(actions: Sequence[Any]) -> str:
 def chances(move: Move, space: Space, most: int = MOST_CHANCES) -> tuple[tuple[int, float], ...]:
     """(action, probability) of the `most` probable actions; for MultiDiscrete, of each chosen component.
 
-    Empty for continuous actions and for policies without probabilities.
+    Empty for continuous actions, scripts and remote models.
     """
     if move.dist_inputs is None:
         return ()

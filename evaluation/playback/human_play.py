@@ -23,7 +23,15 @@ from evaluation.results import Document
 from league.conditions import ActionSelection, action_selection
 from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
-from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, IllegalMask, InvalidInput, one_line
+from league.errors import (
+    EnvironmentMismatch,
+    GameCrashed,
+    IllegalAction,
+    IllegalMask,
+    InvalidInput,
+    RemoteError,
+    one_line,
+)
 from league.interface import Interface
 from league.policies.loading import baselines, configured_scripts, eligible
 from league.policies.onnx import LAST_ACTION, OnnxPolicy
@@ -166,6 +174,7 @@ def human_play(
         EnvironmentMismatch: The agent's action space is not Discrete.
         IllegalAction: An illegal action; the message lists legal ones.
         GameCrashed: The environment raised.
+        RemoteError: The server of a remote opponent cannot be reached or failed.
     """
     space = space_of(interface, request.agent)
     person = _Person(request.actions, space, players[request.agent] if request.chances else None)
@@ -222,7 +231,7 @@ def _play(
             stop = stopping
         view = request.agent if hooks.has_views else None
         picture = data_uri(environment.render(0, view), LARGEST) if hooks.draws else None
-    except IllegalAction:
+    except (IllegalAction, RemoteError):
         raise
     except Exception as error:
         raise GameCrashed(
@@ -311,7 +320,7 @@ class _Person:
 
 
 class _Opponent:
-    """Raises _Forfeited for the first output of a policy that is not playable.
+    """Raises _Forfeited for the first output of a policy that is not playable, and RemoteError as it is.
 
     with_probabilities: whether to return action probabilities.
     """
@@ -330,7 +339,7 @@ class _Opponent:
     ) -> Actions:
         try:
             given = policy_output(self._policy, observations, state, rng, explore)
-        except MemoryError:
+        except (MemoryError, RemoteError):
             raise
         except Exception as error:
             raise _Forfeited(self._agent, PolicyFault("crashed", one_line(error, with_type=True))) from error

@@ -143,6 +143,38 @@ def probabilities(dist_inputs: NDArray, space: Space, mask: NDArray | None = Non
     raise ConfigError(f"unsupported action space {space!r}")
 
 
+def certain(actions: NDArray, space: Space) -> NDArray:
+    """Compute inputs of distributions in which actions have the probability 1.
+
+    Args:
+        actions: Actions in the action space, (k, *shape).
+        space: The action space.
+
+    Returns:
+        Inputs of the distributions, (k, d) float64.
+
+    Raises:
+        ConfigError: The action space is not supported.
+    """
+    match space:
+        case Discrete(n=n, start=start):
+            return _only(actions - start, n)
+        case MultiDiscrete(nvec=nvec, start=start):
+            raw = (actions - np.asarray(start)).reshape(len(actions), -1)
+            parts = zip(raw.T, np.ravel(nvec).tolist(), strict=True)
+            return np.concatenate([_only(chosen, n) for chosen, n in parts], axis=1)
+        case Box():
+            centre, half = _range(space)
+            means = (actions.reshape(len(actions), -1) - centre) / np.where(half == 0, 1, half)
+            return np.concatenate([means, np.full_like(means, -np.inf)], axis=1)
+    raise ConfigError(f"unsupported action space {space!r}")
+
+
+def _only(chosen: NDArray, n: int) -> NDArray:
+    """Logits (k, n) with which one of n actions is certain. chosen: (k,)."""
+    return np.where(np.arange(n) == chosen[:, np.newaxis], 0.0, -np.inf)
+
+
 def _shares(logits: NDArray, mask: NDArray | None) -> NDArray:
     """Softmax, (k, n) float64."""
     if mask is not None:
@@ -154,9 +186,13 @@ def _shares(logits: NDArray, mask: NDArray | None) -> NDArray:
 def _gaussian(dist_inputs: NDArray, space: Box) -> tuple[NDArray, NDArray]:
     """Means and standard deviations (k, m) in the units of the space; see `to_environment`."""
     means, log_deviations = np.split(dist_inputs, 2, axis=1)
-    deviations = np.exp(log_deviations)
+    centre, half = _range(space)
+    return centre + means * half, np.exp(log_deviations) * half
+
+
+def _range(space: Box) -> tuple[NDArray, NDArray]:
+    """Centre and half of the range, (m,), that raw values from -1 to 1 cover; of [-1, 1] without two finite bounds."""
     low, high = (np.ravel(bound) for bound in bounds(space))
     finite = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(finite, low, -1.0), np.where(finite, high, 1.0)
-    half, centre = high / 2 - low / 2, high / 2 + low / 2
-    return centre + means * half, deviations * half
+    return high / 2 + low / 2, high / 2 - low / 2

@@ -1,5 +1,6 @@
 """Runs the ONNX graph of a policy with ONNX Runtime on one thread."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError, one_line
 from league.policies.actions import dist_inputs_size, to_environment
-from league.policies.draws import Generators, UniformNumbers, sample
+from league.policies.draws import Generators, UniformNumbers, certain, sample
 from league.policies.policy import Actions, Arrays
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import OBSERVATION, Discrete, Space
@@ -33,7 +34,7 @@ class OnnxPolicy:
         graph: Path or content of the ONNX file, which must contain its weights.
         manifest: Expected inputs, outputs and action space. Without it, the graph is not checked against them.
         has_distribution: Whether actions can be sampled; see `Manifest.has_distribution`. Otherwise they are greedy,
-            also with `explore`.
+            also with `explore`: those have the probability 1.
 
     Raises:
         ArtifactCorrupt: The file is not an ONNX graph, or it does not match the manifest.
@@ -87,7 +88,16 @@ class OnnxPolicy:
         return Actions(to_environment(raw, self._action), after, outputs[1])
 
     def distribution(self, observations: Arrays | NDArray, *, state: Arrays | None = None) -> Actions:
-        """Choose greedy actions and return `dist_inputs`, too; see `act`."""
+        """Choose greedy actions and return `dist_inputs`, too; see `act`. Without a distribution, the actions are
+        certain.
+        """
+        found = self.outputs(observations, state=state)
+        if self.has_distribution or self._action is None:
+            return found
+        return replace(found, dist_inputs=certain(found.actions, self._action))
+
+    def outputs(self, observations: Arrays | NDArray, *, state: Arrays | None = None) -> Actions:
+        """Return the outputs of the graph: like `distribution`, but `dist_inputs` are values if it computes values."""
         outputs = self._run(observations, state, self._exploring)
         return Actions(outputs[0], self._state(outputs[2:]), outputs[1])
 

@@ -22,7 +22,7 @@ class Actions:
     Attributes:
         actions: Actions in the agent's action space, (k, *action shape).
         state: Recurrent state for the next call, under the names `state_in_<i>`; None for policies without state.
-        dist_inputs: Masked inputs of the action distribution, (k, d) float32; None for scripts or if not requested.
+        dist_inputs: Masked inputs of the action distribution, (k, d); None for scripts or if not requested.
         faults: Row → the exception that a policy raised for this row only. The row's action is undefined.
     """
 

@@ -119,7 +119,7 @@ class Probes:
         space: action space of the policy. source: identifies the version in error messages.
         """
         try:
-            answer = policy.distribution(self.observations, state=self.state or None)
+            answer = policy.outputs(self.observations, state=self.state or None)
         except ObservationError as error:
             raise ArtifactCorrupt(f"{source} does not fit the graph: {error}") from error
         assert answer.dist_inputs is not None

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from league.conditions import game_changes
+from league.conditions import ActionSelection, action_selection, default_selection, game_changes
 from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface, digest
+from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert, upsert
 from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, require_active
 from league.registry.storage.tables import READY, EarlierGameTable, LeagueTable, MatchTable, VersionTable
@@ -26,7 +27,8 @@ class LeagueRepository(Repository):
     """Registers and reads leagues."""
 
     def register(self, config: "LeagueConfig", interface: Interface) -> None:
-        """Add a league or update its configuration. Warns if results exist and what decides them has changed.
+        """Add a league or update its configuration. Warns if results exist and what decides them has changed: the game,
+        or how versions select actions.
 
         Raises LeagueArchived, or InterfaceChanged if published versions have another interface.
         """
@@ -41,6 +43,7 @@ class LeagueRepository(Repository):
         first = {"slug": config.league, "last_version": 0, "registered_at": datetime.now(UTC)}
         with self._database.write() as session:
             if insert(session, LeagueTable, [first | values]):
+                change_counter.count(session, "leagues")
                 return
             known = lock_active(session, config.league)
             if known.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
@@ -48,15 +51,21 @@ class LeagueRepository(Repository):
                     f"league {config.league} has versions with other spaces or policies than this configuration: "
                     "keep them, or register the configuration under a new league name"
                 )
-            if known.game_digest != values["game_digest"] and _has_results(session, config.league):
+            before, now = _action_selections(session, known.slug)[known.slug], action_selection(config, interface)
+            changes = [f"how versions select actions has changed: {before} → {now}"] if before != now else []
+            if changes:
+                change_counter.count(session, "leagues")
+            if known.game_digest != values["game_digest"] and _has_results(session, known.slug):
+                changes.insert(0, _describe_changes(known.game, game))
+                earlier = {"game": known.game, "replaced_at": datetime.now(UTC)}
+                upsert(session, EarlierGameTable, {"league": known.slug, "digest": known.game_digest}, earlier)
+            if changes and _has_results(session, known.slug):
                 logger.warning(
                     "league %s: %s. Earlier results can be viewed, but no longer count in ratings, payoffs and"
                     " verdicts.",
-                    config.league,
-                    _describe_changes(known.game, game),
+                    known.slug,
+                    "; ".join(changes),
                 )
-                earlier = {"game": known.game, "replaced_at": datetime.now(UTC)}
-                upsert(session, EarlierGameTable, {"league": known.slug, "digest": known.game_digest}, earlier)
             for name, value in values.items():
                 setattr(known, name, value)
 
@@ -94,6 +103,11 @@ class LeagueRepository(Repository):
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
+    def action_selections(self) -> dict[str, ActionSelection]:
+        """Return league → how its versions select actions. Does not read the rest of the configurations."""
+        with self._database.read() as session:
+            return _action_selections(session)
+
     def all(self) -> list[LeagueRow]:
         """Return all leagues, sorted by name."""
         with self._database.read() as session:
@@ -119,6 +133,14 @@ def lock_active(session: Session, league: str) -> LeagueTable:
     row = lock(session, league)
     require_active(league, row.archived_at)
     return row
+
+
+def _action_selections(session: Session, league: str | None = None) -> dict[str, ActionSelection]:
+    """league → action selection, of all leagues or of one."""
+    chosen, interface = LeagueTable.config["play"]["actions"].as_string(), LeagueTable.interface
+    query = select(LeagueTable.slug, chosen, interface["hidden_information"].as_boolean(), interface["sides"])
+    rows = session.execute(query if league is None else query.where(LeagueTable.slug == league))
+    return {slug: actions or default_selection(bool(hidden), len(sides)) for slug, actions, hidden, sides in rows}
 
 
 def _has_versions(session: Session, league: str) -> bool:

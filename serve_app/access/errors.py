@@ -2,7 +2,8 @@
 
 InvalidInput 400 (BodyTooLarge 413, UnsupportedMediaType 415, IllegalAction 422), Unauthenticated 401, Forbidden 403,
 NotFound 404 (VersionRetired 410), BodyTooSlow 408, Conflict 409, Overloaded and RateLimited 429 with Retry-After,
-NotReady, ArtifactCorrupt and StorageError 503 with Retry-After, DeadlineExceeded and GameHung 504, others 500
+RemoteError 502, NotReady, ArtifactCorrupt and StorageError 503 with Retry-After, DeadlineExceeded and GameHung 504,
+others 500
 """
 
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from league.errors import (
     NotReady,
     Overloaded,
     RateLimited,
+    RemoteError,
     StorageError,
     Unauthenticated,
     VersionRetired,
@@ -68,6 +70,7 @@ STATUSES: dict[type[LeagueError], int] = {
     Conflict: 409,
     Overloaded: 429,
     RateLimited: 429,
+    RemoteError: 502,
     NotReady: 503,
     ArtifactCorrupt: 503,
     StorageError: 503,

@@ -216,7 +216,9 @@ def build_response(
     response = {"actions": actions} if request.is_batch else {"action": actions[0]}
     if request.probabilities:
         assert answer.dist_inputs is not None
-        likely = probabilities(answer.dist_inputs, policy.manifest.action, observations.get(ACTION_MASK))
+        # An action that is certain has the probability 1 even if it is illegal.
+        mask = observations.get(ACTION_MASK) if policy.policy.has_distribution else None
+        likely = probabilities(answer.dist_inputs, policy.manifest.action, mask)
         response["probabilities"] = likely if request.is_batch else likely[0]
     return response
 

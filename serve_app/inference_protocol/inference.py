@@ -153,7 +153,7 @@ async def _run(
 
     def act() -> Actions:
         if DIST_INPUTS in wanted:
-            return policy.distribution(arrays, state=state)
+            return policy.outputs(arrays, state=state)
         return policy.act(arrays, state=state)
 
     rows = len(next(iter(arrays.values())))

@@ -1,4 +1,5 @@
-"""Follows the registry's aliases, traffic settings and API keys, and acknowledges what this replica serves.
+"""Follows the registry's aliases, traffic settings, API keys and action selections, and acknowledges what this replica
+serves.
 
 One task on the event loop. It reads what has changed, as the change counter tells: after a notification of PostgreSQL,
 otherwise by polling.
@@ -11,11 +12,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 
+from league.conditions import ActionSelection
 from league.errors import LeagueError, StorageError
 from league.registry.registry import Registry
 from league.registry.replicas import KEPT
 from league.registry.storage.rows import AliasTarget, ChangeCounts, KeyRow, ReadPosition, ServedState
 from league.registry.storage.rows import Traffic as Setting
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.alias_slots import Alias, AliasSlots
 from serve_app.models.polling import JITTER, Polling
 from serve_app.models.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
@@ -42,6 +45,7 @@ class _Read:
     aliases: Mapping[Alias, AliasTarget] | None
     traffic: Mapping[str, Setting] | None
     keys: list[KeyRow] | None
+    selections: Mapping[str, ActionSelection] | None
 
 
 @dataclass(slots=True)
@@ -53,7 +57,7 @@ class _Acknowledged:
 
 
 class RegistryWatcher:
-    """Keeps slots, traffic and keys at what the registry requires, and acknowledges it as `replica`.
+    """Keeps slots, traffic, action selections and keys at what the registry requires, and acknowledges it as `replica`.
 
     update_keys: raises StorageError if the keys are those of a different database. on_heartbeat: called at each
     heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas
@@ -65,6 +69,7 @@ class RegistryWatcher:
         connection: RegistryConnection,
         slots: AliasSlots,
         traffic: TrafficSplit,
+        selections: ActionSelections,
         update_keys: Callable[[list[KeyRow]], None],
         replica: str,
         process: ReplicaProcess,
@@ -76,6 +81,7 @@ class RegistryWatcher:
         self._connection = connection
         self._slots = slots
         self._traffic = traffic
+        self._selections = selections
         self._update_keys = update_keys
         self._replica = replica
         self._process = process
@@ -177,6 +183,7 @@ class RegistryWatcher:
             registry.aliases.all() if known is None or known.aliases != counts.aliases else None,
             registry.traffic.all() if known is None or known.traffic != counts.traffic else None,
             registry.keys.all() if known is None or known.keys != counts.keys else None,
+            registry.leagues.action_selections() if known is None or known.leagues != counts.leagues else None,
         )
 
     def _accept(self, read: _Read) -> None:
@@ -190,7 +197,9 @@ class RegistryWatcher:
             self._newest_events = _newest_events(read.aliases)
         if read.traffic is not None:
             self._wanted_traffic = read.traffic
-        if None not in (read.aliases, read.traffic, read.keys):
+        if read.selections is not None:
+            self._selections.update(read.selections)
+        if None not in (read.aliases, read.traffic, read.keys, read.selections):
             self._reread_at = time.monotonic() + REREAD
         settings = (one.id or 0 for one in self._wanted_traffic.values())
         newest = max(self._newest_events.values(), default=0), max(settings, default=0)

@@ -18,6 +18,7 @@ from league.registry.storage.mixture import Mixture
 from league.spaces import Box, Leaf
 from serve_app.codecs.observation_codec import ObservationReader
 from serve_app.codecs.request_limits import RequestLimits
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.daemon_thread import in_daemon_thread
 
 WARM_BATCH = 64
@@ -36,8 +37,13 @@ class LoadedPolicy:
     limits: RequestLimits
     inline_rows: int
     """The largest batch that is fast enough to run on the event loop."""
-    samples: bool = False
-    """Whether actions are sampled if a request does not say, as in the league's matches."""
+    league: str
+    selections: ActionSelections
+
+    @property
+    def samples(self) -> bool:
+        """Whether actions are sampled if a request does not say, as in the league's matches."""
+        return self.policy.has_distribution and self.selections.is_sampled(self.league)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +74,10 @@ class LoadedVersion:
         return f"{self.league}.{next(name for name, one in self.policies.items() if one is policy)}"
 
 
-def load(registry: Registry, league: str, number: int, inline: float) -> LoadedVersion:
+def load(registry: Registry, league: str, number: int, inline: float, selections: ActionSelections) -> LoadedVersion:
     """Load a version, of a mixture without its members. Blocks.
 
-    inline: time in seconds that inference may take on the event loop.
+    inline: time in seconds that inference may take on the event loop. selections: how it selects actions.
 
     Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
     """
@@ -83,7 +89,7 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
     registry.artifacts.verify_names(league, number, version.sha256)
     if version.mixture is not None:
         return LoadedVersion(league, number, version.sha256, {}, version.mixture)
-    is_sampled = registry.leagues.get(league).conditions.actions == "sampled"
+    selections.add(league, registry.leagues.get(league).conditions.actions)
     policies = {}
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.
@@ -93,13 +99,15 @@ def load(registry: Registry, league: str, number: int, inline: float) -> LoadedV
             probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
             probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
         try:
-            policies[name] = _warm_up(policy, manifest, inline, is_sampled)
+            policies[name] = _warm_up(policy, manifest, inline, league, selections)
         except InvalidInput as error:
             raise ArtifactCorrupt(f"policy {name} of {version.ref} does not run: {error}") from error
     return LoadedVersion(league, number, version.sha256, policies)
 
 
-def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float, is_sampled: bool) -> LoadedPolicy:
+def _warm_up(
+    policy: OnnxPolicy, manifest: PolicyManifest, inline: float, league: str, selections: ActionSelections
+) -> LoadedPolicy:
     """Run the graph to allocate its memory, and measure how many rows fit into `inline` seconds."""
     reader = ObservationReader(manifest.observation)
     one, many = (_measure(policy, reader, rows) for rows in (1, WARM_BATCH))
@@ -110,7 +118,7 @@ def _warm_up(policy: OnnxPolicy, manifest: PolicyManifest, inline: float, is_sam
         for tensor in manifest.state
     )
     limits = RequestLimits.of([leaf for *_, leaf in reader.leaves] + [leaf for _, leaf in state])
-    return LoadedPolicy(policy, manifest, reader, state, limits, rows, is_sampled and policy.has_distribution)
+    return LoadedPolicy(policy, manifest, reader, state, limits, rows, league, selections)
 
 
 def _measure(policy: Policy, reader: ObservationReader, rows: int) -> float:

@@ -98,7 +98,7 @@ class GameRoutes:
         def build_request(registry: Registry) -> GameRequest:
             return GameRequest(
                 league=league,
-                environment=registry.leagues.get(league).environment_digest,
+                conditions=registry.leagues.get(league).conditions.name,
                 operation=build_operation(registry, league),
             )
 

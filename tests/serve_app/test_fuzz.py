@@ -24,6 +24,7 @@ from serve_app.inference.stream_codec import FRAMING, REQUEST, BinaryCodec, pars
 from serve_app.inference_protocol.inference import InferResponse
 from serve_app.inference_protocol.rest_codec import read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs, signature_of
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.version_cache import LoadedPolicy, load
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.leagues.match_results import record
@@ -86,7 +87,9 @@ MODELS = ("board", "memory", "nested", "kinds", "choice", "vector")
 @pytest.fixture(scope="module")
 def policies(storage_to_fuzz: Storage) -> dict[str, LoadedPolicy]:
     registry = Registry.open(storage_to_fuzz)
-    loaded = {model: load(registry, model, 1, inline=0.001).policy(None) for model in MODELS}
+    loaded = {
+        model: load(registry, model, 1, inline=0.001, selections=ActionSelections()).policy(None) for model in MODELS
+    }
     registry.close()
     return loaded
 

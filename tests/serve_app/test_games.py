@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from starlette.testclient import TestClient
 from evaluation.matches.tournament import evaluate
 from evaluation.service.game_worker_pool import GameWorkerPool
 from league.environments.building import interface
-from league.errors import GameHung, LeagueError, NoEvaluationService, NotReady, Overloaded, WorkerLost
+from league.errors import GameHung, LeagueError, NoEvaluationService, NotReady, Overloaded, RemoteError, WorkerLost
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match
@@ -55,6 +56,18 @@ class FailingEvaluation(UnavailableEvaluation):
     async def request_game(self, order: GameRequest) -> GameResponse:
         """Raise the error."""
         raise self._error
+
+
+class RecordingEvaluation(UnavailableEvaluation):
+    """An evaluation service that records the requests."""
+
+    def __init__(self) -> None:
+        self.requests: list[GameRequest] = []
+
+    async def request_game(self, order: GameRequest) -> GameResponse:
+        """Respond with an empty document."""
+        self.requests.append(order)
+        return GameResponse("application/json", b"{}")
 
 
 @pytest.fixture(scope="module")
@@ -223,6 +236,7 @@ def test_a_league_without_matches_can_be_played_with_scripts(client: TestClient)
         (Overloaded("too many"), 429, "overloaded"),
         (GameHung("it hangs"), 504, "game_hung"),
         (WorkerLost("it died"), 500, "worker_lost"),
+        (RemoteError("it is unreachable"), 502, "remote_error"),
     ],
 )
 def test_errors_of_the_evaluation_service_keep_their_status(
@@ -233,6 +247,22 @@ def test_errors_of_the_evaluation_service_keep_their_status(
         reply = client.get(f"{LEAGUE}/playable")
         assert (reply.status_code, reply.json()) == (status, {"code": code, "message": str(error)})
         assert ("retry-after" in reply.headers) == (status in (429, 503))
+
+
+def test_games_under_other_conditions_are_other_requests(tmp_path: Path) -> None:
+    """The evaluation service caches the responses."""
+    registry, service = tictactoe.registry(tmp_path), RecordingEvaluation()
+    server = Replica(Registry.open(registry.storage), QUICK, "replica-1", evaluation_client=service)
+    with local_client(server) as client:
+        for actions, plies in (("greedy", 2), (None, 2), ("sampled", 2), ("sampled", 3)):
+            league = tictactoe.config(play={"actions": actions, "opening_plies": plies})
+            registry.leagues.register(league, interface(league))
+            reply = client.post(PLAY, json={"opponent": "script:random", "agent": "player_1"})
+            assert reply.status_code == 200
+    registry.close()
+    first, same, sampled, longer = service.requests
+    assert first == same
+    assert len({each.model_dump_json() for each in (first, sampled, longer)}) == 3
 
 
 def test_a_missing_evaluation_service_is_reported(playable: Registry) -> None:

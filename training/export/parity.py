@@ -18,7 +18,7 @@ from league.environments.stepping import Indices, Starts
 from league.errors import ParityError
 from league.interface import Interface
 from league.policies.actions import to_environment
-from league.policies.onnx import OnnxPolicy
+from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.probes import Probes, excused, same
 from league.registry.storage.manifest import Parity
 from league.seeds import derive, generator
@@ -115,7 +115,7 @@ def check_parity(path: Path, policy: str, module: PolicyModule, batches: list[Ob
     """Compare the served graph at `path` with `module`, row by row. space: of the actions.
 
     Raises ParityError if a greedy action differs other than in a near tie, or if a distribution input or a state
-    differs by more than TOLERANCE.
+    differs by more than TOLERANCE. The previous action in a state is the greedy one, which is compared already.
     """
     graph = OnnxPolicy(path)
     near_ties = mismatches = 0
@@ -131,13 +131,14 @@ def check_parity(path: Path, policy: str, module: PolicyModule, batches: list[Ob
         mismatches, near_ties = mismatches + wrong, near_ties + tied
         largest = max(largest, float(np.abs(exported.dist_inputs - expected).max()))
         pairs = [(exported.dist_inputs, expected)]
-        pairs += zip((exported.state or {}).values(), state.values(), strict=True)
+        after = exported.state or {}
+        pairs += [(after[name], known) for name, known in _state_in(state).items() if name != LAST_ACTION]
         worst = max(worst, *(float((np.abs(found - known) / (1 + np.abs(known))).max()) for found, known in pairs))
     count = sum(map(len, batches))
     if mismatches or not worst <= TOLERANCE:
         raise ParityError(
             f"the graph of policy {policy} differs from its module on {mismatches} of {count} greedy actions, "
-            f"and by up to {largest:g} in a distribution input"
+            f"and by up to {worst:g}, relative to 1 + |x|, in a distribution input or a state"
         )
     return Parity(observations=count, mismatches=mismatches, near_ties=near_ties, max_difference=largest)
 

@@ -83,7 +83,7 @@ def line_game(name: str, observation: Space, action: Space) -> LineGame:
         fits = OBSERVATION in leaves and leaves[OBSERVATION].shape == (game.rows, game.columns, 2)
         if fits and ACTION_MASK in leaves and action == Discrete(n=game.actions):
             return game
-    raise EnvironmentMismatch(f"script:{name} supports only the spaces of connect four and tic-tac-toe")
+    raise EnvironmentMismatch(f"script:{name} needs the spaces of PettingZoo's connect_four_v3 or tictactoe_v3")
 
 
 class BestMoves(ABC):

@@ -1,4 +1,5 @@
-"""Counts changes of what replicas follow, so that they poll one row instead of aliases, traffic settings and API keys.
+"""Counts changes of what replicas follow, so that they poll one row instead of aliases, traffic settings, API keys and
+leagues.
 
 A transaction that changes one of these counts it before it writes, and holds the lock of the row until it commits.
 Hence changes of all leagues are committed one after the other, in the order of their event ids: a replica that has
@@ -20,7 +21,7 @@ ROW = 1
 
 _COUNTS = select(*(ChangeCounterTable.__table__.c[name] for name in ChangeCounts._fields)).filter_by(id=ROW)
 
-Subject = Literal["aliases", "traffic", "keys"]
+Subject = Literal["aliases", "traffic", "keys", "leagues"]
 
 
 def count(session: Session, subject: Subject) -> None:
@@ -33,4 +34,4 @@ def count(session: Session, subject: Subject) -> None:
 def counts(database: Database) -> ChangeCounts:
     """Return the number of changes. Read it before what it counts."""
     rows = database.rows(_COUNTS)
-    return ChangeCounts(*rows[0]) if rows else ChangeCounts(0, 0, 0)
+    return ChangeCounts(*rows[0]) if rows else ChangeCounts(0, 0, 0, 0)

@@ -176,6 +176,8 @@ class ChangeCounts(NamedTuple):
     aliases: int
     traffic: int
     keys: int
+    leagues: int
+    """Leagues that were registered, or whose versions select actions in another way since."""
 
     @property
     def to_acknowledge(self) -> int:

@@ -189,6 +189,7 @@ class ChangeCounterTable(Base):
     aliases: Mapped[int] = mapped_column(BigInteger, server_default="0")
     traffic: Mapped[int] = mapped_column(BigInteger, server_default="0")
     keys: Mapped[int] = mapped_column(BigInteger, server_default="0")
+    leagues: Mapped[int] = mapped_column(BigInteger, server_default="0")
 
 
 class AcknowledgementTable(Base):

@@ -26,7 +26,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
-from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput
+from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput, RemoteError
 from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
@@ -175,6 +175,15 @@ def test_probabilities_are_returned_on_request_only() -> None:
     assert play_request(TICTACTOE, scripted_players(described), "player_2", chances=True).chances == ()
 
 
+def test_the_action_of_an_opponent_without_a_distribution_is_certain() -> None:
+    _, described, _ = league_and_environment(TICTACTOE)
+    players = all_agents(described, OnnxPolicy(tictactoe.graph(wins=True), has_distribution=False))
+    state = play_request(TICTACTOE, players, "player_2", chances=True)
+    (move,) = state.steps[1].moves
+    assert move.chances == ((move.action, 1.0),)
+    assert [chance for _, chance in state.chances] == [1.0]
+
+
 def test_the_state_has_the_legal_actions_of_the_person() -> None:
     players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph()))
     first = play_request(TICTACTOE, players, "player_1")
@@ -223,6 +232,16 @@ def test_an_opponent_without_a_legal_action_forfeits() -> None:
     state = play_request(TICTACTOE, players, "player_1", [1, 5, 8])
     assert state.forfeits == ({"agent": "player_2", "ref": "script:random", "reason": "illegal_action"},)
     assert state.score == 1.0
+
+
+def test_an_unreachable_opponent_does_not_forfeit() -> None:
+    class Unreachable(Scripted):
+        def act(self, observations: Arrays, *, state: Any = None, explore: bool = False, rng: Any = None) -> Actions:
+            raise RemoteError("http://127.0.0.1:9/v2/models/board cannot be reached")
+
+    players = all_agents(league_and_environment(TICTACTOE)[1], Unreachable([]))
+    with pytest.raises(RemoteError, match="cannot be reached"):
+        play_request(TICTACTOE, players, "player_1", [4])
 
 
 def test_an_exception_of_the_environment_is_reported() -> None:

@@ -85,7 +85,7 @@ def shared(registry: Registry) -> Iterator[GameWorkerPool]:
 
 
 def game_request(operation: Any, league: str = LEAGUE) -> GameRequest:
-    return GameRequest(league=league, environment="digest", operation=operation)
+    return GameRequest(league=league, conditions="1-greedy", operation=operation)
 
 
 def submit(pool: GameWorkerPool, operation: Any, league: str = LEAGUE, timeout: float = LONG) -> GameResponse:
@@ -258,7 +258,7 @@ def test_a_changed_environment_is_used_for_the_next_game(registry: Registry) -> 
         )
         registry.leagues.register(other, interface(other))
         with pytest.raises(GameCrashed):
-            asyncio.run(pool.submit(GameRequest(league="moving", environment="another", operation=operation), LONG))
+            asyncio.run(pool.submit(GameRequest(league="moving", conditions="2-greedy", operation=operation), LONG))
 
 
 def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> None:

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from league.errors import ConfigError
 from league.policies.actions import to_environment
-from league.policies.draws import probabilities, sample
+from league.policies.draws import certain, probabilities, sample
 from league.spaces import Box, DictSpace, Discrete, MultiDiscrete, Space
 
 logits = arrays(np.float32, (3, 5), elements=st.floats(-1e9, 1e9, width=32))
@@ -93,6 +93,21 @@ def _marginals(reported: Any, space: Space) -> list[Any]:
     return [reported] if isinstance(space, Discrete) else list(reported)
 
 
+def test_certain_actions_have_the_probability_one() -> None:
+    assert probabilities(certain(np.array([1, -1]), space := Discrete(n=3, start=-1)), space) == [[0, 0, 1], [1, 0, 0]]
+    assert probabilities(certain(np.array([[[1, 1]], [[0, 3]]]), PAIRS), PAIRS) == [
+        [[0, 1], [1, 0, 0]],
+        [[1, 0], [0, 0, 1]],
+    ]
+    action = np.array([[[2.0, -1.5], [-7.0, 3.0]]], np.float32)
+    (found,) = probabilities(certain(action, MIXED), MIXED)
+    assert found == {"mean": [pytest.approx(row) for row in action[0].tolist()], "std": [[0, 0], [0, 0]]}
+    single = Box(dtype="float32", shape=(1,), low=2, high=2)
+    assert probabilities(certain(np.full((1, 1), 2.0), single), single) == [{"mean": [2.0], "std": [0.0]}]
+
+
 def test_an_unsupported_space_is_rejected() -> None:
     with pytest.raises(ConfigError, match="unsupported action space"):
         probabilities(np.zeros((1, 2), np.float32), DictSpace(spaces={"a": Discrete(n=2)}))
+    with pytest.raises(ConfigError, match="unsupported action space"):
+        certain(np.zeros(1), DictSpace(spaces={"a": Discrete(n=2)}))

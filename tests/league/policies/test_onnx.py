@@ -97,6 +97,16 @@ def test_illegal_actions_are_never_chosen(mask: np.ndarray, seed: int) -> None:
         assert mask[np.arange(4), answer.actions].all()
 
 
+def test_actions_without_a_distribution_are_certain() -> None:
+    policy, batch = OnnxPolicy(masked_mlp(), manifest(), has_distribution=False), observations(5)
+    values, greedy = POLICY.distribution(batch).dist_inputs, POLICY.act(batch).actions
+    np.testing.assert_array_equal(policy.outputs(batch).dist_inputs, values)
+    for answer in (policy.distribution(batch), policy.act(batch, explore=True, rng=generators(5))):
+        assert answer.actions.tolist() == greedy.tolist()
+        assert answer.dist_inputs is not None
+        assert np.exp(answer.dist_inputs).tolist() == np.eye(7)[greedy].tolist()
+
+
 def test_actions_start_at_the_start_of_their_space() -> None:
     policy = OnnxPolicy(masked_mlp(start=3), manifest(action=Discrete(n=7, start=3)))
     batch = observations(30)

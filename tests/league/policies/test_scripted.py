@@ -206,6 +206,13 @@ def test_unsupported_spaces_are_rejected(name: str, observation: Space, action: 
         script(name, observation, action)
 
 
+def test_scripts_of_line_games_name_the_environments_that_they_play() -> None:
+    """The games of OpenSpiel with the same names have other observations."""
+    message = "script:solver needs the spaces of PettingZoo's connect_four_v3 or tictactoe_v3"
+    with pytest.raises(EnvironmentMismatch, match=message):
+        script("solver", Box(dtype="float32", shape=(27,), low=0, high=1), Discrete(n=9))
+
+
 @pytest.mark.parametrize("name", ["random", "one_ply", "mcts_100", "solver"])
 def test_missing_generators_and_empty_masks_are_reported(name: str) -> None:
     policy = script(name, *spaces(tictactoe()))

@@ -75,6 +75,36 @@ def test_a_change_of_the_game_is_reported_once_it_concerns_results(
     assert row.environment_digest == SCHEDULE.environment_digest
 
 
+def test_a_change_of_the_action_selection_is_reported_once_it_concerns_results(
+    registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
+    def with_play(**play: object) -> LeagueConfig:
+        return LeagueConfig.from_mapping(config().model_dump(by_alias=True) | {"play": play})
+
+    with caplog.at_level(logging.WARNING):
+        registry.leagues.register(with_play(actions="sampled"), interface())
+        registry.leagues.register(config(), interface())
+        ledger = Ledger(registry)
+        ledger.open(SCHEDULE)
+        ledger.append(play_match(SCHEDULE, 0))
+        registry.leagues.register(with_play(actions="greedy"), interface())
+        assert caplog.messages == [], "greedy is the default"
+        registry.leagues.register(with_play(actions="sampled"), interface())
+        registry.leagues.register(with_play(opening_plies=4), interface())
+    first, second = caplog.messages
+    assert "how versions select actions has changed: greedy → sampled. Earlier results can be viewed" in first
+    assert "opening_plies 0 → 4; how versions select actions has changed: sampled → greedy. Earlier" in second
+
+
+def test_the_action_selections_of_all_leagues_are_read(registry: Registry) -> None:
+    registered(registry, "another")
+    hidden = interface().model_copy(update={"hidden_information": True})
+    registry.leagues.register(config(), hidden)
+    rows = registry.leagues.all()
+    assert registry.leagues.action_selections() == {row.slug: row.conditions.actions for row in rows}
+    assert registry.leagues.action_selections() == {"another": "greedy", LEAGUE: "sampled"}
+
+
 def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     before = registry.leagues.get(LEAGUE)
     assert registry.leagues.follow_code(LEAGUE) == before

@@ -13,6 +13,7 @@ from league.errors import InvalidInput, ObservationError
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, BinaryCodec, encode_request, parse_request
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.version_cache import LoadedPolicy, load
 from tests.support.leagues.protocol_leagues import DTYPES, every_kind
 
@@ -29,7 +30,7 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoadedPolicy
 
 
 def policy(registry: Registry, league: str) -> LoadedPolicy:
-    return load(registry, league, 1, inline=1).policy(None)
+    return load(registry, league, 1, inline=1, selections=ActionSelections()).policy(None)
 
 
 def leaves(dtype: str, rows: int) -> st.SearchStrategy[np.ndarray]:

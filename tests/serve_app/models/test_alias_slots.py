@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from league.registry.registry import Registry
+from serve_app.models.action_selections import ActionSelections
 from serve_app.models.alias_slots import Alias, AliasSlots
 from serve_app.models.version_cache import LoadedVersion, VersionCache, load
 from serve_app.runtime.ray_serve import logger
@@ -222,7 +223,7 @@ async def test_any_exception_is_a_fault_of_its_alias(registry: Registry, log: li
     def exhausted(league: str, number: int) -> LoadedVersion:
         if number == 2:
             raise MemoryError
-        return load(registry, league, number, inline=0.001)
+        return load(registry, league, number, inline=0.001, selections=ActionSelections())
 
     slots = AliasSlots(VersionCache(exhausted, capacity=1, retry=0))
     await follow(slots, {CHAMPION: 1, OTHER: 1})

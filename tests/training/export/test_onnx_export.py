@@ -15,7 +15,8 @@ from league.policies.actions import dist_inputs_size
 from league.policies.onnx import OnnxPolicy
 from league.spaces import MultiDiscrete
 from league.spaces.conversion import to_gymnasium
-from tests.support.leagues.training_leagues import counting, solvable, tictactoe
+from tests.support.leagues.training_leagues import counting, solvable, solvable_by_dqn, tictactoe
+from training.algorithms import setup
 from training.algorithms.ppo import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
@@ -157,6 +158,25 @@ def test_near_ties_are_counted_but_accepted(exported: Exported, tmp_path: Path) 
     masks = np.concatenate([part.observations["action_mask"] for part in exported[3]])
     assert proof.mismatches == 0
     assert proof.near_ties == (masks[:, :2] == 1).all(-1).sum() > 0
+
+
+def test_near_ties_are_accepted_if_the_previous_action_is_an_input(tmp_path: Path) -> None:
+    """The state after a near tie contains one or the other action."""
+    league = solvable_by_dqn("masked", **MEMORY)
+    interface_of_league = interface(league)
+    spaces = interface_of_league.of_policy("shared")
+    first, second = (setup.module_spec(league.training, interface_of_league).build()["shared"] for _ in range(2))
+    second.set_state(first.get_state())
+    for net, better in ((first, 0), (second, 2)):
+        with torch.no_grad():
+            net.advantages.weight.zero_()
+            net.advantages.bias.zero_()
+            net.advantages.bias[better] = 4e-6
+    export_policy(second, spaces, tmp_path / "second.onnx")
+    observed = parity.collect_observations(league.environment, interface_of_league, {"shared": first}, seed=1)["shared"]
+    proof = parity.check_parity(tmp_path / "second.onnx", "shared", first, observed, spaces.action)
+    assert proof.mismatches == 0
+    assert proof.near_ties > 0
 
 
 def test_a_diverged_network_is_rejected(exported: Exported) -> None:
