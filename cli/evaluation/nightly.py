@@ -264,7 +264,7 @@ def summary_of_night(night: "TrainingNightRow") -> list[str]:
     from evaluation.results import Difference
 
     versions = night.steps["train"]["versions"]
-    start = "from scratch" if night.parent is None else f"from {night.league}@{night.parent}"
+    start = "from scratch" if night.start is None else f"from {night.league}@{night.start}"
     sentences = [f"{night.league}: night {night.id} trained {', '.join(versions) or 'no version'} {start}."]
     if (found := night.steps["measure"]["exploitability"]) is not None:
         best = found["exploiters"][0]
@@ -281,7 +281,7 @@ def night_document(night: "TrainingNightRow") -> dict[str, Any]:
     return {
         "league": night.league,
         "night": night.id,
-        "parent": night.parent,
+        "parent": night.start,
         "steps": night.steps,
         "began_at": night.began_at,
         "ended_at": night.ended_at,

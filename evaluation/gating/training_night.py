@@ -17,7 +17,7 @@ from evaluation.gating.trained_exploiters import Trainer, check_exploiters, trai
 from evaluation.results import Listener, NightlyReport
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.errors import AlreadyRunning, LeagueError, StorageError, one_line
+from league.errors import AlreadyRunning, LeagueError, StorageError, UnknownRun, one_line
 from league.policies.loading import check_contestants
 from league.refs import CHAMPION, CheckpointRef
 from league.registry.registry import Registry
@@ -99,8 +99,17 @@ def _train(night: _Night) -> dict[str, Any]:
     parent = night.row.parent
     if parent is not None:
         parent = trainable_version(night.registry, night.config.league, parent)
-    error = _attempt(night, night.config.of_night(seed), night.row.run, parent, None)
-    return {"run": night.row.run, "versions": night.versions(night.row.run)} | error
+    run = night.row.run
+    error = _attempt(night, night.config.of_night(seed), run, parent, None)
+    return {"run": run, "versions": night.versions(run)} | _start(night, run) | error
+
+
+def _start(night: _Night, run: str) -> dict[str, int | None]:
+    """The version that a run started from, which `train` decides; nothing if it never began."""
+    try:
+        return {"start": night.registry.runs.get(night.config.league, run).parent}
+    except UnknownRun:
+        return {}
 
 
 def _seed(night: _Night, *path: str) -> int:

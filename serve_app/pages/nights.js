@@ -43,12 +43,12 @@ function List({ league, nights }) {
   return html`<${Table} caption="Nights, newest first" head=${head} cls="full">${nights.map((night) => html`<${Row} key=${night.night} league=${league} night=${night} />`)}<//>`;
 }
 
-function Row({ league, night: { night, run, exploiter_run: exploiterRun, versions, champion, champion_before: before, rating, interval: bounds, exploitability, errors, began_at: began, ended_at: ended } }) {
+function Row({ league, night: { night, run, exploiter_run: exploiterRun, parent, versions, champion, champion_before: before, rating, interval: bounds, exploitability, errors, began_at: began, ended_at: ended } }) {
   const score = exploitability && html`${percent(exploitability.score)} <small class="muted">${range(exploitability)}</small>`;
   return html`<tr>
     <th scope="row" class="number">${night}</th>
     <td class="nowrap"><${Time} at=${began} date />${!ended && html` <small class="muted">not complete</small>`}</td>
-    <td><a href=${leaguePath(league, "runs", run)}>${versions.map(shortRef).join(", ") || "none"}</a></td>
+    <td><a href=${leaguePath(league, "runs", run)}>${versions.map(shortRef).join(", ") || "none"}</a>${versions.length > 0 && html` <small class="muted">from ${parent == null ? "scratch" : shortRef(parent)}</small>`}</td>
     <td class="nowrap">${champion ? html`<span class="ref">${shortRef(champion)}</span>${champion !== before && html` <small>new</small>`}` : html`<span class="muted">–</span>`}</td>
     <td class="number strong">${signed(rating)}</td><td class="nowrap muted">${interval(bounds)}</td>
     <td class="number nowrap">${score && exploiterRun ? html`<a href=${leaguePath(league, "runs", exploiterRun)}>${score}</a>` : score ?? html`<span class="muted">–</span>`}</td>
