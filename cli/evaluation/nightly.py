@@ -256,7 +256,9 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
 
 def faults_of(night: "TrainingNightRow") -> list[str]:
     """The errors of a night's steps."""
-    return [f"night {night.id}, {step}: {result['error']}" for step, result in night.steps.items() if "error" in result]
+    return [
+        f"night {night.number}, {step}: {result['error']}" for step, result in night.steps.items() if "error" in result
+    ]
 
 
 def summary_of_night(night: "TrainingNightRow") -> list[str]:
@@ -265,7 +267,7 @@ def summary_of_night(night: "TrainingNightRow") -> list[str]:
 
     versions = night.steps["train"]["versions"]
     start = "from scratch" if night.start is None else f"from {night.league}@{night.start}"
-    sentences = [f"{night.league}: night {night.id} trained {', '.join(versions) or 'no version'} {start}."]
+    sentences = [f"{night.league}: night {night.number} trained {', '.join(versions) or 'no version'} {start}."]
     if (found := night.steps["measure"]["exploitability"]) is not None:
         best = found["exploiters"][0]
         gain = "" if best["gain"] is None else f", return gain {difference(Difference(**best['gain']))}"
@@ -281,6 +283,7 @@ def night_document(night: "TrainingNightRow") -> dict[str, Any]:
     return {
         "league": night.league,
         "night": night.id,
+        "number": night.number,
         "parent": night.start,
         "steps": night.steps,
         "began_at": night.began_at,

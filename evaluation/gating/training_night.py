@@ -89,7 +89,7 @@ def training_night(
         night = _Night(config, registry, row, train, workers, listener, announce)
         for number, (name, step) in enumerate(STEPS.items(), 1):
             if name not in night.row.steps:
-                announce(f"{config.league}: night {row.id}, step {number} of {len(STEPS)}: {name}")
+                announce(f"{config.league}: night {row.number}, step {number} of {len(STEPS)}: {name}")
                 night.row = registry.training_nights.record(row.id, name, step(night))
         return registry.training_nights.close(row.id), night.gate_report
 

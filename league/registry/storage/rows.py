@@ -373,6 +373,9 @@ class TrainingNightRow:
     """A night of training of a league; `ended_at` is None while it runs."""
 
     id: int
+    """Unique among all leagues."""
+    number: int
+    """Its place among the nights of the league, from 1."""
     league: str
     parent: int | None
     """The champion when it began, or without one the newest version."""

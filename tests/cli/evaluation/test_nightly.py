@@ -138,9 +138,9 @@ def test_the_summary_of_a_night_names_the_version_that_training_started_from(tra
     """The champion, version 3, was imported or is a mixture."""
     steps = {"train": {"versions": ["tictactoe@4"]} | train, "measure": {"exploitability": None}}
     now = datetime.now(UTC)
-    night = TrainingNightRow(id=9, league="tictactoe", parent=3, steps=steps, began_at=now, ended_at=now)
-    assert summary_of_night(night) == [f"tictactoe: night 9 trained tictactoe@4 {start}."]
-    assert night_document(night)["parent"] == train.get("start", 3)
+    night = TrainingNightRow(id=9, number=5, league="tictactoe", parent=3, steps=steps, began_at=now, ended_at=now)
+    assert summary_of_night(night) == [f"tictactoe: night 5 trained tictactoe@4 {start}."]
+    assert [night_document(night)[name] for name in ("night", "number", "parent")] == [9, 5, train.get("start", 3)]
 
 
 def test_a_verdict_is_voided_with_a_reason(league: League, registry: Registry) -> None:
