@@ -179,17 +179,18 @@ def _exploiter(night: _Night) -> dict[str, Any]:
 
 
 def _measure(night: _Night) -> dict[str, Any]:
-    """Play the champion against the newest version of its exploiter."""
+    """Play the champion against its exploiters: the last version of each run."""
     exploiter = night.row.steps["exploiter"]
     target, versions = exploiter["target"], exploiter["versions"]
     if not versions:
         return {"target": target, "exploitability": None}
     if (earlier := night.earlier("measure", target)) is not None and earlier["exploitability"]:
         return earlier
+    last = {row.run: row.ref for row in night.registry.versions.all(night.config.league) if row.ref in versions}
     try:
         found = exploitability(
             CheckpointRef.parse(target),
-            versions[-1:],
+            list(last.values()),
             registry=night.registry,
             workers=night.workers,
             listener=night.listener,
