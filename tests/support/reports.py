@@ -5,7 +5,7 @@ from evaluation.results import Difference, Exploitability, ExploitabilityReport,
 
 def exploitability_report(outcome: str, exploiters: int = 2, improvement: float = 0.0) -> ExploitabilityReport:
     """A test of tictactoe@3 against the champion tictactoe@2, with the exploiters @4, @5, … and @14, @15, …"""
-    interval = (0.01, 0.19) if exploiters > 1 else (None, None)
+    over_exploiters = Difference(0.1, 0.01, 0.19) if exploiters > 1 else Difference(0.1, None, None)
     return ExploitabilityReport(
         ref="tictactoe@2",
         margin=0.1,
@@ -21,7 +21,7 @@ def exploitability_report(outcome: str, exploiters: int = 2, improvement: float 
         candidate=_exploitability("tictactoe@3", exploiters, first=4, score=0.6),
         champion=_exploitability("tictactoe@2", exploiters, first=14, score=0.5),
         difference=Difference(0.1, 0.05, 0.15),
-        difference_over_exploiters=Difference(0.1, *interval),
+        difference_over_exploiters=over_exploiters,
     )
 
 
