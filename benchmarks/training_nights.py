@@ -110,11 +110,12 @@ def _compared(config: Path) -> str:
 
 
 def _of_exploiter(found: dict[str, Any], compared: str) -> tuple[float, float, float]:
-    """The mean score or gain of the best exploiter and its interval."""
-    best = found["exploiters"][0]
-    if compared == "score":
-        return best["score"], best["low"], best["high"]
-    return best["gain"]["mean"], best["gain"]["low"], best["gain"]["high"]
+    """The mean score or gain of the best exploiter by its lower bound, and its interval."""
+    name, results = "score", found["exploiters"]
+    if compared == "gain":
+        name, results = "mean", [each["gain"] for each in results]
+    best = max(results, key=lambda each: each["low"])
+    return best[name], best["low"], best["high"]
 
 
 def _interval(found: tuple[float, float, float]) -> str:

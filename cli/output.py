@@ -13,10 +13,11 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
+from evaluation.reporting import wording
 from league.refs import short_verdict
 
 if TYPE_CHECKING:
-    from evaluation.results import CompanionReport, Difference, ExploitabilityReport, Listener, Standing, VerdictReport
+    from evaluation.results import Difference, ExploitabilityReport, Listener, Standing, VerdictReport
     from evaluation.results import Progress as Games
 
 console = Console(highlight=False)
@@ -228,29 +229,20 @@ def verdict(report: "VerdictReport") -> str:
     games = f"after {report.games} games ({report.unique_games} unique), score {score}"
     place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
     gap = f", returns differ by {difference(report.difference)}" if report.difference else ""
-    anchors = "".join(f"; {compared(each, 'to', each.ref, each.margin)}" for each in report.anchors)
+    anchors = "".join(f"; {wording.against_anchor(each, report.model)}" for each in report.anchors)
     exploiters = "".join(
-        f"; against {each.ref} {compared(each, 'than', report.opponent, each.margin)}" for each in report.exploiters
+        f"; against {each.ref} {wording.against_exploiter(each, report.opponent, report.model)}"
+        for each in report.exploiters
     )
     note = f": {report.note}" if report.note else ""
-    exploiters += "" if report.exploitability is None else f"; {exploitability(report.exploitability)}"
+    exploiters += "" if report.exploitability is None else f"; {_exploitability(report.exploitability, report.model)}"
     who = f"{short_verdict(report.verdict)}: {report.candidate} against {report.opponent}"
     return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}"
 
 
-def compared(test: "CompanionReport", preposition: str, other: str, margin: float | None) -> str:
-    """`not inferior to connect_four@1 by 50 after 600 games`"""
-    is_decided = test.outcome not in ("inconclusive", "open")
-    by = "" if margin is None else f" by {margin:g}"
-    found = f"{preposition} {other}{by}" if is_decided else f"compared with {other}"
-    return f"{test.outcome} {found} after {test.games} games"
-
-
-def exploitability(test: "ExploitabilityReport") -> str:
-    """`not more exploitable than connect_four@1 by 0.1 after 600 games: a best response scores at least 0.48 (0.45)`"""
-    # That it is less exploitable is shown, but not that it is by the improvement.
-    margin = None if test.outcome == "less exploitable" else test.improvement or test.margin
-    found = compared(test, "than", test.ref, margin)
+def _exploitability(test: "ExploitabilityReport", model: str) -> str:
+    """`not more exploitable than connect_four@1 by … after 600 games: a best response scores at least 0.48 (…), …`"""
+    found = wording.exploitability(test, model)
     if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
         return found
     return (

@@ -265,7 +265,7 @@ class VerdictReport(Document):
     counts: blocks per cell, worst for the candidate first.
     score: the candidate's mean score. elo, interval: logistic Elo above the opponent with its 95 % interval; infinite
     bounds are None.
-    alpha: error probability spent by this verdict.
+    alpha: error probability spent by this verdict. model: of the gate, which decides the units of margins.
     anchors: non-inferiority tests after the opponent was beaten. exploiters: paired tests after these.
     exploitability: the test of learned exploitability after all others; None if it was not reached or is not required.
     difference: mean return minus that of the opponent if contestants are compared on the same side or the gate
@@ -289,6 +289,7 @@ class VerdictReport(Document):
     interval: tuple[float | None, float | None] | None
     promoted: bool
     alpha: float
+    model: str
     anchors: tuple[AnchorReport, ...] = ()
     exploiters: tuple[ExploiterReport, ...] = ()
     exploitability: ExploitabilityReport | None = None

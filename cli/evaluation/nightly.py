@@ -275,7 +275,9 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
 
 def faults_of(night: "TrainingNightRow") -> list[str]:
     """The errors of a night's steps."""
-    return [f"night {night.id}, {step}: {result['error']}" for step, result in night.steps.items() if "error" in result]
+    return [
+        f"night {night.number}, {step}: {result['error']}" for step, result in night.steps.items() if "error" in result
+    ]
 
 
 def summary_of_night(night: "TrainingNightRow") -> list[str]:
@@ -283,8 +285,8 @@ def summary_of_night(night: "TrainingNightRow") -> list[str]:
     from evaluation.results import Difference
 
     versions = night.steps["train"]["versions"]
-    start = "from scratch" if night.parent is None else f"from {night.league}@{night.parent}"
-    sentences = [f"{night.league}: night {night.id} trained {', '.join(versions) or 'no version'} {start}."]
+    start = "from scratch" if night.start is None else f"from {night.league}@{night.start}"
+    sentences = [f"{night.league}: night {night.number} trained {', '.join(versions) or 'no version'} {start}."]
     if (found := night.steps["measure"]["exploitability"]) is not None:
         best = found["exploiters"][0]
         gain = "" if best["gain"] is None else f", return gain {difference(Difference(**best['gain']))}"
@@ -300,7 +302,8 @@ def night_document(night: "TrainingNightRow") -> dict[str, Any]:
     return {
         "league": night.league,
         "night": night.id,
-        "parent": night.parent,
+        "number": night.number,
+        "parent": night.start,
         "steps": night.steps,
         "began_at": night.began_at,
         "ended_at": night.ended_at,

@@ -139,12 +139,13 @@ def mixture(
 
 
 def _show(found: "MetaStrategy", shares: dict[str, float]) -> None:
+    """Print the mixture `shares`, and the scores against it."""
     table(
         ("version", "probability", "score against it"),
         [
             (ref, shares.get(ref, 0.0), score)
             for ref, _, score in sorted(
-                zip(found.refs, found.probabilities, found.scores, strict=True), key=lambda row: -row[1]
+                zip(found.refs, found.probabilities, found.scores(shares), strict=True), key=lambda row: -row[1]
             )
         ],
     )

@@ -17,7 +17,7 @@ from evaluation.gating.trained_exploiters import Trainer, check_exploiters, trai
 from evaluation.results import Listener, NightlyReport
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.errors import AlreadyRunning, LeagueError, StorageError, one_line
+from league.errors import AlreadyRunning, LeagueError, StorageError, UnknownRun, one_line
 from league.policies.loading import check_contestants
 from league.refs import CHAMPION, CheckpointRef
 from league.registry.registry import Registry
@@ -89,7 +89,7 @@ def training_night(
         night = _Night(config, registry, row, train, workers, listener, announce)
         for number, (name, step) in enumerate(STEPS.items(), 1):
             if name not in night.row.steps:
-                announce(f"{config.league}: night {row.id}, step {number} of {len(STEPS)}: {name}")
+                announce(f"{config.league}: night {row.number}, step {number} of {len(STEPS)}: {name}")
                 night.row = registry.training_nights.record(row.id, name, step(night))
         return registry.training_nights.close(row.id), night.gate_report
 
@@ -99,8 +99,17 @@ def _train(night: _Night) -> dict[str, Any]:
     parent = night.row.parent
     if parent is not None:
         parent = trainable_version(night.registry, night.config.league, parent)
-    error = _attempt(night, night.config.of_night(seed), night.row.run, parent, None)
-    return {"run": night.row.run, "versions": night.versions(night.row.run)} | error
+    run = night.row.run
+    error = _attempt(night, night.config.of_night(seed), run, parent, None)
+    return {"run": run, "versions": night.versions(run)} | _start(night, run) | error
+
+
+def _start(night: _Night, run: str) -> dict[str, int | None]:
+    """The version that a run started from, which `train` decides; nothing if it never began."""
+    try:
+        return {"start": night.registry.runs.get(night.config.league, run).parent}
+    except UnknownRun:
+        return {}
 
 
 def _seed(night: _Night, *path: str) -> int:
@@ -174,17 +183,18 @@ def _exploiter(night: _Night) -> dict[str, Any]:
 
 
 def _measure(night: _Night) -> dict[str, Any]:
-    """Play the champion against the newest version of its exploiter."""
+    """Play the champion against its exploiters: the last version of each run."""
     exploiter = night.row.steps["exploiter"]
     target, versions = exploiter["target"], exploiter["versions"]
     if not versions:
         return {"target": target, "exploitability": None}
     if (earlier := night.earlier("measure", target)) is not None and earlier["exploitability"]:
         return earlier
+    last = {row.run: row.ref for row in night.registry.versions.all(night.config.league) if row.ref in versions}
     try:
         found = exploitability(
             CheckpointRef.parse(target),
-            versions[-1:],
+            list(last.values()),
             registry=night.registry,
             workers=night.workers,
             listener=night.listener,

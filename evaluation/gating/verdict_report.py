@@ -134,6 +134,7 @@ def report_of(
         **gate_statistics(seen.champion),
         promoted=is_applied(registry, verdict),
         alpha=verdict.alpha,
+        model=gate_of(verdict).model,
         anchors=tuple(map(anchor_report, seen.anchors)),
         exploiters=tuple(map(exploiter_report, seen.exploiters)),
         exploitability=exploitability_report(seen.exploitability, verdict.candidate_ref),

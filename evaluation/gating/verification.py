@@ -70,6 +70,8 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     outcome = VOID if row.outcome == VOID else str(seen.outcome)
     note = seen.note if outcome not in (VOID, "promote") else row.evidence.get("note")
     computed = report_of(registry, row, outcome, seen, note).to_json()
+    if "model" not in row.evidence:
+        del computed["model"]  # recorded by an earlier release
     if row.outcome == VOID:
         # A voided verdict keeps its evidence, which is empty if it was open.
         computed = {name: value for name, value in computed.items() if name in row.evidence and name != "outcome"}

@@ -17,7 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from evaluation.gating.verdict_evidence import VerdictEvidence
-from evaluation.reporting import charts
+from evaluation.reporting import charts, wording
 from evaluation.reporting.flipbook import Flipbook
 from evaluation.reporting.league_report import LeagueReport
 from evaluation.results import Confirmation, Difference, Standing
@@ -87,7 +87,9 @@ def _templates() -> Environment:
         "difference": _difference,
         "elo": _elo,
         "evidence": _evidence,
+        "exploitability": wording.exploitability,
         "interval": _interval,
+        "margin_unit": wording.margin_unit,
         "timestamp": _timestamp,
         "outcome": _outcome,
         "percent": _percent,

@@ -30,16 +30,24 @@ class MetaStrategy:
     Attributes:
         refs: The contestants that have played each other, (n,).
         probabilities: Of each, (n,).
-        scores: Mean score of each against an opponent that is drawn with these probabilities, (n,).
+        payoff: Mean score of each against each other, (n, n).
         games: Number of games between them.
         unmet: Number of pairs without a game, which count as equally strong.
     """
 
     refs: tuple[str, ...]
     probabilities: tuple[float, ...]
-    scores: tuple[float, ...]
+    payoff: tuple[tuple[float, ...], ...]
     games: float
     unmet: int
+
+    def scores(self, shares: Mapping[str, float]) -> tuple[float, ...]:
+        """Return the mean score of each contestant against an opponent that is drawn from `shares`, (n,).
+
+        shares: contestant → probability, which is 0 for those that it lacks.
+        """
+        drawn = np.array([shares.get(ref, 0.0) for ref in self.refs])
+        return tuple((np.array(self.payoff) @ drawn).tolist())
 
 
 def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: str = "nash") -> MetaStrategy:
@@ -74,7 +82,7 @@ def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: s
     return MetaStrategy(
         refs=playing,
         probabilities=tuple(shares.tolist()),
-        scores=tuple((table @ shares).tolist()),
+        payoff=tuple(map(tuple, table.tolist())),
         games=sum(each.games for each in pairs),
         unmet=len(playing) * (len(playing) - 1) // 2 - len(met),
     )

@@ -27,12 +27,12 @@ function Charts({ nights }) {
   return html`<div class="curves">
     ${rated.length > 0 && html`<article><h3>Strength</h3>
       <${Chart} label="Ratings of the champions of ${rated.length} nights. Last: ${last.rated.champion} with ${signed(last.rated.rating)} Elo." xName="night" yName="Elo"
-        x=${rated.map((night) => night.night)} lines=${[{ name: "rating of the champion", values: rated.map((night) => night.rating), dots: true }]}
+        x=${rated.map((night) => night.number)} lines=${[{ name: "rating of the champion", values: rated.map((night) => night.rating), dots: true }]}
         intervals=${rated.map((night) => night.interval)} format=${(value) => signed(value)} />
       <p class="muted small">Current rating of the champion after each night, with 95 % intervals.</p></article>`}
     ${measured.length > 0 && html`<article><h3>Learned exploitability</h3>
       <${Chart} label="Scores of exploiters in ${measured.length} nights. Last: ${percent(last.measured.score)}, 95 % interval ${range(last.measured)}." xName="night" yName="score"
-        x=${measured.map((night) => night.night)} lines=${[{ name: "score of the exploiter", values: measured.map((night) => night.exploitability.score), dots: true }]}
+        x=${measured.map((night) => night.number)} lines=${[{ name: "score of the exploiter", values: measured.map((night) => night.exploitability.score), dots: true }]}
         intervals=${measured.map(({ exploitability: { low, high } }) => [low, high])} thresholds=${[{ name: "even", value: 0.5, tone: "muted" }]} format=${(share) => percent(share, 0)} />
       <p class="muted small">The score of the best exploiter against the champion, with its interval. A best response scores at least the lower end. The return gain is its mean return minus that of the champion.</p></article>`}
   </div>`;
@@ -43,12 +43,12 @@ function List({ league, nights }) {
   return html`<${Table} caption="Nights, newest first" head=${head} cls="full">${nights.map((night) => html`<${Row} key=${night.night} league=${league} night=${night} />`)}<//>`;
 }
 
-function Row({ league, night: { night, run, exploiter_run: exploiterRun, versions, champion, champion_before: before, rating, interval: bounds, exploitability, errors, began_at: began, ended_at: ended } }) {
+function Row({ league, night: { number: place, run, exploiter_run: exploiterRun, parent, versions, champion, champion_before: before, rating, interval: bounds, exploitability, errors, began_at: began, ended_at: ended } }) {
   const score = exploitability && html`${percent(exploitability.score)} <small class="muted">${range(exploitability)}</small>`;
   return html`<tr>
-    <th scope="row" class="number">${night}</th>
+    <th scope="row" class="number">${place}</th>
     <td class="nowrap"><${Time} at=${began} date />${!ended && html` <small class="muted">not complete</small>`}</td>
-    <td><a href=${leaguePath(league, "runs", run)}>${versions.map(shortRef).join(", ") || "none"}</a></td>
+    <td><a href=${leaguePath(league, "runs", run)}>${versions.map(shortRef).join(", ") || "none"}</a>${versions.length > 0 && html` <small class="muted">from ${parent == null ? "scratch" : shortRef(parent)}</small>`}</td>
     <td class="nowrap">${champion ? html`<span class="ref">${shortRef(champion)}</span>${champion !== before && html` <small>new</small>`}` : html`<span class="muted">–</span>`}</td>
     <td class="number strong">${signed(rating)}</td><td class="nowrap muted">${interval(bounds)}</td>
     <td class="number nowrap">${score && exploiterRun ? html`<a href=${leaguePath(league, "runs", exploiterRun)}>${score}</a>` : score ?? html`<span class="muted">–</span>`}</td>

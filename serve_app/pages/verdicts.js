@@ -49,8 +49,8 @@ export function Verdict({ league, verdict }) {
       <${Evidence} verdict=${loaded} />
       <${Statistics} league=${league} verdict=${loaded} />
       ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
-      ${loaded.exploiters?.length > 0 && html`<${Exploiters} exploiters=${loaded.exploiters} />`}
-      ${loaded.exploitability && html`<${Exploitability} test=${loaded.exploitability} candidate=${loaded.candidate} />`}
+      ${loaded.exploiters?.length > 0 && html`<${Exploiters} exploiters=${loaded.exploiters} model=${loaded.model} />`}
+      ${loaded.exploitability && html`<${Exploitability} test=${loaded.exploitability} candidate=${loaded.candidate} model=${loaded.model} />`}
       ${loaded.confirmation && html`<${Confirmation} match=${loaded.confirmation} />`}`}
     <//>
   </section>`;
@@ -106,24 +106,27 @@ function Anchors({ anchors }) {
     <//>`;
 }
 
-function Exploiters({ exploiters }) {
+/** The unit of the margins of tests with exploiters. */
+const marginUnit = (model) => (model === "returns" ? "in returns" : "of all points");
+
+function Exploiters({ exploiters, model }) {
   const name = "Against exploiters, compared with the champion";
   return html`<h3>${name}</h3>
-    <${Table} caption=${name} head=${[["Exploiter"], ["Of"], ["Outcome"], ["Margin", "number"], ["Games", "number"], ["LLR", "number"], ["Score", "number"], ["Champion’s score", "number"], ["Difference", "number"]]}>
+    <${Table} caption=${name} head=${[["Exploiter"], ["Of"], ["Outcome"], [`Margin ${marginUnit(model)}`, "number"], ["Games", "number"], ["LLR", "number"], ["Score", "number"], ["Champion’s score", "number"], ["Difference", "number"]]}>
       ${exploiters.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td><span class="ref">${each.exploits}</span></td><td>${each.outcome}</td><td class="number">${each.margin}</td>
         <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${percent(each.score)}</td><td class="number">${percent(each.champion_score)}</td>
         <td class="number">${each.difference && html`${signed(each.difference.mean, 3)} <small>${number(each.difference.low, 3)} to ${number(each.difference.high, 3)}</small>`}</td></tr>`)}
     <//>`;
 }
 
-function Exploitability({ test, candidate }) {
+function Exploitability({ test, candidate, model }) {
   const bounds = [test.candidate, test.champion].filter(Boolean);
   const rows = bounds.flatMap((side) => side.exploiters.map((each) => [side, each]));
   const gap = (difference) => `${signed(difference.mean, 3)}${difference.low == null ? "" : ` (${signed(difference.low, 3)} to ${signed(difference.high, 3)})`}`;
   const name = "Learned exploitability";
   const isDecided = !["inconclusive", "open"].includes(test.outcome);
   return html`<h3>${name}</h3>
-    <p><span class="ref">${candidate}</span> is ${test.outcome} ${isDecided ? "than" : "compared with"} <span class="ref">${test.ref}</span>${isDecided && test.outcome !== "less exploitable" && ` by ${test.improvement || test.margin}`} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
+    <p><span class="ref">${candidate}</span>: ${test.outcome} ${isDecided ? "than" : "compared with"} <span class="ref">${test.ref}</span>${isDecided && test.outcome !== "less exploitable" && ` by ${test.improvement || test.margin} ${marginUnit(model)}`} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
       ${bounds.map((side) => html` A best response to <span class="ref">${side.ref}</span> scores at least ${percent(side.bound)}.`)}</p>
     ${test.difference && html`<p>The exploiters of the candidate achieve ${gap(test.difference)} more than those of the champion.
       The 95 % interval is for these exploiters${test.difference_over_exploiters.low == null ? "" : `; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}`}.</p>`}

@@ -47,9 +47,10 @@ def _night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> dict[str, Any]:
     rated = ratings.get(champion, {})
     return {
         "night": row.id,
+        "number": row.number,
         "run": row.run,
         "exploiter_run": row.steps.get("exploiter", {}).get("run"),
-        "parent": row.parent,
+        "parent": row.start,
         "versions": train.get("versions", []),
         "champion_before": gate.get("champion_before"),
         "champion": champion,

@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from cli import output
-from evaluation.results import AnchorReport, Progress
+from evaluation.results import Progress
 
 
 @pytest.fixture
@@ -32,29 +32,3 @@ def test_quiet_progress_prints_nothing(printed: StringIO) -> None:
     with output.GameProgress(quiet=True) as listener:
         listener(Progress("a against b", 8, 16))
     assert printed.getvalue() == ""
-
-
-@pytest.mark.parametrize(
-    ("outcome", "expected"),
-    [
-        ("not inferior", "not inferior to memory@1 by 50 after 200 games"),
-        ("inconclusive", "inconclusive compared with memory@1 after 200 games"),
-    ],
-)
-def test_a_comparison_that_is_not_decided_names_no_margin(outcome: str, expected: str) -> None:
-    test = AnchorReport(
-        ref="memory@1",
-        margin=50,
-        schedule="s",
-        outcome=outcome,
-        llr=0.0,
-        bounds=(-3.0, 3.0),
-        blocks=100,
-        games=200,
-        unique_games=200,
-        counts=(0, 0, 100, 0, 0),
-        score=0.5,
-        elo=0.0,
-        interval=(-10.0, 10.0),
-    )
-    assert output.compared(test, "to", test.ref, test.margin) == expected

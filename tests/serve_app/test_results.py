@@ -228,6 +228,7 @@ def test_a_run_has_the_strength_of_its_versions(reader: TestClient) -> None:
 def test_nights_have_the_strength_and_the_exploitability_of_their_champions(reader: TestClient) -> None:
     (open_night,), (night,) = pages(reader, f"{BOARD}/nights", "Nights", "nights", limit=1)
     assert (night["versions"], night["champion_before"], night["champion"]) == (["board@2"], "board@1", "board@2")
+    assert [(each["number"], each["parent"]) for each in (open_night, night)] == [(2, 2), (1, 3)]
     assert (night["rating"], night["errors"]) == (200.0, ["exploiter: the disk is full"])
     expected = {"bound": 0.625, "exploiter": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875}
     assert night["exploitability"] == expected | {"gain": {"mean": 1.5, "low": 0.5, "high": 2.5}}

@@ -375,13 +375,25 @@ class TrainingNightRow:
     """A night of training of a league; `ended_at` is None while it runs."""
 
     id: int
+    """Unique among all leagues."""
+    number: int
+    """Its place among the nights of the league, from 1."""
     league: str
     parent: int | None
-    """The version that training continues from."""
+    """The champion when it began, or without one the newest version."""
     steps: dict[str, Any]
     """step → result of each complete step"""
     began_at: datetime
     ended_at: datetime | None
+
+    @property
+    def start(self) -> int | None:
+        """The version that its training started from, which may be another one than `parent`; None: from scratch.
+
+        `parent` if none is recorded: before the end of training, or in a night of an earlier release.
+        """
+        start: int | None = self.steps.get("train", {}).get("start", self.parent)
+        return start
 
     @property
     def run(self) -> str:

@@ -7,7 +7,7 @@ was interrupted.
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from league.refs import CHAMPION
@@ -35,7 +35,7 @@ class TrainingNightRepository(Repository):
                 night = TrainingNightTable(league=league, parent=parent, steps={}, began_at=datetime.now(UTC))
                 session.add(night)
                 session.flush()
-            return detached(TrainingNightRow, night)
+            return _row(session, night)
 
     @repeat_after_deadlock
     def record(self, night: int, step: str, result: dict[str, Any]) -> TrainingNightRow:
@@ -43,7 +43,7 @@ class TrainingNightRepository(Repository):
         with self._database.write() as session:
             row = session.get_one(TrainingNightTable, night, with_for_update=True)
             row.steps = {step: result} | row.steps
-            return detached(TrainingNightRow, row)
+            return _row(session, row)
 
     @repeat_after_deadlock
     def close(self, night: int) -> TrainingNightRow:
@@ -51,14 +51,21 @@ class TrainingNightRepository(Repository):
         with self._database.write() as session:
             row = session.get_one(TrainingNightTable, night, with_for_update=True)
             row.ended_at = row.ended_at or datetime.now(UTC)
-            return detached(TrainingNightRow, row)
+            return _row(session, row)
 
     def all(self, league: str) -> list[TrainingNightRow]:
         """Return all nights of a league, oldest first. Raises UnknownLeague."""
         query = select(TrainingNightTable).filter_by(league=league).order_by(TrainingNightTable.id)
         with self._database.read() as session:
             leagues.require(session, league)
-            return [detached(TrainingNightRow, night) for night in session.scalars(query)]
+            nights = enumerate(session.scalars(query), 1)
+            return [detached(TrainingNightRow, night, number=number) for number, night in nights]
+
+
+def _row(session: Session, night: TrainingNightTable) -> TrainingNightRow:
+    table = TrainingNightTable
+    until = select(func.count()).select_from(table).where(table.league == night.league, table.id <= night.id)
+    return detached(TrainingNightRow, night, number=session.scalars(until).one())
 
 
 def _champion(session: Session, league: str) -> int | None:

@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from cli.evaluation.nightly import night_document, summary_of_night
 from league.config.gate import GateConfig
 from league.registry.registry import Registry
+from league.registry.storage.rows import TrainingNightRow
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 
@@ -134,6 +137,23 @@ def test_a_version_that_cannot_be_tested_gives_exit_code_1(league: League, regis
     assert result.code == 1
     assert any("tictactoe@2" in fault for fault in result.json["faults"])
     assert len(result.json["leagues"][0]["verdicts"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("train", "start"),
+    [
+        ({"start": 2}, "from tictactoe@2"),
+        ({"start": None}, "from scratch"),
+        ({}, "from tictactoe@3"),  # recorded by an earlier release
+    ],
+)
+def test_the_summary_of_a_night_names_the_version_that_training_started_from(train: dict[str, Any], start: str) -> None:
+    """The champion, version 3, was imported or is a mixture."""
+    steps = {"train": {"versions": ["tictactoe@4"]} | train, "measure": {"exploitability": None}}
+    now = datetime.now(UTC)
+    night = TrainingNightRow(id=9, number=5, league="tictactoe", parent=3, steps=steps, began_at=now, ended_at=now)
+    assert summary_of_night(night) == [f"tictactoe: night 5 trained tictactoe@4 {start}."]
+    assert [night_document(night)[name] for name in ("night", "number", "parent")] == [9, 5, train.get("start", 3)]
 
 
 def test_a_verdict_is_voided_with_a_reason(league: League, registry: Registry) -> None:

@@ -7,6 +7,8 @@ from league.results.payoffs import MetaStrategy
 from tests.support.command import League
 from tests.support.servers.streaming import listening
 
+REFS = ("tictactoe@1", "tictactoe@2", "tictactoe@3")
+
 
 def test_a_mixture_is_promoted_shown_and_rolled_back(league: League, registry: Registry) -> None:
     league("promote", "tictactoe@1")
@@ -73,10 +75,25 @@ def test_the_equilibrium_is_shown_and_becomes_an_alias(
     target = registry.versions.resolve("tictactoe@mix")
     assert target.mixture is None or set(target.mixture.versions) <= {1, 2, 3}
     assert "'best': expected nash or alpha_rank" in league("mixture", "tictactoe", "--method", "best").err
-    alike = MetaStrategy(tuple(f"tictactoe@{number}" for number in (1, 2, 3)), (1 / 3,) * 3, (0.5,) * 3, 60, 0)
+    alike = MetaStrategy(REFS, (1 / 3,) * 3, ((0.5,) * 3,) * 3, 60, 0)
     monkeypatch.setattr("league.results.payoffs.meta_strategy", lambda *_: alike)
     refused = league("mixture", "tictactoe", "--at-least", "0.4", "--alias", "mix", "--yes")
     assert refused.err == "league: --at-least 0.4: no version is as probable; the highest probability is 0.333\n"
+
+
+def test_scores_are_those_against_the_mixture_that_is_shown(
+    league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third version is left out: three of five opponents are the first version, the others the second."""
+    payoff = ((0.5, 0.8, 0.2), (0.2, 0.5, 0.9), (0.8, 0.1, 0.5))
+    found = MetaStrategy(REFS, (1 / 2, 1 / 3, 1 / 6), payoff, 60, 0)
+    monkeypatch.setattr("league.results.payoffs.meta_strategy", lambda *_: found)
+    lines = league("mixture", "tictactoe", "--at-least", "0.2").out.splitlines()[1:4]
+    assert [line.split() for line in lines] == [
+        ["tictactoe@1", "0.600", "0.620"],
+        ["tictactoe@2", "0.400", "0.320"],
+        ["tictactoe@3", "0.000", "0.520"],
+    ]
 
 
 def test_what_needs_one_policy_names_the_members(league: League, registry: Registry) -> None:

@@ -9,6 +9,7 @@ import pytest
 from filelock import FileLock
 
 from evaluation.gating.training_night import training_night
+from league.config.league import LeagueConfig
 from league.errors import AlreadyRunning, ConfigError
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
@@ -121,7 +122,8 @@ def test_failed_training_is_recorded_and_the_night_goes_on(registry: Registry) -
 
     night, report = training_night(CONFIG, registry=registry, train=fail)
     assert night.parent == 1, "the newest version, without a champion"
-    assert night.steps["train"]["error"] == "no such opponent"
+    assert night.steps["train"] == {"run": night.run, "versions": [], "error": "no such opponent"}
+    assert night.start == 1
     assert report is not None
     assert report.champion == "tictactoe@1"
     assert night.steps["exploiter"]["error"] == "no such opponent"
@@ -135,7 +137,7 @@ def test_a_night_continues_the_likeliest_member_and_tests_against_the_mixture(re
     registry.aliases.set(LEAGUE, "champion", number, expected=ANY, actor="me", reason="test")
     trainer = HandwrittenTrainer(registry, lambda *_: WEAK)
     night, _ = training_night(CONFIG, registry=registry, train=trainer)
-    assert (night.parent, trainer.calls[0][1]) == (3, 1)
+    assert (night.parent, trainer.calls[0][1], night.steps["train"]["start"], night.start) == (3, 1, 1, 1)
     assert night.steps["gate"]["champion_before"] == "tictactoe@3"
     assert night.steps["gate"]["verdicts"][0]["opponent"] == "tictactoe@3"
     assert {verdict["candidate"] for verdict in night.steps["gate"]["verdicts"]} == {
@@ -143,6 +145,18 @@ def test_a_night_continues_the_likeliest_member_and_tests_against_the_mixture(re
     }
     played = [match for match in Ledger(registry).matches(league=LEAGUE) if "tictactoe@3" in match.contestants]
     assert {member for match in played for game in match.games for member in game.members} == {1, 2, None}
+
+
+def test_the_trainer_decides_where_a_night_starts(registry: Registry) -> None:
+    """As with an imported champion, which cannot be trained further."""
+    tictactoe.publish(registry, STRONG)
+    inner = HandwrittenTrainer(registry, lambda *_: WEAK)
+
+    def from_scratch(config: LeagueConfig, *, name: str, parent: int | None, target: str | None) -> None:
+        inner(config, name=name, parent=None, target=target)
+
+    night, _ = training_night(CONFIG, registry=registry, train=from_scratch)
+    assert (night.parent, night.steps["train"]["start"], night.start) == (1, None, None)
 
 
 def test_a_run_in_another_process_leaves_the_night_open(registry: Registry) -> None:

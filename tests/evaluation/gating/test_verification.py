@@ -88,6 +88,7 @@ CHANGES: dict[str, Any] = {
     "promoted": False,
     "candidate": "tictactoe@9",
     "opponent": "script:one_ply",
+    "model": "returns",
 }
 
 
@@ -100,6 +101,14 @@ def test_each_change_of_the_evidence_is_reported(registry: Registry, name: str) 
         stored.evidence = {**stored.evidence, name: CHANGES[name]}  # type: ignore[dict-item]
     with pytest.raises(VerdictRefuted, match=f"{name} is .*but the games give"):
         verify(row.id, registry=registry)
+
+
+def test_a_record_of_an_earlier_release_is_verified(registry: Registry) -> None:
+    row = verdicts(registry)[0]
+    with registry.database.write() as session:
+        stored = session.get_one(tables.VerdictTable, row.id)
+        stored.evidence = {name: value for name, value in (stored.evidence or {}).items() if name != "model"}
+    assert verify(row.id, registry=registry).outcome == "promote"
 
 
 def change_moves(registry: Registry, verdict: str, change: Callable[[list[Any]], None], position: int = 0) -> None:

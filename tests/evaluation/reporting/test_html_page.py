@@ -19,6 +19,7 @@ from league.errors import StorageError
 from league.refs import short_verdict
 from tests.support.leagues import reported_league
 from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.reports import exploitability_report
 
 BLOCKS = {"td", "th", "li", "p", "dt", "dd", "h3", "b", "caption", "span"}
 VOID = {"meta", "link", "img", "input", "br", "hr"}
@@ -245,6 +246,31 @@ def test_optional_fields_of_a_verdict_are_shown(report: LeagueReport) -> None:
     assert "script:one_ply inferior 30 −3 [−2.9, +2.9] 84" in text
     assert "Confirmation match: +31 Elo [+4, +59], score 0.544, 400 games, returns differ by +1.5 [" in text
     assert "[−∞, +70]" in text
+
+
+@pytest.mark.parametrize(
+    ("model", "outcome", "expected"),
+    [
+        ("normalized", "more exploitable", "more exploitable than tictactoe@2 by 0.1 of all points"),
+        ("returns", "more exploitable", "more exploitable than tictactoe@2 by 0.1 in returns"),
+        ("normalized", "less exploitable", "less exploitable than tictactoe@2"),
+        ("normalized", "inconclusive", "inconclusive compared with tictactoe@2"),
+        ("normalized", "open", "open compared with tictactoe@2"),
+    ],
+)
+@pytest.mark.parametrize("exploiters", [1, 2])
+def test_exploitability_is_compared(
+    report: LeagueReport, model: str, outcome: str, expected: str, exploiters: int
+) -> None:
+    test = exploitability_report(outcome, exploiters, improvement=0.05 if outcome == "less exploitable" else 0.0)
+    verdict = replace(report.verdicts[0], candidate="tictactoe@3", model=model, exploitability=test)
+    (_, text), *_ = PageParser(render_page(replace(report, verdicts=(verdict,)))).all("article", "verdict")
+    assert f"tictactoe@3: {expected} after 600 games, LLR −3 of [−2.9, +2.9]." in text
+    assert "tictactoe@3 tictactoe@4 400 0.600 [0.500, 0.700] +0.25 [+0.125, +0.375]" in text
+    assert "A best response to tictactoe@2 scores at least 0.400." in text
+    with_others = "; +0.1 [+0.01, +0.19] with an interval for others that are trained in the same way"
+    of_others = with_others if exploiters > 1 else ""
+    assert f"more than those of the champion, with an interval for these exploiters{of_others}." in text
 
 
 @pytest.mark.parametrize("league", [reported_league.empty, reported_league.league_with_roles])

@@ -24,7 +24,8 @@ class HandwrittenTrainer:
         if name in {row.run for row in rows}:
             return
         settings = config.training.model_dump(mode="json", by_alias=True)
-        runs.begin(LEAGUE, name, algorithm="ppo", settings=settings, seed=config.training.seed, target=100)
+        seed = config.training.seed
+        runs.begin(LEAGUE, name, algorithm="ppo", settings=settings, seed=seed, target=100, parent=parent)
         graph = self._choose(len(rows), target)
         tictactoe.publish(self._registry, graph, exploits=target, source=f"{name}/100", settings=settings)
         runs.end(LEAGUE, name, "ended")

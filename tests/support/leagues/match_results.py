@@ -18,7 +18,7 @@ STRENGTH = StrengthRow(2, 200, "board@1", 40, 0.625, 0.5, 0.75, datetime(2026, 3
 GAIN = {"mean": 1.5, "low": 0.5, "high": 2.5}
 EXPLOITER_SCORE = {"ref": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875, "gain": GAIN}
 NIGHT = {
-    "train": {"run": "first", "versions": ["board@2"]},
+    "train": {"run": "first", "versions": ["board@2"], "start": 3},
     "gate": {"champion_before": "board@1", "champion": "board@2", "verdicts": []},
     "exploiter": {"target": "board@2", "run": "exploiter", "versions": ["board@3"], "error": "the disk is full"},
     "measure": {"exploitability": {"ref": "board@2", "bound": 0.625, "exploiters": [EXPLOITER_SCORE]}},
