@@ -191,9 +191,7 @@ class OffPolicy(LeagueAlgorithm):
         priorities = self.settings.priorities
         if priorities is None:
             return 1.0
-        limit = self.settings.max_steps
-        done = self.progress.budget if limit is None else min(self.steps / limit, 1.0)
-        return priorities.beta + (1 - priorities.beta) * done
+        return priorities.beta + (1 - priorities.beta) * self.progress.budget
 
 
 def off_policy_config(

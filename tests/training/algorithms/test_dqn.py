@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 
 from league.config.league import LeagueConfig
-from league.config.off_policy import DQNConfig
 from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
@@ -210,14 +208,11 @@ def test_a_buffer_of_another_capacity_is_rejected(tmp_path: Path) -> None:
         restored.stop()
 
 
-def test_exploration_and_priorities_follow_their_schedules(monkeypatch: pytest.MonkeyPatch) -> None:
-    league = solvable_by_dqn(
-        "discrete", steps=4096, priorities={"beta": 0.4}, exploration={"steps": 2048, "final": 0.1}
-    )
-
-    def inspect_algorithm(algorithm: OffPolicy, result: dict[str, Any]) -> tuple[float, float, float]:
-        return algorithm.steps, result["exploration"], algorithm._beta
-
+def test_exploration_follows_the_steps_and_the_correction_by_priorities_the_budget(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Steps include those of parent versions, the budget is the run's own."""
+    league = solvable_by_dqn("discrete", priorities={"beta": 0.4}, exploration={"steps": 2048, "final": 0.1})
     betas: list[float] = []
     sample = ReplayBuffer.sample
 
@@ -225,22 +220,15 @@ def test_exploration_and_priorities_follow_their_schedules(monkeypatch: pytest.M
         betas.append(beta)
         return sample(self, *arguments, beta=beta, **options)
 
+    def inspect_algorithm(algorithm: OffPolicy, result: dict[str, Any]) -> tuple[int, float, float]:
+        algorithm.progress = ScheduleProgress(algorithm.steps, budget=0.25)
+        algorithm.draw_sample(algorithm.replays["shared"])
+        return algorithm.steps, result["exploration"], betas[-1]
+
     monkeypatch.setattr(ReplayBuffer, "sample", record_beta)
     assert train(league, 1, inspect_algorithm) == (1024, pytest.approx(0.55), pytest.approx(0.55))
-    assert betas == sorted(betas)
-    assert 0.4 < betas[0] < 0.5 < betas[-1] == pytest.approx(0.55)
-    assert train(league, 3, inspect_algorithm) == (3072, pytest.approx(0.1), pytest.approx(0.85))
-
-
-def test_the_correction_by_priorities_follows_the_time_if_only_that_is_limited() -> None:
-    assert OffPolicy._beta.fget is not None
-    for settings, expected in (({"minutes": 5}, 0.7), ({"steps": 1000, "minutes": 5}, 0.55)):
-        algorithm = SimpleNamespace(
-            settings=DQNConfig.model_validate({"algorithm": "dqn", "priorities": {"beta": 0.4}, **settings}),
-            progress=ScheduleProgress(steps=250, budget=0.5),
-            steps=250,
-        )
-        assert OffPolicy._beta.fget(algorithm) == pytest.approx(expected)
+    assert betas[0] == 0.4
+    assert train(league, 3, inspect_algorithm) == (3072, pytest.approx(0.1), pytest.approx(0.55))
 
 
 @pytest.mark.parametrize("settings", [{}, ALL_EXTENSIONS, MEMORY], ids=["plain", "all extensions", "recurrent"])
