@@ -1,6 +1,6 @@
 """Settings of the algorithms with a replay buffer: DQN, QMIX and MADDPG."""
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -139,6 +139,8 @@ class MADDPGConfig(OffPolicyConfig):
     """
 
     algorithm: Literal["maddpg"]
+    supports_opponents: ClassVar[bool] = False
+    """Critics need the observations and actions of all agents."""
     lr: float = Field(default=0.01, gt=0)
     gamma: float = Field(default=0.95, ge=0, le=1)
     grad_clip: float = Field(default=0.5, gt=0)
