@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config.off_policy import PrioritiesConfig
-from league.errors import ConfigError
 from league.seeds import generator
 
 
@@ -240,13 +239,9 @@ class ReplayBuffer:
         (directory / STATE_FILE).write_text(json.dumps(state))
 
     def load(self, directory: Path) -> None:
-        """Load what `save` wrote. Raises ConfigError if it had another capacity."""
+        """Load what `save` wrote. The capacity must be the same."""
         state = json.loads((directory / STATE_FILE).read_text())
-        if state["capacity"] != self.capacity:
-            raise ConfigError(
-                f"training.replay_capacity: the checkpoint's buffer has {state['capacity']}, got {self.capacity}: use"
-                " the same capacity, or discard the buffer with replay_in_checkpoint: false"
-            )
+        assert state["capacity"] == self.capacity
         self._added, self._largest = state["added"], state["largest"]
         with np.load(directory / ROWS_FILE, allow_pickle=False) as kept:
             self._columns = {}
@@ -305,6 +300,11 @@ class ReplayBuffer:
             if name.startswith(FLAGS):
                 ends |= column[indices].reshape(len(indices), -1).any(axis=1)
         return ends
+
+
+def saved_capacity(directory: Path) -> int:
+    """Return the capacity of a buffer that was saved."""
+    return int(json.loads((directory / STATE_FILE).read_text())["capacity"])
 
 
 def subcolumns(rows: Mapping[str, Column], prefix: str) -> dict[str, Column]:

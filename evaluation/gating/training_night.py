@@ -171,6 +171,9 @@ def _exploiter(night: _Night) -> dict[str, Any]:
     league = night.registry.leagues.get(night.config.league)
     if target is None or share == 0 or len(league.interface.sides) < 2:
         return {"target": target, "versions": []}
+    if not (training := night.config.training).supports_opponents:
+        night.announce(f"{league.slug}: {training.algorithm} does not support opponents, so {target} gets no exploiter")
+        return {"target": target, "versions": []}
     if (earlier := night.earlier("exploiter", target)) is not None and earlier["versions"]:
         return earlier
     run, config = night.row.exploiter_run, night.config.of_night(_seed(night, "exploiter"), share)

@@ -1,6 +1,6 @@
 """Settings of the algorithms with a replay buffer: DQN, QMIX and MADDPG."""
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -40,8 +40,8 @@ class OffPolicyConfig(TrainingSettings):
     replay_capacity: int = Field(default=100_000, ge=1)
     """Capacity of the replay buffer: transitions of each policy, or joint transitions of all agents."""
     replay_in_checkpoint: bool = True
-    """Whether checkpoints include the replay buffer. Without it, resumed training starts with an empty buffer and
-    differs from uninterrupted training."""
+    """Whether checkpoints include the replay buffer. Without it, or with another capacity than the version's, training
+    that continues from a version starts with an empty buffer and differs from uninterrupted training."""
     learning_starts: int = Field(default=1_000, ge=1)
     """Number of transitions in the buffer at which learning starts."""
     batch_size: int = Field(default=256, ge=1)
@@ -139,6 +139,8 @@ class MADDPGConfig(OffPolicyConfig):
     """
 
     algorithm: Literal["maddpg"]
+    supports_opponents: ClassVar[bool] = False
+    """Critics need the observations and actions of all agents."""
     lr: float = Field(default=0.01, gt=0)
     gamma: float = Field(default=0.95, ge=0, le=1)
     grad_clip: float = Field(default=0.5, gt=0)

@@ -1,6 +1,6 @@
 """The `training` section: settings common to all algorithms; and the `nightly` section."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -34,6 +34,8 @@ class StrengthConfig(Part):
 class TrainingSettings(Part):
     """Settings common to all algorithms."""
 
+    supports_opponents: ClassVar[bool] = True
+    """Whether the algorithm can train against opponents, which exploiters need."""
     seed: int = Field(default=0, ge=0)
     """Seed of the run, from which all random choices are derived."""
     steps: int | None = Field(default=None, ge=1)

@@ -47,14 +47,15 @@ class LeagueAlgorithm(NoResultsDirectory, Algorithm):
         torch.manual_seed(derive(self.config.seed or 0, "learner", steps))
 
     def exchange_opponents(self, results: Sequence[Mapping[str, Any]], actions: int) -> None:
-        """Add the games of an update, log the scores, and draw the opponents of the next one.
+        """Add the episodes of an update, log shares and scores, and draw the opponents of the next one.
 
         results: the runners' metrics. actions: of all agents in the update.
         """
         self.opponents.add(results, actions)
         for ref, share in self.opponents.shares().items():
-            self.metrics.log_value((OPPONENTS, ref, SCORE), self.opponents.score(ref), window=1)
             self.metrics.log_value((OPPONENTS, ref, SHARE), share, window=1)
+        for ref, score in self.opponents.scores().items():
+            self.metrics.log_value((OPPONENTS, ref, SCORE), score, window=1)
         self.opponents.draw()
 
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:

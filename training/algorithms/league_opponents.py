@@ -1,7 +1,8 @@
 """The opponents that a run draws from the versions of its league.
 
 The learner's scores are those of its training games. They decay, because the learner changes, and are shrunk towards a
-prior: ½, or the parent version's score in the league's matches. A version that the run publishes becomes a candidate;
+prior: ½, or the parent version's score in the league's matches. Shares of the episodes are counted apart from them,
+since the games of some leagues are not scored. A version that the run publishes becomes a candidate;
 the learner's scores at its checkpoint become its row of the payoff matrix.
 """
 
@@ -23,10 +24,12 @@ from league.results.payoffs import UNKNOWN, Scores, payoff_matrix, shrunk
 from league.seeds import generator
 from league.settings import Storage
 from training.algorithms.opponent_distribution import opponent_distribution, systematic_counts
-from training.sampling.self_play import GAMES, OPPONENTS, SCORE
+from training.sampling.self_play import EPISODES, GAMES, OPPONENTS, SCORE
 
 HALF_LIFE = 200_000
-"""Actions of all agents after which a training game counts half."""
+"""Actions of all agents after which an episode or a game counts half."""
+LEAST_EPISODES = 0.01
+"""Episodes, after this decay, below which an opponent is forgotten."""
 
 
 class LeagueOpponents:
@@ -41,7 +44,8 @@ class LeagueOpponents:
         self.candidates: tuple[str, ...] = ()
         """Versions by age, the newest last."""
         self._scores: Scores = {}
-        self._episodes = 0.0
+        self._episodes: dict[str, float] = {}
+        self._all_episodes = 0.0
         self._priors: dict[str, float] = {}
         self._rows: dict[str, Scores] = {}
         self._unpublished: dict[str, Scores] = {}
@@ -72,9 +76,13 @@ class LeagueOpponents:
         games, score = self._scores.get(ref, (0.0, 0.0))
         return shrunk(games, score, self._priors.get(ref, UNKNOWN))
 
+    def scores(self) -> dict[str, float]:
+        """Return the score against each opponent of whose recent episodes some were scored."""
+        return {ref: self.score(ref) for ref in self._scores}
+
     def shares(self) -> dict[str, float]:
-        """Return each opponent's share of the recent episodes, 0 for those that were not drawn for long."""
-        return {ref: games / max(self._episodes, 1.0) for ref, (games, _) in self._scores.items()}
+        """Return each opponent's share of the recent episodes, without those that were not drawn for long."""
+        return {ref: episodes / max(self._all_episodes, 1.0) for ref, episodes in self._episodes.items()}
 
     def add(self, results: Sequence[Mapping[str, Any]], actions: int) -> None:
         """Add the episodes in the metrics of all runners, and the games against opponents among them.
@@ -82,16 +90,21 @@ class LeagueOpponents:
         actions: of all agents since the last call.
         """
         decay = 0.5 ** (actions / HALF_LIFE)
-        self._scores = {ref: (games * decay, score * decay) for ref, (games, score) in self._scores.items()}
-        self._episodes *= decay
+        self._all_episodes *= decay
+        decayed = {ref: episodes * decay for ref, episodes in self._episodes.items()}
+        self._episodes = {ref: episodes for ref, episodes in decayed.items() if episodes >= LEAST_EPISODES}
+        scores = self._scores.items()
+        self._scores = {ref: (games * decay, score * decay) for ref, (games, score) in scores if ref in self._episodes}
         for result in results:
-            self._episodes += float(result[NUM_EPISODES])
+            self._all_episodes += float(result[NUM_EPISODES])
             for ref, values in result.get(OPPONENTS, {}).items():
-                new, won = float(values[GAMES]), float(values[SCORE])
-                if isnan(new) or not new:
+                episodes, new, won = (float(values[name]) for name in (EPISODES, GAMES, SCORE))
+                if isnan(episodes) or not episodes:
                     continue  # RLlib keeps the keys of earlier updates.
-                games, score = self._scores.get(ref, (0.0, 0.0))
-                self._scores[ref] = games + new, score + won
+                self._episodes[ref] = self._episodes.get(ref, 0.0) + episodes
+                if new:
+                    games, score = self._scores.get(ref, (0.0, 0.0))
+                    self._scores[ref] = games + new, score + won
 
     def refresh(self, *, checkpoint: str | None = None, parent: int | None = None) -> None:
         """Read the candidates and their results from the registry.
@@ -136,6 +149,7 @@ class LeagueOpponents:
             "candidates": self.candidates,
             "scores": self._scores,
             "episodes": self._episodes,
+            "all_episodes": self._all_episodes,
             "priors": self._priors,
             "rows": self._rows,
             "unpublished": self._unpublished,
@@ -147,7 +161,9 @@ class LeagueOpponents:
         self.candidates, self._payoff = state["candidates"], state["payoff"]
         self._scores, self._priors = dict(state["scores"]), dict(state["priors"])
         # Checkpoints of earlier releases have the games only.
-        self._episodes = state.get("episodes", sum(games for games, _ in self._scores.values()))
+        scored = {ref: games for ref, (games, _) in self._scores.items()}
+        self._episodes = dict(state["episodes"]) if "all_episodes" in state else scored
+        self._all_episodes = state.get("all_episodes", sum(scored.values()))
         self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
 
     def _versions(self, registry: Registry) -> dict[str, str]:

@@ -47,7 +47,7 @@ from training.algorithms.league_algorithm import LeagueAlgorithm
 from training.algorithms.metrics import EXPLORATION
 from training.algorithms.setup import configure
 from training.learners.off_policy import OffPolicyLearner
-from training.replay_buffer import ReplayBuffer, Sample, TransitionBlock
+from training.replay_buffer import ReplayBuffer, Sample, TransitionBlock, saved_capacity
 from training.rllib_compat import ExplicitConfig, local_learner
 from training.sampling.closed_transitions import JOINT
 from training.sampling.env_runner import LEAGUE
@@ -127,10 +127,7 @@ class OffPolicy(LeagueAlgorithm):
         return written
 
     def restore_from_path(self, path: str | Path, *args: Any, **kwargs: Any) -> None:
-        """Load a checkpoint. See `starts_with_empty_replay` for buffers that are not restored.
-
-        Raises ConfigError if the saved buffers have another capacity.
-        """
+        """Load a checkpoint. See `starts_with_empty_replay` for buffers that are not restored."""
         super().restore_from_path(path, *args, **kwargs)
         if not starts_with_empty_replay(self.settings, Path(path)):
             for key, replay in self.replays.items():
@@ -191,9 +188,7 @@ class OffPolicy(LeagueAlgorithm):
         priorities = self.settings.priorities
         if priorities is None:
             return 1.0
-        limit = self.settings.max_steps
-        done = self.progress.budget if limit is None else min(self.steps / limit, 1.0)
-        return priorities.beta + (1 - priorities.beta) * done
+        return priorities.beta + (1 - priorities.beta) * self.progress.budget
 
 
 def off_policy_config(
@@ -214,11 +209,12 @@ def off_policy_config(
 
 
 def starts_with_empty_replay(settings: TrainingSettings, checkpoint: Path) -> bool:
-    """Return whether training from a checkpoint starts with empty buffers: as configured, or because it contains
-    none."""
+    """Return whether training from a checkpoint starts with empty buffers: as configured, or because it contains none
+    of the configured capacity."""
     if not isinstance(settings, OffPolicyConfig):
         return False
-    return not settings.replay_in_checkpoint or not (checkpoint / REPLAY).is_dir()
+    capacities = {saved_capacity(directory) for directory in (checkpoint / REPLAY).glob("*")}
+    return not settings.replay_in_checkpoint or capacities != {settings.replay_capacity}
 
 
 def _play_round(

@@ -67,19 +67,17 @@ class PPO(LeagueAlgorithm, ppo.PPO):
         self.exchange_opponents(results, sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results))
 
     def sample_train_batch(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
-        """Sample a train batch from all runners; return the chunks and the runners' metrics."""
+        """Sample a train batch from all runners; return the chunks and the runners' metrics.
+
+        Waits for all runners, however long they take. Raises RayActorError if one is lost.
+        """
         chunks: list[EpisodeChunks] = []
         results: list[dict[str, Any]] = []
         # With remote runners, the local one only holds weights.
         is_local = self.env_runner_group.num_remote_env_runners() == 0
         sample = partial(_sample_chunks, opponents=self.opponents.active)
         while sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results) < self.config.total_train_batch_size:
-            sampled = self.env_runner_group.foreach_env_runner(
-                sample, local_env_runner=is_local, timeout_seconds=self.config.sample_timeout_s
-            )
-            if not sampled:
-                break
-            for own, metrics in sampled:
+            for own, metrics in self.env_runner_group.foreach_env_runner(sample, local_env_runner=is_local):
                 chunks += own
                 results.append(metrics)
         return chunks, results

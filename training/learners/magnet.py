@@ -26,11 +26,8 @@ from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Box
-from training.learners.train_batch import TrainBatch
+from training.learners.train_batch import PASS_ROWS, TrainBatch
 from training.modules.policy_module import MASKED_LOGIT
-
-ROWS = 8192
-"""Rows per forward pass of a reference policy."""
 
 State = dict[str, dict[str, Any]]
 """Policy id → weights."""
@@ -68,7 +65,7 @@ class Previous:
             self._snapshot[policy].greedy_outputs(
                 {Columns.OBS: {name: value[rows] for name, value in batch.observations.items()}}
             )[Columns.ACTION_DIST_INPUTS]
-            for rows in batch.acted.split(ROWS)
+            for rows in batch.acted.split(PASS_ROWS)
         ]
         return torch.cat(parts)
 
@@ -92,7 +89,7 @@ class Version:
         """Return the inputs of ρ's action distribution at the steps of a batch, (n, d)."""
         parts = [
             self._rows({name: value[rows].cpu().numpy() for name, value in batch.observations.items()}, policy)
-            for rows in batch.acted.split(ROWS)
+            for rows in batch.acted.split(PASS_ROWS)
         ]
         return torch.from_numpy(np.concatenate(parts)).to(batch.dist_inputs.device)
 

@@ -250,5 +250,8 @@ class OffPolicyLearner(FixedPoliciesLearner):
                 self.targets[name].load_state_dict(weights)
             for name, weights in own["extra"].items():
                 self.networks[name].load_state_dict(weights)
+        for name in self.networks:
+            # The saved state of an optimiser contains the learning rate of that time.
+            self.get_optimizer(module_id=name).param_groups[0]["lr"] = self.settings.lr
         # The next weights must be newer than those of the runners, even right after a restore.
         self.weights_version = max(self.weights_version, state.get(WEIGHTS_SEQ_NO, 0))

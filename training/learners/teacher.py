@@ -21,7 +21,7 @@ from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Discrete, MultiDiscrete, Space
-from training.learners.train_batch import TrainBatch
+from training.learners.train_batch import PASS_ROWS, TrainBatch
 
 
 class Teacher:
@@ -47,13 +47,19 @@ class Teacher:
             batch: n steps.
             update: Number of the update, from which the teacher's random choices are derived.
         """
-        rows = batch.acted.cpu().numpy()
-        observations = {name: value.cpu().numpy()[rows] for name, value in batch.observations.items()}
         rng = np.random.default_rng((self._seed, update))
-        answer = self._policies[policy].act(observations, rng=[rng] * len(rows))
+        parts = [
+            self._act(policy, {name: value[rows].cpu().numpy() for name, value in batch.observations.items()}, rng)
+            for rows in batch.acted.split(PASS_ROWS)
+        ]
+        return torch.from_numpy(_raw(np.concatenate(parts), self._spaces[policy])).to(batch.acted.device)
+
+    def _act(self, policy: str, observations: dict[str, NDArray], rng: np.random.Generator) -> NDArray:
+        count = len(next(iter(observations.values())))
+        answer = self._policies[policy].act(observations, rng=[rng] * count)
         for fault in answer.faults.values():
             raise GameCrashed(f"training.teacher: {self._ref}: {one_line(fault, with_type=True)}") from fault
-        return torch.from_numpy(_raw(answer.actions, self._spaces[policy])).to(batch.acted.device)
+        return answer.actions
 
 
 def check_teacher(interface: Interface) -> None:

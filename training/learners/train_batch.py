@@ -63,8 +63,8 @@ def generalized_advantages(
 Bootstraps = Callable[[EpisodeChunks], NDArray]
 """c chunks → (c,) bool: whether the value of each chunk's last observation counts."""
 
-VALUE_PASS_ROWS = 2048
-"""Rows per forward pass: more than a few thousand images as floats would exhaust memory."""
+PASS_ROWS = 2048
+"""Rows per forward pass over a batch: more than a few thousand images as floats would exhaust memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,8 +229,8 @@ def _value_pass(
 ) -> tuple[NDArray, dict[str, Tensor]]:
     """Return the values of some rows, one step each from its own recurrent state, and the states after it."""
     values, states = [], []
-    for first in range(0, len(rows), VALUE_PASS_ROWS):
-        part = slice(first, first + VALUE_PASS_ROWS)
+    for first in range(0, len(rows), PASS_ROWS):
+        part = slice(first, first + PASS_ROWS)
         batch = {
             Columns.OBS: {name: value[rows[part]] for name, value in observations.items()},
             Columns.STATE_IN: {key: value[part] for key, value in state.items()},

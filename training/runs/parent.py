@@ -13,7 +13,7 @@ from league.registry.storage.rows import VersionRow
 NETWORK_SETTINGS = (
     *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
     *("dueling", "noisy", "distributional"),
-    *("mixer", "mixing_width", "groups"),
+    *("mixer", "mixing_width", "groups", "critic"),
 )
 """Settings that define the network: a version's weights require the same values."""
 

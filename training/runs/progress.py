@@ -98,10 +98,11 @@ def policy_summaries(metrics: Mapping[str, Any], policies: Mapping[str, str]) ->
 
 
 def opponent_summary(metrics: Mapping[str, Any]) -> str:
-    """Return the scores against the most frequent opponents; empty without opponents."""
+    """Return the scores against the most frequent opponents; empty if there are none."""
     shares = {name.rpartition("/")[0]: value for name, value in metrics.items() if _is_opponent_share(name)}
-    frequent = sorted(shares, key=lambda opponent: shares[opponent], reverse=True)[:MAX_OPPONENTS]
-    shown = [f"{metrics[f'{name}/score']:.0%} against {name.removeprefix(OPPONENT_PREFIX)}" for name in frequent]
+    scores = {name: metrics[f"{name}/score"] for name in shares if f"{name}/score" in metrics}
+    frequent = sorted(scores, key=lambda opponent: shares[opponent], reverse=True)[:MAX_OPPONENTS]
+    shown = [f"{scores[name]:.0%} against {name.removeprefix(OPPONENT_PREFIX)}" for name in frequent]
     return f"; score {', '.join(shown)}" if shown else ""
 
 

@@ -16,7 +16,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -64,32 +64,36 @@ def locked(directory: Path, what: str) -> Iterator[None]:
         lock.release()
 
 
-def pin_opponents(config: LeagueConfig, registry: Registry, interface: Interface) -> dict[str, str]:
+def pin_opponents(
+    config: LeagueConfig, registry: Registry, interface: Interface, trials: Iterable[LeagueConfig] = ()
+) -> dict[str, str]:
     """Resolve each opponent of `training.opponents`, the version of the magnet and the teacher: reference as written
     → `script:name`, `league@number`, or the URL of a version of a remote model.
+
+    trials: the league with the settings of a sweep's trials, whose references are resolved, too.
 
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for written in _references(config.training):
+    for written, is_opponent in dict.fromkeys(found for each in (config, *trials) for found in _references(each)):
         ref = parse_ref(of_league(written, config.league))
         if isinstance(ref, RemoteRef):
             ref = fixed_version(ref, interface)
         pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
-        is_opponent = any(opponent.ref == written for opponent in config.training.opponents.fixed)
         for player in players(pinned, registry) if is_opponent else [pinned]:
             contestant(player, registry, interface)
         pins[written] = pinned
     return pins
 
 
-def _references(settings: TrainingSettings) -> list[str]:
-    """The fixed opponents, the version of the magnet, and the teacher."""
-    found: list[str | None] = [opponent.ref for opponent in settings.opponents.fixed]
+def _references(config: LeagueConfig) -> list[tuple[str, bool]]:
+    """The fixed opponents, the version of the magnet, and the teacher; each with whether it is an opponent."""
+    settings = config.training
+    found: list[tuple[str | None, bool]] = [(opponent.ref, True) for opponent in settings.opponents.fixed]
     if isinstance(settings, PPOConfig):
-        found.append(settings.magnet.version if settings.magnet else None)
-        found.append(settings.teacher.ref if settings.teacher else None)
-    return [ref for ref in found if ref is not None]
+        found.append((settings.magnet.version if settings.magnet else None, False))
+        found.append((settings.teacher.ref if settings.teacher else None, False))
+    return [(ref, is_opponent) for ref, is_opponent in found if ref is not None]
 
 
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:

@@ -212,6 +212,8 @@ def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
     """Return the version that an exploiter is trained against, which must be able to play in the league now."""
     if len(interface.sides) < 2:
         raise ConfigError(f"--against: league {config.league} has one side only, so a version has no opponent")
+    if not config.training.supports_opponents:
+        raise ConfigError(f"--against: {config.training.algorithm} does not support opponents")
     check_eligible(str(ref), registry, config)
     return registry.versions.resolve(ref).ref
 

@@ -2,11 +2,13 @@
 
 `league.results.scoring` defines the rule. If sides are symmetric, the learner's return is compared with the opponent's
 in each game. If they are not, two games with the learner on either side form a block, and returns on the same side are
-compared; games without a partner are dropped. Unlike those of a match, the games of such a block have different seeds.
-If there are more than two such sides, games are not scored: the learner never has all sides but one.
+compared; a game waits for its partner until the episodes are reset. Unlike those of a match, the games of such a block
+have different seeds. If there are more than two such sides, games are not scored: the learner never has all sides but
+one.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +16,19 @@ from numpy.typing import NDArray
 from league.environments.stepping import Indices, Turn
 from league.results.records import Scoring
 
+MOST_WAITING = 16
+"""Games against an opponent, with the learner on one side, that wait for a partner: the newest ones."""
+NO_ROWS = np.zeros(0, np.int64)
+
 
 @dataclass(frozen=True, slots=True)
-class ScoredGames:
-    """Games against each opponent and the sum of the learner's scores in them, both (opponents,)."""
+class OpponentResults:
+    """Of each opponent, (opponents,): episodes, the scored games, and the sum of the learner's scores in them.
 
+    A game may be scored later than its episode is counted, or never.
+    """
+
+    episodes: NDArray[np.int64]
     games: NDArray[np.int64]
     scores: NDArray[np.float64]
 
@@ -32,28 +42,32 @@ class OpposedGames:
     own: NDArray[np.float64]
     other: NDArray[np.float64]
 
-    def scored(self, scoring: Scoring, opponents: int) -> ScoredGames:
-        """Score the games. opponents: the number of all opponents."""
-        if scoring == "game":
-            return self._summed(_compare(self.own, self.other), self.opponents, opponents)
-        scores, numbers = [np.zeros(0)], [np.zeros(0, np.int64)]
+    def __getitem__(self, rows: Indices) -> "OpposedGames":
+        return OpposedGames(self.opponents[rows], self.sides[rows], self.own[rows], self.other[rows])
+
+    def blocks(self) -> tuple["OpposedGames", "OpposedGames"]:
+        """Return the games that form blocks, each with the opponent's return from its partner, and those that wait."""
+        games, partners, waiting = [NO_ROWS], [NO_ROWS], [NO_ROWS]
         for opponent in np.unique(self.opponents).tolist():
             first, second = (np.flatnonzero((self.opponents == opponent) & (self.sides == side)) for side in (0, 1))
-            blocks = min(len(first), len(second))
-            first, second = first[:blocks], second[:blocks]
-            scores += [_compare(self.own[first], self.other[second]), _compare(self.own[second], self.other[first])]
-            numbers.append(np.full(2 * blocks, opponent))
-        return self._summed(np.concatenate(scores), np.concatenate(numbers), opponents)
+            count = min(len(first), len(second))
+            games += [first[:count], second[:count]]
+            partners += [second[:count], first[:count]]
+            waiting += [first[count:][-MOST_WAITING:], second[count:][-MOST_WAITING:]]
+        whole, others = self[np.concatenate(games)], self.other[np.concatenate(partners)]
+        return replace(whole, other=others), self[np.concatenate(waiting)]
 
-    @staticmethod
-    def _summed(scores: NDArray[np.float64], numbers: Indices, opponents: int) -> ScoredGames:
-        games = np.bincount(numbers, minlength=opponents).astype(np.int64)
-        summed = np.bincount(numbers, weights=scores, minlength=opponents).astype(np.float64)
-        return ScoredGames(games, summed)
+    def scores(self) -> NDArray[np.float64]:
+        """Return the learner's score in each game, (m,)."""
+        return np.where(self.own > self.other, 1.0, np.where(self.own == self.other, 0.5, 0.0))
 
 
-def _compare(mine: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(mine > other, 1.0, np.where(mine == other, 0.5, 0.0))
+NO_GAMES = OpposedGames(NO_ROWS, NO_ROWS, np.zeros(0), np.zeros(0))
+
+
+def _concatenated(games: Sequence[OpposedGames]) -> OpposedGames:
+    columns = (np.concatenate([getattr(each, name) for each in [NO_GAMES, *games]]) for name in OpposedGames.__slots__)
+    return OpposedGames(*columns)
 
 
 def is_scored(scoring: Scoring, sides: int) -> bool:
@@ -73,6 +87,7 @@ class OpponentScores:
         """The opponent's number in each environment, -1 in self-play."""
         self._sides = np.zeros(num_envs, np.int64)
         self._next_opponents, self._next_sides = self.opponents.copy(), self._sides.copy()
+        self._episodes: list[Indices] = []
         self._finished: list[OpposedGames] = []
 
     def begin(self, envs: Indices, opponents: Indices, sides: Indices) -> None:
@@ -87,8 +102,10 @@ class OpponentScores:
         for rows in turn.endings:
             self._returns[rows.envs, rows.agents] += rows.rewards
         opposed = turn.finished[self.opponents[turn.finished] >= 0]
-        if len(opposed) and self._is_scored:
-            self._finished.append(self._games(opposed))
+        if len(opposed):
+            self._episodes.append(self.opponents[opposed])
+            if self._is_scored:
+                self._finished.append(self._games(opposed))
         self.forget(np.concatenate([turn.finished, turn.crashed]))
         for batch in turn.batches.values():
             self._returns[batch.envs, batch.agents] += batch.rewards
@@ -98,14 +115,18 @@ class OpponentScores:
         """Drop the open episodes of some environments."""
         self._returns[envs] = 0
 
-    def take(self, opponents: int) -> ScoredGames:
-        """Return the scores since the last call. opponents: the number of all opponents."""
-        finished, self._finished = self._finished, []
-        columns = (
-            np.concatenate([getattr(games, name) for games in finished] or [np.zeros(0, np.int64)])
-            for name in OpposedGames.__slots__
+    def take(self, opponents: int) -> OpponentResults:
+        """Return the results since the last call. opponents: the number of all opponents."""
+        games, waiting = _concatenated(self._finished), NO_GAMES
+        if self._scoring == "side":
+            games, waiting = games.blocks()
+        numbers = np.concatenate([NO_ROWS, *self._episodes])
+        self._episodes, self._finished = [], [waiting]
+        return OpponentResults(
+            np.bincount(numbers, minlength=opponents).astype(np.int64),
+            np.bincount(games.opponents, minlength=opponents).astype(np.int64),
+            np.bincount(games.opponents, weights=games.scores(), minlength=opponents).astype(np.float64),
         )
-        return OpposedGames(*columns).scored(self._scoring, opponents)
 
     def _games(self, envs: Indices) -> OpposedGames:
         sides = self._sides[envs]

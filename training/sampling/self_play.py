@@ -50,8 +50,9 @@ class ForwardOutput:
     state: State | None
 
 
-OPPONENTS, GAMES, SCORE = "opponents", "games", "score"
-"""Keys of metrics: opponent → number of finished games, and the sum of the learner's scores in them."""
+OPPONENTS, EPISODES, GAMES, SCORE = "opponents", "episodes", "games", "score"
+"""Keys of metrics: opponent → finished episodes, the games that were scored, and the sum of the learner's scores in
+them."""
 
 Forward = Callable[[Mapping[str, ForwardInput]], Mapping[str, ForwardOutput]]
 """One forward pass for all policies that must act: policy id → its rows."""
@@ -122,11 +123,12 @@ class SelfPlay:
     def log(self, metrics: MetricsLogger) -> None:
         """Log everything since the last call."""
         self.metrics.log(metrics)
-        scored = self._scores.take(len(self._matchups.refs))
-        for ref, games, score in zip(self._matchups.refs, scored.games.tolist(), scored.scores.tolist(), strict=True):
-            if games:
-                metrics.log_value((OPPONENTS, ref, GAMES), games, reduce="sum")
-                metrics.log_value((OPPONENTS, ref, SCORE), score, reduce="sum")
+        results = self._scores.take(len(self._matchups.refs))
+        for number, ref in enumerate(self._matchups.refs):
+            if results.episodes[number]:
+                metrics.log_value((OPPONENTS, ref, EPISODES), int(results.episodes[number]), reduce="sum")
+                metrics.log_value((OPPONENTS, ref, GAMES), int(results.games[number]), reduce="sum")
+                metrics.log_value((OPPONENTS, ref, SCORE), float(results.scores[number]), reduce="sum")
 
     def restart(self) -> None:
         """Drop all open episodes, and start new ones in all environments."""

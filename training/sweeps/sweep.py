@@ -114,7 +114,8 @@ def sweep(
     check_contestants(config, interface, registry)
     registry.leagues.register(config, interface)
     interrupted = SweepDirectory.resume(registry.storage, config, trials) if resume else None
-    pins = {} if interrupted else pin_opponents(config, registry, interface)
+    leagues = [applied(config, settings) for settings in trials]
+    pins = {} if interrupted else pin_opponents(config, registry, interface, leagues)
     with connected(address, registry.storage, local) as dashboard:
         this = interrupted or SweepDirectory.begin(registry.storage, config, pins, trials, git_commit(config_path))
         with this.locked(), SweepProgress(console or Console(), this, config.sweep.mode) as progress:

@@ -113,8 +113,8 @@ class SweepDirectory:
         return locked(self.path, f"sweep {self.path.name}")
 
     def league(self, number: int) -> LeagueConfig:
-        """Return the league with a trial's settings."""
-        return applied(self.record.config, self.record.trials[number])
+        """Return the league with a trial's settings, and with pinned opponents."""
+        return with_pins(applied(self.record.config, self.record.trials[number]), self.record.pins)
 
     def trial(self, number: int) -> Path:
         """Return the directory of a trial."""

@@ -114,6 +114,20 @@ def test_a_champion_that_changes_during_training_is_the_opponent_of_the_gate(reg
     assert night.steps["exploiter"]["versions"] == ["tictactoe@4"]
 
 
+def test_an_algorithm_without_opponents_trains_no_exploiter(registry: Registry) -> None:
+    announced: list[str] = []
+    night, _ = training_night(
+        tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 4}, training={"algorithm": "maddpg"}),
+        registry=registry,
+        train=(trainer := trainer_of(registry, STRONG)),
+        announce=announced.append,
+    )
+    assert len(trainer.calls) == 1
+    assert "tictactoe: maddpg does not support opponents, so tictactoe@1 gets no exploiter" in announced
+    assert night.steps["exploiter"] == {"target": "tictactoe@1", "versions": []}
+    assert night.steps["measure"] == {"target": "tictactoe@1", "exploitability": None}
+
+
 def test_failed_training_is_recorded_and_the_night_goes_on(registry: Registry) -> None:
     tictactoe.publish(registry, STRONG)
 

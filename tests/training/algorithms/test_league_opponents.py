@@ -30,9 +30,15 @@ def opponents_of(registry: Registry, fixed: tuple[str, ...] = (), **league: Any)
 
 
 def metrics(episodes: float = 0.0, **results: tuple[float, float]) -> list[dict[str, Any]]:
-    """Of one runner: its episodes, and version number → (games, score)."""
-    played = {f"tictactoe@{ref[1:]}": {"games": games, "score": score} for ref, (games, score) in results.items()}
-    return [{NUM_EPISODES: episodes, "opponents": played}]
+    """Of one runner: its episodes, and version number → (games, score). All games are scored."""
+    return unscored(episodes, {ref: (games, games, score) for ref, (games, score) in results.items()})
+
+
+def unscored(total: float, results: dict[str, tuple[float, float, float]]) -> list[dict[str, Any]]:
+    """Of one runner: its episodes, and version number → (episodes, scored games, score)."""
+    names = ("episodes", "games", "score")
+    played = {f"tictactoe@{ref[1:]}": dict(zip(names, values, strict=True)) for ref, values in results.items()}
+    return [{NUM_EPISODES: total, "opponents": played}]
 
 
 def publish_exploiter(registry: Registry, source: str, target: str) -> None:
@@ -117,9 +123,20 @@ def test_the_shares_of_opponents_that_are_no_longer_drawn_vanish(registry: Regis
     restored = opponents_of(registry)
     restored.set_state(opponents.get_state())
     for each in (opponents, restored):
-        for _ in range(20):
+        each.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
+        assert each.shares() == pytest.approx({"tictactoe@1": 25 / 150, "tictactoe@2": 50 / 150})
+        for _ in range(12):
             each.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
-        assert each.shares() == pytest.approx({"tictactoe@1": 0.0, "tictactoe@2": 0.5}, abs=1e-5)
+        assert each.shares() == pytest.approx({"tictactoe@2": 0.5}, rel=1e-3)
+        assert each.scores().keys() == each.get_state()["scores"].keys() == {"tictactoe@2"}
+        assert each.score("tictactoe@1") == 0.5
+
+
+def test_opponents_whose_games_are_not_scored_have_shares(registry: Registry) -> None:
+    opponents = opponents_of(registry)
+    opponents.add(unscored(10.0, {"v1": (4.0, 0.0, 0.0), "v2": (1.0, 2.0, 2.0)}), 0)
+    assert opponents.shares() == {"tictactoe@1": 0.4, "tictactoe@2": 0.1}
+    assert opponents.scores().keys() == {"tictactoe@2"}
 
 
 def test_the_learners_scores_become_those_of_its_checkpoint(registry: Registry) -> None:

@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import ray
 import torch
-from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
+from ray.exceptions import RayActorError
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, NUM_ENV_STEPS_SAMPLED
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -71,6 +73,21 @@ def test_ppo_learns(name: str, options: dict[str, Any], target: dict[str, float]
 )
 def test_it_does_not_learn_without_the_required_setting(name: str, below: float) -> None:
     assert updates_until(solvable(name), {"shared": below}, limit=15) is None
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_a_slow_runner_is_waited_for_and_a_lost_one_ends_training() -> None:
+    league = tictactoe(runners=1, train_batch_size=64, minibatch_size=64, epochs=1)
+    config = algorithm_config(league, interface(league)).env_runners(sample_timeout_s=0.001)  # RLlib's: one minute
+    algorithm = config.build_algo()
+    try:
+        assert algorithm.train()[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED] >= 64
+        (runner,) = algorithm.env_runner_group._worker_manager._actors.values()
+        ray.kill(runner)
+        with pytest.raises(RayActorError):
+            algorithm.train()
+    finally:
+        algorithm.stop()
 
 
 @pytest.mark.usefixtures("ray_session")

@@ -1,6 +1,7 @@
 """The learner alone, on joint transitions sampled by a runner in this process."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,6 +75,15 @@ def test_targets_follow_equation_6_and_bootstrap_truncated_agents() -> None:
     ended = rows["terminated/b"][:, 0]
     # There is no bootstrap after termination.
     torch.testing.assert_close(own[ended], rows["rewards/b"][:, 0][ended])
+
+
+def test_a_restored_learner_has_the_learning_rate_of_its_own_settings(tmp_path: Path) -> None:
+    league = maddpg("summing", {"ends": 2}, OWN, lr=0.01)
+    learner_of(league).save_to_path(tmp_path / "state")
+    restored = learner_of(league.with_training(lr=0.002))
+    restored.restore_from_path(tmp_path / "state")
+    rates = {name: restored.get_optimizer(module_id=name).param_groups[0]["lr"] for name in restored.networks}
+    assert rates == dict.fromkeys(("a", "b", critic_name("a"), critic_name("b")), 0.002)
 
 
 @pytest.mark.parametrize("critic", ["centralised", "own"])

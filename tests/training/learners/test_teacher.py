@@ -43,7 +43,9 @@ def test_the_loss_contains_the_weighted_cross_entropy_of_the_teachers_actions() 
     assert free.teacher == 0
 
 
-def test_the_teacher_acts_on_the_observations_of_the_batch() -> None:
+def test_the_teacher_acts_on_the_observations_of_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In several passes."""
+    monkeypatch.setattr("training.learners.teacher.PASS_ROWS", 10)
     league = taught()
     learner, episodes = learner_of(league), episodes_of(league)
     batch = train_batch(learner.module["shared"], episodes, gamma=1.0, lambda_=1.0)
@@ -51,6 +53,7 @@ def test_the_teacher_acts_on_the_observations_of_the_batch() -> None:
     assert league.training.teacher is not None
     found = Teacher(league.training.teacher, interface(league), None, 0).actions("shared", batch, 1)
     masks = batch.observations[ACTION_MASK][batch.acted].numpy()
+    assert len(masks) > 20
     np.testing.assert_array_equal(found.numpy(), masks.argmax(axis=1))
     assert OBSERVATION in batch.observations
 

@@ -127,7 +127,7 @@ def test_statistics_are_updated_before_values_are_computed() -> None:
 @pytest.mark.parametrize("at_once", [2, 3, 100])
 def test_a_recurrent_value_uses_the_state_of_each_step(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compared with the module step by step: for γ = 1, λ = 0, no reward, targets are the values of the next steps."""
-    monkeypatch.setattr(train_batches, "VALUE_PASS_ROWS", at_once)
+    monkeypatch.setattr(train_batches, "PASS_ROWS", at_once)
     net = network(spaces.Discrete(5), recurrence=3)
     states = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     chunks = [chunk([0, 1, 2, 3], [0.0] * 3, states[:3], truncated=True), chunk([4, 2, 1], [0.0] * 2, states[3:])]

@@ -1,17 +1,19 @@
-"""Which version a night's training starts from."""
+"""Which version a run or a night's training starts from."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from league.config.league import LeagueConfig
+from league.errors import ConfigError
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, Manifest
 from league.settings import Storage
 from tests.support.leagues import registries
 from tests.support.leagues.registries import LEAGUE
-from training.runs.parent import start_of_night
+from training.runs.parent import check_network, start_of_night
 
 
 @pytest.fixture
@@ -42,3 +44,25 @@ def test_in_place_of_an_imported_version_the_newest_one_continues(registry: Regi
     publish(registry, role=EXPLOITER, exploits=str(imported))
     publish(registry, algorithm="imported")
     assert start_of_night(registry, imported) == trained
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "changed"),
+    [
+        ("ppo", {"hidden": [32]}, "hidden"),
+        ("maddpg", {"critic": "own"}, "critic"),
+        ("qmix", {"mixer": "vdn"}, "mixer"),
+        ("maddpg", {"lr": 0.5, "gamma": 0.5}, None),
+    ],
+)
+def test_a_version_continues_with_its_own_network_only(
+    registry: Registry, algorithm: str, settings: dict[str, Any], changed: str | None
+) -> None:
+    version = registry.versions.resolve(publish(registry, algorithm=algorithm, settings={"algorithm": algorithm}))
+    config = LeagueConfig.from_mapping(registries.config().model_dump() | {"training": {"algorithm": algorithm}})
+    check_network(version, config)
+    if changed is None:
+        check_network(version, config.with_training(**settings))
+        return
+    with pytest.raises(ConfigError, match=rf"^training\.{changed}: tictactoe@1 was trained with .*, got "):
+        check_network(version, config.with_training(**settings))

@@ -86,3 +86,9 @@ def test_the_most_frequent_opponents_are_shown_with_the_scores_against_them() ->
         METRICS | scores | {f"opponents/{ref}/share": share for ref, share in shares.items()}
     ).splitlines()
     assert line.endswith("; score 25% against script:random, 25% against a@3, 25% against a@2")
+
+
+def test_opponents_whose_games_are_not_scored_are_not_shown() -> None:
+    scored = {"opponents/a@1/share": 0.2, "opponents/a@1/score": 0.5}
+    (line,) = output_of(METRICS | scored | {"opponents/a@2/share": 0.4}).splitlines()
+    assert line.endswith("; score 50% against a@1")

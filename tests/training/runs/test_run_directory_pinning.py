@@ -60,6 +60,21 @@ def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) ->
         pin_opponents(magnet, registry, spaces)
 
 
+def test_the_references_of_a_sweeps_trials_are_pinned_too(tmp_path: Path) -> None:
+    registry = tictactoe.registry(tmp_path)
+    for _ in range(2):
+        tictactoe.publish(registry, tictactoe.graph())
+    number = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75}).number
+    registry.aliases.set("tictactoe", "champion", number, expected=None, actor="me", reason="first")
+    spaces = registry.leagues.get("tictactoe").interface
+    trials = [with_opponents("@champion"), tictactoe.config().with_training(teacher={"ref": "@2", "weight": 1})]
+    pins = pin_opponents(with_opponents("script:random"), registry, spaces, trials)
+    assert pins == {"script:random": "script:random", "@champion": "tictactoe@3", "@2": "tictactoe@2"}
+    trials += [tictactoe.config().with_training(teacher={"ref": "@champion", "weight": 1})]
+    with pytest.raises(InvalidInput, match=r"tictactoe@3 is a mixture"):
+        pin_opponents(with_opponents("script:random"), registry, spaces, trials)
+
+
 @pytest.mark.parametrize(
     ("ref", "error"),
     [("@3", UnknownVersion), ("champion", ConfigError), ("script:stockfish", LeagueError)],

@@ -229,6 +229,9 @@ def test_invalid_options_are_rejected_before_training(registry: Registry) -> Non
     team = LeagueConfig.load("configs/two_step_game.yaml")
     with pytest.raises(ConfigError, match="--against: league two_step_game has one side only"):
         train(team, registry=registry, role=EXPLOITER, target=CheckpointRef("two_step_game", 1))
+    adversary = LeagueConfig.load("configs/simple_adversary.yaml")
+    with pytest.raises(ConfigError, match="--against: maddpg does not support opponents"):
+        train(adversary, registry=registry, role=EXPLOITER, target=CheckpointRef("simple_adversary", 1))
     assert not (registry.storage.home / "runs").exists()
 
 

@@ -5,33 +5,33 @@ from hypothesis import strategies as st
 
 from league.environments.stepping import Batch, Turn
 from league.environments.vector.vector_env import AgentRows
+from league.results.records import Scoring
 from league.results.scoring import scores
-from training.sampling.opponent_scores import OpponentScores, OpposedGames
+from training.sampling.opponent_scores import MOST_WAITING, OpponentResults, OpponentScores, OpposedGames
 
 RETURNS = st.sampled_from([-1.0, 0.0, 0.25, 7.0])
-GAMES = st.lists(st.tuples(st.integers(0, 2), RETURNS, RETURNS), max_size=8)
+GAMES = st.lists(st.tuples(RETURNS, RETURNS), max_size=8)
 TWO_SIDES = np.eye(2, dtype=bool)
 
 
 @given(GAMES)
-def test_games_are_scored_as_in_matches(games: list[tuple[int, float, float]]) -> None:
-    opponents, own, other = (np.array([game[i] for game in games]) for i in range(3))
-    found = OpposedGames(opponents.astype(int), np.zeros(len(games), int), own, other).scored("game", 3)
-    for number in range(3):
-        expected = [scores([(mine, theirs)], "game")[0][0] for of, mine, theirs in games if of == number]
-        assert found.games[number] == len(expected)
-        assert float(found.scores[number]) == sum(float(score or 0) for score in expected)
+def test_games_are_scored_as_in_matches(games: list[tuple[float, float]]) -> None:
+    own, other = (np.array([game[i] for game in games]) for i in range(2))
+    numbers = np.zeros(len(games), int)
+    found = OpposedGames(numbers, numbers, own, other).scores()
+    assert found.tolist() == [scores([game], "game")[0][0] for game in games]
 
 
 @given(st.tuples(RETURNS, RETURNS), st.tuples(RETURNS, RETURNS))
 def test_two_games_form_a_block_if_sides_differ(first: tuple[float, float], second: tuple[float, float]) -> None:
     own, other = np.array([second[0], first[0]]), np.array([second[1], first[1]])
-    block = OpposedGames(np.zeros(2, int), np.array([1, 0]), own, other).scored("side", 1)
+    block, waiting = OpposedGames(np.zeros(2, int), np.array([1, 0]), own, other).blocks()
     expected = scores([first, second], "side")
-    assert block.games.tolist() == [2]
-    assert float(block.scores[0]) == sum(float(game[0] or 0) for game in expected)
-    alone = OpposedGames(np.zeros(2, int), np.array([1, 1]), own, other).scored("side", 1)
-    assert alone.games.tolist() == [0]
+    assert len(waiting.own) == 0
+    assert block.scores().sum() == sum(float(game[0] or 0) for game in expected)
+    for opponents, sides in (([0, 0], [1, 1]), ([0, 1], [1, 0])):
+        block, waiting = OpposedGames(np.array(opponents), np.array(sides), own, other).blocks()
+        assert (len(block.own), sorted(waiting.own)) == (0, sorted(own))
 
 
 def rows(envs: list[int], agents: list[int], rewards: list[float]) -> AgentRows:
@@ -62,6 +62,40 @@ def test_rewards_of_an_episode_are_summed_for_both_sides() -> None:
     collected.add_turn(Turn(endings=[rows([0, 0], [0, 1], [1.0, 1.0])], finished=np.array([0])))
     found = collected.take(2)
     assert (found.games.tolist(), found.scores.tolist()) == ([0, 1], [0.0, 0.5])
+
+
+def play(collected: OpponentScores, opponents: list[int], sides: list[int], own: list[float]) -> OpponentResults:
+    """Results after a game in each environment. own: the learner's returns; those of the other sides are 0."""
+    envs = np.arange(len(sides))
+    collected.begin(envs, np.array(opponents), np.array(sides))
+    collected.add_turn(Turn())
+    collected.add_turn(Turn(endings=[rows(envs.tolist(), sides, own)], finished=envs))
+    return collected.take(2)
+
+
+def test_a_game_waits_for_its_partner() -> None:
+    collected = OpponentScores(TWO_SIDES, "side", num_envs=2)
+    found = play(collected, [0, 1], [0, 1], [1.0, 1.0])
+    assert (found.episodes.tolist(), found.games.tolist()) == ([1, 1], [0, 0])
+    found = play(collected, [0, 0], [1, 1], [0.0, 5.0])
+    assert (found.episodes.tolist(), found.games.tolist(), found.scores.tolist()) == ([2, 0], [2, 0], [1.5, 0.0])
+    found = play(collected, [0, 1], [0, 0], [0.0, 0.0])
+    assert (found.episodes.tolist(), found.games.tolist(), found.scores.tolist()) == ([1, 1], [2, 2], [1.5, 1.5])
+
+
+def test_the_newest_games_wait() -> None:
+    collected, many = OpponentScores(TWO_SIDES, "side", num_envs=40), [0] * 40
+    returns = [0.0] * (40 - MOST_WAITING) + [1.0] * MOST_WAITING
+    assert play(collected, many, many, returns).games.tolist() == [0, 0]
+    found = play(collected, many, [1] * 40, [1.0] * 40)
+    assert (found.games[0], found.scores[0]) == (2 * MOST_WAITING, 2 * MOST_WAITING), "all games with returns of 1"
+
+
+@pytest.mark.parametrize(("scoring", "sides"), [("side", 3), ("team", 2)])
+def test_episodes_of_unscored_leagues_are_counted(scoring: Scoring, sides: int) -> None:
+    collected = OpponentScores(np.eye(sides, dtype=bool), scoring, num_envs=3)
+    found = play(collected, [1, 1, -1], [0, 1, 0], [1.0, 1.0, 1.0])
+    assert (found.episodes.tolist(), found.games.tolist()) == ([0, 2], [0, 0])
 
 
 @pytest.mark.parametrize("side", [0, 1, 2])

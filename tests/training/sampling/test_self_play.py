@@ -14,6 +14,7 @@ from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
 from league.errors import ConfigError
 from league.policies.actions import to_environment
+from league.results.records import Scoring
 from league.seeds import generator
 from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
@@ -24,11 +25,13 @@ from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import ForwardInput, SelfPlay
 
 
-def self_play(env: Scripted, sides: int = 2, opening_plies: int = 0, **training: object) -> SelfPlay:
+def self_play(
+    env: Scripted, sides: int = 2, opening_plies: int = 0, scoring: Scoring = "game", **training: object
+) -> SelfPlay:
     config = PPOConfig.model_validate(training)
     interface_of_league = interface(len(env.agents), sides)
     recorder = EpisodeRecorder(interface_of_league, env.agents, env.num_envs)
-    play = SelfPlay(env, interface_of_league, config, recorder, INITIAL, opening_plies=opening_plies)
+    play = SelfPlay(env, interface_of_league, config, recorder, INITIAL, None, scoring, opening_plies=opening_plies)
     begin(play, env)
     return play
 
@@ -226,6 +229,22 @@ def test_a_restart_is_reproducible() -> None:
         ]
 
     assert chunks_after(11) == chunks_after(30)
+
+
+def test_games_do_not_wait_for_a_partner_beyond_a_restart() -> None:
+    def results_after(steps_before: int) -> tuple[list[float], ...]:
+        env = Scripted(2, 2)
+        play = self_play(env, scoring="side", opponents=[RANDOM])
+        sample(play, [steps_before])
+        play._scores.take(1)
+        begin(play, env, steps=5000)
+        sample(play, [50])
+        results = play._scores.take(1)
+        return results.episodes.tolist(), results.games.tolist(), results.scores.tolist()
+
+    fresh = results_after(0)
+    assert fresh[0] > [4]
+    assert all(results_after(steps) == fresh for steps in (11, 30, 31))
 
 
 def test_metrics_exclude_opponents_and_crashed_episodes() -> None:

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
 from league.errors import AlreadyRunning, ConfigError, NotFound
 from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe
@@ -35,6 +36,18 @@ def test_an_interrupted_sweep_is_resumed_with_its_outcomes(storage: Storage, swe
     assert (resumed.path, resumed.record) == (sweep.path, sweep.record)
     assert [resumed.outcome(number) for number in (0, 1)] == [OUTCOME, None]
     assert [resumed.league(number).training.lr for number in (0, 1)] == [0.1, 0.2]
+
+
+def test_the_references_of_trials_are_pinned(storage: Storage) -> None:
+    trials: list[Settings] = [{"opponents": [{"ref": ref, "share": 0.5}]} for ref in ("@champion", "script:random")]
+    trials += [{"teacher": {"ref": "@champion", "weight": 0.5}}]
+    pins = {"@champion": "tictactoe@1", "script:random": "script:random"}
+    sweep = SweepDirectory.begin(storage, league(), pins, trials, None)
+    found = [sweep.league(number).training for number in range(3)]
+    assert [each.ref for settings in found for each in settings.opponents.fixed] == ["tictactoe@1", "script:random"]
+    assert isinstance(found[2], PPOConfig)
+    assert found[2].teacher is not None
+    assert found[2].teacher.ref == "tictactoe@1"
 
 
 def test_a_trial_continues_from_the_checkpoint_with_the_most_steps(sweep: SweepDirectory) -> None:
