@@ -81,7 +81,7 @@ def nightly(
 
     registry, at_once, outcome = open_registry(), workers_for(workers, address), _Outcome()
     for name in leagues or _registered(registry):
-        league = name
+        league = None
         try:
             # Read when its turn comes: other leagues may take hours, in which it may be registered again.
             config = _config(registry, name)
@@ -117,12 +117,15 @@ class _Outcome:
     def exit_code(self) -> int:
         return FAULTS if self.faults else INVALID if self.invalid else BUSY if self.busy else 0
 
-    def fail(self, league: str, error: LeagueError) -> None:
-        """Print and record why a league's run ended early. An archived league is not an error."""
-        sentence = f"{league}: {one_line(error)}"
+    def fail(self, league: str | None, error: LeagueError) -> None:
+        """Print and record why a league's run ended early. An archived league is not an error.
+
+        league: None if its configuration could not be read, whose error names it.
+        """
+        sentence = one_line(error) if league is None else f"{league}: {one_line(error)}"
         match error:
             case LeagueArchived():
-                complain(f"{league} is skipped: {one_line(error)}")
+                complain(f"skipped: {one_line(error)}")
                 return
             case AlreadyRunning():
                 self.busy = True

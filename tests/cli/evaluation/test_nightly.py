@@ -124,8 +124,8 @@ def test_unknown_and_archived_leagues_do_not_prevent_the_others(league: League, 
     registry.leagues.archive("idle")
     result = league("nightly", "idle", "nothing", "tictactoe", "--workers", "0", "--json")
     assert result.code == 2
-    assert result.err.startswith("idle is skipped: league idle is archived")
-    assert "league: nothing: " in result.err
+    assert result.err.startswith("skipped: league idle is archived: `league archive idle --undo`")
+    assert "league: there is no league 'nothing'; known: " in result.err
     assert [report["league"] for report in result.json["leagues"]] == ["tictactoe"]
     assert len(result.json["faults"]) == 1
     assert league("nightly", "idle", "tictactoe", "--workers", "0").code == 0
