@@ -39,7 +39,7 @@ def page() -> str:
 
 def modules(folder: Path) -> list[Path]:
     """The modules that lie directly in a folder, without the package's own and migrations."""
-    if folder.name == "versions":
+    if folder.parent.name == "migrations":
         return []
     return sorted(path for path in folder.glob("*.py") if path.name != "__init__.py")
 

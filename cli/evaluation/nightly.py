@@ -15,10 +15,8 @@ from configs import find, names
 from league.errors import (
     AlreadyRunning,
     ConfigError,
-    InvalidInput,
     LeagueArchived,
     LeagueError,
-    NotFound,
     UnknownLeague,
     one_line,
 )
@@ -129,7 +127,7 @@ class _Outcome:
                 return
             case AlreadyRunning():
                 self.busy = True
-            case InvalidInput() | NotFound():
+            case _ if league is None or isinstance(error, ConfigError):
                 self.invalid.append(sentence)
             case _:
                 self.faults.append(sentence)

@@ -71,10 +71,14 @@ class OpponentsConfig(Part):
 
     @model_validator(mode="after")
     def _shares_fit(self) -> Self:
-        total = sum(opponent.share for opponent in self.fixed) + (self.league.share if self.league else 0.0)
-        if total > 1 + 1e-9:
-            raise ValueError(f"the shares of opponents must sum to at most 1, got {total:g}")
+        if self.share > 1 + 1e-9:
+            raise ValueError(f"the shares of opponents must sum to at most 1, got {self.share:g}")
         return self
+
+    @property
+    def share(self) -> float:
+        """Fraction of the episodes with any opponent."""
+        return sum(opponent.share for opponent in self.fixed) + (self.league.share if self.league else 0.0)
 
     @property
     def any(self) -> bool:

@@ -202,10 +202,10 @@ async def execute(
 
 async def execute_request(
     request: DecodedActionRequest, policy: LoadedPolicy, observations: Arrays, state: Arrays | None
-) -> Actions:
-    """Run the graph with the request's seed."""
+) -> tuple[Actions, bool]:
+    """Run the graph with the request's seed. Returns the actions, and whether they are greedy."""
     rng = generators(request.seed, len(request.observations)) if is_sampled(request.explore, policy) else None
-    return await execute(policy, observations, state, rng, request.probabilities)
+    return await execute(policy, observations, state, rng, request.probabilities), rng is None
 
 
 def build_response(

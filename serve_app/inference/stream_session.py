@@ -160,9 +160,8 @@ class StreamSession:
         served, state = await self._select(request, is_anew, _resets(reset, request))
         plain = is_plain(request, served.policy, data.count(b'"') - 2 * len(own))
         observations = await read_observations(request, served.policy, plain, len(data))
-        answer = await execute_request(request, served.policy, observations, state)
-        greedy = None if is_sampled(request.explore, served.policy) else answer.actions
-        self._mirror(served, observations, state, greedy)
+        answer, is_greedy = await execute_request(request, served.policy, observations, state)
+        self._mirror(served, observations, state, answer.actions if is_greedy else None)
         self._store_state(served, answer, request.is_batch)
         response = build_response(request, answer, observations, served.policy) | served.signature
         if return_state and self._state is not None:

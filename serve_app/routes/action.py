@@ -33,7 +33,6 @@ from serve_app.inference.action_request import (
     encode_state,
     execute_request,
     is_plain,
-    is_sampled,
     parse_action_request,
     pinned_version,
     read_observations,
@@ -139,9 +138,9 @@ async def _response(
     plain = is_plain(request, policy, body.count(b'"'))
     observations = await read_observations(request, policy, plain, len(body))
     state = decode_state(request, version, policy, not plain)
-    output = await execute_request(request, policy, observations, state)
+    output, is_greedy = await execute_request(request, policy, observations, state)
     if mirror is not None:
-        mirror(observations, state, None if is_sampled(request.explore, policy) else output.actions)
+        mirror(observations, state, output.actions if is_greedy else None)
     response = build_response(request, output, observations, policy)
     if output.state is not None:
         if request.state is not None:

@@ -160,10 +160,12 @@ class LeagueOpponents:
         """Restore what `get_state` returned."""
         self.candidates, self._payoff = state["candidates"], state["payoff"]
         self._scores, self._priors = dict(state["scores"]), dict(state["priors"])
-        # Checkpoints of earlier releases have the games only.
-        scored = {ref: games for ref, (games, _) in self._scores.items()}
-        self._episodes = dict(state["episodes"]) if "all_episodes" in state else scored
-        self._all_episodes = state.get("all_episodes", sum(scored.values()))
+        if "all_episodes" in state:
+            self._episodes, self._all_episodes = dict(state["episodes"]), state["all_episodes"]
+        else:
+            # Checkpoints of earlier releases have the scored games only, a share of all.
+            self._episodes = {ref: games for ref, (games, _) in self._scores.items()}
+            self._all_episodes = sum(self._episodes.values()) / (self._league.training.opponents.share or 1.0)
         self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
 
     def _versions(self, registry: Registry) -> dict[str, str]:

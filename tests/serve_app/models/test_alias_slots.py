@@ -28,7 +28,7 @@ DEADLINE = 30
 
 @pytest.fixture
 def versions(registry: Registry) -> VersionCache:
-    return VersionCache(partial(load, registry, inline=0.001), capacity=1, retry=0)
+    return VersionCache(partial(load, registry, inline=0.001, selections=ActionSelections()), capacity=1, retry=0)
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ class Stalled:
     """A loader for which some versions take until `gate` opens, as on a disk that does not respond."""
 
     def __init__(self, registry: Registry, *numbers: int) -> None:
-        self._load = partial(load, registry, inline=0.001)
+        self._load = partial(load, registry, inline=0.001, selections=ActionSelections())
         self._numbers = numbers
         self.gate = threading.Event()
         self.calls: list[tuple[str, int]] = []
