@@ -204,11 +204,11 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     found.aliases += session.scalars(
         select(AliasTable.name).filter_by(league=league, version=number).order_by(AliasTable.name)
     )
-    for verdict in session.scalars(select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at)):
-        companions = [*verdict.settings.get("anchors", ()), *verdict.settings.get("exploiters", ())]
-        if number == verdict.candidate or ref in (verdict.champion, *(each["ref"] for each in companions)):
+    for row in session.scalars(select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at)):
+        verdict = detached(VerdictRow, row)
+        if ref in verdict.contestants:
             found.verdicts.append(verdict.id)
-            found.schedules |= set(detached(VerdictRow, verdict).schedules)
+            found.schedules |= set(verdict.schedules)
     documents = session.execute(select(ScheduleTable.id, ScheduleTable.document).filter_by(league=league))
     found.played = {id_ for id_, document in documents if ref in json.loads(document)["contestants"]}
     found.played -= found.schedules

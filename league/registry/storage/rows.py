@@ -335,6 +335,14 @@ class VerdictRow:
         return [self.schedule, *(each["schedule"] for each in companions if each is not None)]
 
     @property
+    def contestants(self) -> set[str]:
+        """References of all that play in its tests."""
+        settings, exploitability = self.settings, self.settings.get("exploitability") or {}
+        others = {each["ref"] for each in (*settings.get("anchors", ()), *settings.get("exploiters", ()))}
+        trained = {*exploitability.get("of_candidate", ()), *exploitability.get("of_champion", ())}
+        return {self.candidate_ref, self.champion} | others | trained
+
+    @property
     def schedules(self) -> list[str]:
         """Ids of all schedules that belong to the verdict."""
         confirmation = self.settings.get("confirmation")

@@ -93,6 +93,18 @@ def test_a_version_without_dependents_is_removed_and_its_number_is_not_reused(us
     assert publish(used, "run/5").number == 5
 
 
+def test_exploiters_that_were_trained_for_a_verdict_are_in_use(used: Registry) -> None:
+    publish(used, "run/4")
+    verdict = f"{LEAGUE}-verdict-1f3a62d1c8b45e97-1b2c3d4e"
+    trained = {"of_candidate": [f"{LEAGUE}@4"], "of_champion": [], "schedule": f"{LEAGUE}-exploitability-1"}
+    used.verdicts.open(LEAGUE, 3, f"{LEAGUE}@2", verdict, SETTINGS | {"exploitability": trained})
+    used.verdicts.close(verdict, "reject", {})
+    with pytest.raises(Conflict, match=r"1 verdict \(1f3a62d1\)"):
+        used.removal.remove_version(CheckpointRef(LEAGUE, 4))
+    used.removal.remove_version(CheckpointRef(LEAGUE, 4), force=True)
+    assert [row.id for row in used.verdicts.all(LEAGUE)] == [VERDICT]
+
+
 def test_force_removes_what_depends_on_a_version(used: Registry) -> None:
     used.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True)
     assert used.verdicts.all(LEAGUE) == []
