@@ -15,7 +15,7 @@ from tests.support.leagues import tictactoe
 def test_one_worker_is_the_process_itself_and_several_are_ray_tasks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int, tasks: int
 ) -> None:
-    given = []
+    given: list[int] = []
 
     def evaluate(*_: Any, workers: int, **__: Any) -> None:
         given.append(workers)
