@@ -55,7 +55,7 @@ PANELS = {
             "cli.evaluation.exploitability:exploitability", "Play a version against its exploiters; print their scores."
         ),
         "nightly": Subcommand(
-            "cli.evaluation.nightly:nightly", "Test new versions, promote the best and update the ratings."
+            "cli.evaluation.nightly:nightly", "Test new versions, promote those that pass, and update the ratings."
         ),
         "report": Subcommand(
             "cli.evaluation.report:report", "Write a league's leaderboard, verdicts and upsets as one page."

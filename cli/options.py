@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 CORES = usable_cpus()
 DEFAULT_URL = "http://127.0.0.1:8000"
-"""Of the policy server that `league serve` starts and `league act` calls."""
+"""URL of the policy server that `league serve` starts and `league act` calls."""
 
 Config = Annotated[
     str,

@@ -335,7 +335,7 @@ class NightlyReport(Document):
 class Progress(Document):
     """Progress of one schedule.
 
-    what: for people, such as `connect_four@3 against connect_four@2`.
+    what: human-readable, such as `connect_four@3 against connect_four@2`.
     played, of: matches (blocks) so far and at most.
     moves_per_second: actions of all games since the start of the schedule in this process; None before the first match.
     llr, bounds: state of the sequential test, for verdicts.

@@ -78,7 +78,7 @@ def default_selection(hidden_information: bool, sides: int) -> ActionSelection:
 
 
 def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
-    """Return a sentence for people: how versions select actions, and why."""
+    """Return a human-readable sentence: how versions select actions, and why."""
     chosen, algorithm = action_selection(config, interface), config.training.algorithm
     if chosen == "sampled" and algorithm in VALUE_BASED:
         return f"Versions play with greedy actions: those of {algorithm} have no action distribution."

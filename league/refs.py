@@ -34,7 +34,7 @@ CHAMPION = "champion"
 VERDICT = "-verdict-"
 """Part of a verdict's id before its digest: `connect_four-verdict-0f3a62d1c8b45e97-1b2c3d4e`."""
 SHORT_VERDICT = 8
-"""Characters of the digest that identify a verdict for people, and are accepted by all commands."""
+"""Characters of the digest that identify a verdict in displays, and are accepted by all commands."""
 MAX_VERSION = 2**31 - 1
 """Version numbers are a signed 32-bit column of the registry."""
 

@@ -46,7 +46,7 @@ class TournamentRequest(_WithReason):
 
 
 class NightlyRequest(_WithReason):
-    """A nightly run, like `league nightly`: gate new versions, promote the best, update all ratings."""
+    """A nightly run, like `league nightly`: test new versions, promote those that pass, and update the ratings."""
 
     kind: Literal["nightly"]
 

@@ -157,9 +157,11 @@ class PolicyServer(ray_serve.AsgiReplica):
 class Replica:
     """The components of a replica. Independent of Ray.
 
-    `process`: where it runs, by default only that it is on this machine; `machine` is the address of its node;
-    `is_exposed`: whether other machines reach it;
-    `evaluation_client`: None without an evaluation service; `is_draining`: whether the replica is being stopped.
+    process: The process of the replica; by default this one, known by its machine.
+    machine: Address of its node.
+    is_exposed: Whether other machines reach it.
+    evaluation_client: None without an evaluation service.
+    is_draining: Returns whether the replica is being stopped.
     """
 
     def __init__(

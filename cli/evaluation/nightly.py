@@ -61,7 +61,7 @@ def nightly(
     address: EvaluationCluster = None,
     as_json: AsJson = False,
 ) -> None:
-    """Test new versions, promote the best and update the ratings.
+    """Test new versions, promote those that pass, and update the ratings.
 
     Intended for cron, a systemd timer or a CronJob (see deploy/nightly/ in the repository). An interrupted run
     continues when the command is run again, without replaying recorded games. The report of each league is written

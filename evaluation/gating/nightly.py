@@ -1,4 +1,4 @@
-"""The nightly run of a league: gates new versions, promotes the best one and updates all ratings.
+"""The nightly run of a league: tests new versions, promotes those that pass, and updates the ratings.
 
 Every step is stored in the registry or the ledger before the next begins. An interrupted run resumes without playing a
 match twice, repeating a verdict, or losing or repeating a promotion.

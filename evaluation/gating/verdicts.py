@@ -128,7 +128,7 @@ def conclude(
     workers: int | None = 0,
     listener: Listener | None = None,
 ) -> VerdictReport:
-    """Play an open verdict to its end, move the champion if it was beaten, and close the verdict.
+    """Play an open verdict to its end, promote the candidate if it passes all tests, and close the verdict.
 
     A verdict that a person voids meanwhile ends immediately. If the champion changes meanwhile, it is void, so that the
     candidate is tested against the new one.
@@ -165,10 +165,10 @@ def conclude(
 
 
 def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bool = False) -> VerdictRow:
-    """Stop an open verdict or revoke a closed one. Its α stays spent, because its results may be the reason for voiding
-       it.
+    """Stop an open verdict or revoke a closed one.
 
-    The candidate is gated again with other games. A promotion that resulted from the verdict stays.
+    Its α stays spent, because its results may be the reason for voiding it. The candidate is tested again with other
+    games. A promotion that resulted from the verdict stays.
     verdict: its id, or a unique beginning of it or of its digest.
     purge: exclude its games, which stay in the ledger, from all results.
     Raises NotFound, or Conflict for a verdict whose promotion is just being applied.

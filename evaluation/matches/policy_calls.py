@@ -27,7 +27,7 @@ Randomness = Generators | ActionNumbers | None
 
 @dataclass(frozen=True, slots=True)
 class PolicyFault:
-    """Why a row has no playable action. detail: for people; differs between machines."""
+    """Why a row has no playable action. detail: human-readable; differs between machines."""
 
     reason: Reason
     detail: str

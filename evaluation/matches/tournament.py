@@ -342,7 +342,7 @@ class _Places:
                 self.at_once = max(1, cluster_cpus())
 
     def played(self, node: str) -> None:
-        """Note where a chunk was played. As many of the latest ones as are played at once say what is in use."""
+        """Record the node of a finished chunk and update the nodes and CPUs in use."""
         self._latest.append(node)
         cpus = node_cpus(set(self._latest))
         alive = [each for each in self._latest if each in cpus]

@@ -1,1 +1,1 @@
-"""Single games for people: replays, recorded steps, videos and human play."""
+"""Single games to watch and to play: replays, recorded steps, videos and human play."""

@@ -66,7 +66,7 @@ class Declarations(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentHooks:
-    """What an environment offers to people.
+    """What an environment offers for display.
 
     draws: whether it renders images. has_views: whether it renders what one agent sees.
     """

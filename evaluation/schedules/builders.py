@@ -118,9 +118,9 @@ def verdict(
     gate: GateConfig | None = None,
     seed: int = 0,
 ) -> Schedule:
-    """The candidate plays up to `gate.max_blocks` matches against the champion. The id depends on the gate's settings
-       too.
+    """The candidate plays up to `gate.max_blocks` matches against the champion.
 
+    The id depends on the gate's settings, too.
     gate: by default that of the league.
     """
     gate = gate or config.gate
@@ -131,8 +131,7 @@ def verdict(
 def companion(
     config: LeagueConfig, interface: Interface, kind: str, verdict: Schedule, opponent: str, blocks: int
 ) -> Schedule:
-    """The candidate of a verdict plays up to `blocks` matches against another opponent, with seeds of this verdict
-       alone.
+    """The candidate of a verdict plays up to `blocks` matches against another opponent, with seeds of this verdict.
 
     kind: `anchor` or `confirmation`.
     """

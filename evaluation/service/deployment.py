@@ -1,4 +1,4 @@
-"""Ray Serve deployment of the evaluation service: evaluations, games for people and snapshots for the web pages.
+"""Ray Serve deployment of the evaluation service: evaluations, replays and human play, and snapshots for the web pages.
 
 deploy.yaml refers to it by import string; replicas of the policy server call it by handle and never import it. It
 keeps no state of its own: evaluations and their progress are in the registry, and each request contains the whole game

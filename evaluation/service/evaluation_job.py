@@ -70,10 +70,9 @@ def _report(
 ) -> EvaluationReport | NightlyReport:
     """Dispatch the stored request.
 
-    workers: processes that play matches. One is this process; with more, matches run in Ray tasks, and `play_schedule`
-    keeps one more task in flight than its argument says.
+    workers: processes that play matches. With one, it is this process; with more, they are Ray tasks.
     """
-    tasks = workers - 1
+    tasks = workers if workers > 1 else 0
     match EvaluationRequest.model_validate_json(json.dumps(evaluation.request)).root:
         case TournamentRequest() as request:
             return evaluate(

@@ -47,7 +47,7 @@ class PlayConfig(Part):
     """Seconds of environment time (resets and steps of this game alone) after which a game counts as hung."""
 
     action_names: ActionNames | dict[str, ActionNames] | None = None
-    """Names of Discrete actions for people, in the order of the actions: of all policies, or policy id → names. They
+    """Display names of Discrete actions, in the order of the actions: of all policies, or policy id → names. They
     do not influence results."""
 
     def names_for(self, policy: str) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ class PlayConfig(Part):
         return names.get(policy, ()) if isinstance(names, dict) else names
 
     def rules(self) -> JSON:
-        """Return the settings that decide results: all but those of speed, of hung processes and for people.
+        """Return the settings that decide results: all but those of speed, of hung processes and for display.
 
         `actions` is not part of the game, because its default depends on the interface; see `league.conditions`.
         """

@@ -274,7 +274,7 @@ def policies_by_spaces(agents: Mapping[str, AgentInterface]) -> dict[str, str]:
 
 
 def describe_policies(interface: Interface) -> str:
-    """Return a sentence for people: the policies with their agents."""
+    """Return a human-readable sentence: the policies with their agents."""
     parts = []
     for policy in interface.policy_ids:
         own = [agent for agent in interface.agents if interface.policies[agent] == policy]

@@ -43,8 +43,8 @@ def load(
         ref: The version, by number or alias.
         policy: The policy id; optional if the version has one policy.
         registry: The registry; by default the one configured by environment variables.
-        episode: Name of the episode that the policy will play. Of a mixture, it selects the member, the same one as in
-            requests with this `X-League-Key`.
+        episode: Name of the episode that the policy will play. For a mixture, selects the member, as `X-League-Key`
+            does on the server.
 
     Raises:
         InvalidInput: The version is a mixture, and no episode is given.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from league.random.seed_sequence import generate_state
 
 MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
-"""Of PCG64's linear congruential generator with 128-bit states."""
+"""Multiplier of PCG64's linear congruential generator with 128-bit states."""
 LOW = 2**32 - 1
 
 

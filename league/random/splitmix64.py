@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 GAMMA = np.uint64(0x9E3779B97F4A7C15)
 """2⁶⁴ divided by the golden ratio, made odd: the difference between two states."""
 FACTORS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-"""Of the finaliser: variant 13 of Stafford's mixers."""
+"""Factors of the finaliser: variant 13 of Stafford's mixers."""
 
 
 def outputs(seeds: NDArray[np.uint64], numbers: NDArray[np.int64]) -> NDArray[np.uint64]:

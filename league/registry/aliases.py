@@ -1,4 +1,6 @@
-"""Aliases are set by compare-and-set, and each change is an event. Events form a stack for rollback:
+"""Aliases, set by compare-and-set. Every change is recorded as an event.
+
+Events form a stack for rollback:
 
     set 1            set 2            set 3           rollback          rollback        set 4
     version 1   ←    version 2   ←    version 3       version 2         version 1       version 4

@@ -48,8 +48,8 @@ class Schedule:
     seed: int
     environment_digest: str
     game_digest: str
-    """Of what decides results, see LeagueConfig.game; in schedules from before it was recorded, that of the
-    environment."""
+    """Digest of what decides results, see `LeagueConfig.game`; in schedules from before it was recorded, the digest of
+    the environment."""
     sides: tuple[str, ...]
     contestants: tuple[str, ...]
     """Pinned references: `connect_four@3`, `script:random`; never an alias."""
@@ -66,7 +66,7 @@ class Schedule:
 
     @property
     def conditions(self) -> Conditions:
-        """Those under which the matches are played."""
+        """The conditions under which the matches are played."""
         return Conditions(self.game_digest, self.actions)
 
     def contestants_at(self, position: int) -> tuple[str, ...]:
@@ -184,8 +184,8 @@ class LedgerEntry:
     """Kind of its schedule."""
     played_at: datetime
     is_purged: bool
-    conditions: Conditions
     """Whether it is excluded from results."""
+    conditions: Conditions
 
     @property
     def id(self) -> str:

@@ -21,7 +21,7 @@ NUMBER_SIZE = 40
 LEAF_SIZE = 512
 """Bytes for the keys of a leaf, and the headers of a small image."""
 LEAF_COMMAS = 8
-"""Of a leaf in base64, with its dtype and shape."""
+"""Commas of a leaf in base64, with its dtype and shape."""
 OVERHEAD_SIZE = 8 * 1024
 """Bytes of a request apart from its observations and recurrent states."""
 OVERHEAD = 1024

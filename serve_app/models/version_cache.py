@@ -58,7 +58,7 @@ class LoadedVersion:
     mixture: Mixture | None = None
     """The members of a mixture and their probabilities; None for other versions."""
     members: tuple["LoadedVersion", ...] = ()
-    """Those of a mixture, in the same order. They act in its place."""
+    """The loaded members of a mixture, in the same order. They act in its place."""
 
     def policy(self, name: str | None) -> LoadedPolicy:
         """A policy by name; None selects the only policy. Raises UnknownPolicy."""

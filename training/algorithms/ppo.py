@@ -1,7 +1,7 @@
 """PPO by self-play: Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347.
 
 An iteration: `PPO.training_step` here, `PPOLearner.update` in training/learners/ppo.py with train_batch.py, and
-`BatchedEnvRunner.sample` in training/sampling/env_runner.py.
+`BatchedEnvRunner.sample_chunks` in training/sampling/env_runner.py.
 
 All agents of a policy share one network and learn from their own steps. Illegal actions are masked in the logits, which
 keeps the policy gradient valid (Huang and Ontañón, 2020, arXiv 2006.14171). Advantages are generalised advantage

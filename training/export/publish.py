@@ -48,7 +48,7 @@ def publish(
     """Export the policies of `checkpoint`, check parity, and publish the graphs with the training state.
 
     exploits: the version that an exploiter was trained against; None for other versions.
-    Raises ParityError, and what publishing raises; no version exists then.
+    Raises ParityError, or an error of `VersionPublisher.publish`; nothing is published in that case.
     """
 
     def build(staging: Path, number: int) -> Manifest:

@@ -120,7 +120,7 @@ def one_hot(index: Tensor, n: int) -> Tensor:
 
 
 MIN_DEVIATION = 1e-3
-"""Of the exploration noise, in raw units: the logarithm of 0 would not be finite."""
+"""Minimum deviation of the exploration noise, in raw units: the logarithm of 0 would not be finite."""
 
 
 class Actor(PolicyModule):

@@ -21,7 +21,7 @@ from league.ray_cluster import alive_nodes, has_autoscaler
 CHUNK = 8 * 2**20
 """Bytes of a file that are sent at once. Ray's object store has at least 75 MiB."""
 POLL = 1.0
-"""Seconds between looks for a file on another machine."""
+"""Polling interval in seconds for a file on another machine."""
 
 
 class DriverFiles:
@@ -46,7 +46,7 @@ class DriverFiles:
         return path.exists()
 
     def keep_only(self, directory: Path) -> None:
-        """Remove all others of the directory that contains `directory`."""
+        """Remove all siblings of `directory`."""
         for other in directory.parent.iterdir():
             if other != directory:
                 shutil.rmtree(other)

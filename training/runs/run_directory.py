@@ -115,7 +115,7 @@ def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
 
 logger = logging.getLogger("policy_league")
 POLL = 1.0
-"""Seconds between looks for a heartbeat."""
+"""Polling interval in seconds for a heartbeat."""
 RUN_FILE = "run.json"
 ATTEMPT = "attempt-"
 CHECKPOINTS = "checkpoints"
@@ -225,8 +225,8 @@ class RunDirectory:
     def resume(cls, registry: Registry, config: LeagueConfig, role: Role = MAIN) -> Self:
         """Open the league's newest run of a role if it is incomplete: it was interrupted, or its budget is larger now.
 
-        It may have begun on another machine, with the same registry. Runs of nights and gates are left out: these
-        continue them.
+        It may have begun on another machine, with the same registry. Runs of training nights and of the gate are
+        excluded; `league nightly` resumes those.
 
         Raises NotFound; ConfigError if `config` differs; AlreadyRunning if it is trained on another machine.
         """

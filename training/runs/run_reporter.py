@@ -58,7 +58,7 @@ RETRY_SECONDS = 0.5
 DIGITS = 6
 """Significant digits of stored values."""
 AGENT_PREFIX, AGENT_RETURN = "agents/", "/return"
-"""Of the metrics of single agents only the returns are reported: in self-play between rivals, the mean is always 0."""
+"""The only metrics of single agents that are reported: in self-play between rivals, the mean return is always 0."""
 MAX_AGENTS = 8
 """With more agents, their returns are not reported."""
 POINT_FIELDS = {"steps", "seconds"}

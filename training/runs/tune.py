@@ -17,7 +17,7 @@ from training.rllib_compat import restored_sigusr1
 from training.runs.run_reporter import TensorBoard
 
 MIN_CPU_SHARE = 0.05
-"""Of a CPU: more than twenty processes per CPU only wait for one another."""
+"""Minimum CPU share of a process; at most twenty processes share a CPU."""
 
 
 def cpu_share(runners: int, at_once: int = 1) -> float:
@@ -83,7 +83,7 @@ def _gpus(count: float) -> dict[str, float]:
 
 
 ROUNDING = 1e-9
-"""Of a quotient of resources, which Ray counts in units of 0.0001."""
+"""Rounding error of a quotient of resources, which Ray counts in units of 0.0001."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

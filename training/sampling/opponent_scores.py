@@ -23,7 +23,7 @@ NO_ROWS = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, slots=True)
 class OpponentResults:
-    """Of each opponent, (opponents,): episodes, the scored games, and the sum of the learner's scores in them.
+    """Episodes, scored games and the sum of the learner's scores in them, for each opponent, (opponents,).
 
     A game may be scored later than its episode is counted, or never.
     """

@@ -85,7 +85,7 @@ class _Dependents:
     aliases: list[str] = field(default_factory=list)
     verdicts: list[str] = field(default_factory=list)
     schedules: set[str] = field(default_factory=set)
-    """Those of the verdicts, which are deleted as a whole."""
+    """Schedules of the verdicts, which are deleted as a whole."""
     played: set[str] = field(default_factory=set)
     """Other schedules in which the version takes part. Their matches between others stay."""
     reasons: list[str] = field(default_factory=list)

@@ -45,7 +45,7 @@ class LeagueRow:
     game: dict[str, Any]
     """What decides results, see `LeagueConfig.game`; empty if it was not recorded."""
     game_digest: str
-    """Of what decides results. Only results with the same digest are combined."""
+    """SHA-256 of `game`. Only results with the same digest are combined."""
     registered_at: datetime
     archived_at: datetime | None
     """Since when nothing is trained, published or tested."""
@@ -56,7 +56,7 @@ class LeagueRow:
 
     @property
     def conditions(self) -> Conditions:
-        """Those of the games that count."""
+        """The conditions of the games that count."""
         return Conditions(self.game_digest, action_selection(self.config, self.interface))
 
 
@@ -350,7 +350,7 @@ class VerdictRow:
 
     @property
     def short_id(self) -> str:
-        """The id for people."""
+        """The short id for display."""
         return short_verdict(self.id)
 
     @property

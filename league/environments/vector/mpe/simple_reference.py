@@ -12,7 +12,7 @@ from league.environments.vector.mpe.particle_env import ParticleEnv, relative
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
 
 COLORS = np.array([[0.75, 0.25, 0.25], [0.25, 0.75, 0.25], [0.25, 0.25, 0.75]])
-"""Of the landmarks, in rows: red, green, blue."""
+"""Colours of the landmarks, in rows: red, green, blue."""
 
 
 class SimpleReference(ParticleEnv):
