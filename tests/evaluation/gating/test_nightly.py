@@ -30,6 +30,7 @@ from league.settings import Storage
 from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of
+from tests.support.templates import copy_of
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +44,20 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
     opened = league_of(tmp_path / "home", WEAK, MIDDLING, STRONG, MIDDLING)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def judged(tmp_path: Path) -> Iterator[Registry]:
+    """The same league after its first nightly run."""
+    opened = copy_of(run_once, Storage.at(tmp_path / "judged"))
+    yield opened
+    opened.close()
+
+
+def run_once(storage: Storage) -> Registry:
+    registry = league_of(storage.home, WEAK, MIDDLING, STRONG, MIDDLING)
+    nightly(CONFIG, registry=registry)
+    return registry
 
 
 def state(registry: Registry) -> dict[str, Any]:
@@ -77,17 +92,15 @@ def test_a_nightly_run_promotes_the_strongest_version(registry: Registry) -> Non
     assert json.loads(json.dumps(report.to_json(), allow_nan=False))["champion"] == "tictactoe@3"
 
 
-def test_promotions_have_actor_reason_and_verdict(registry: Registry) -> None:
-    report = nightly(CONFIG, registry=registry)
-    event = registry.aliases.history(tictactoe.LEAGUE)[0]
-    assert event.verdict == report.verdicts[2].verdict
+def test_promotions_have_actor_reason_and_verdict(judged: Registry) -> None:
+    event = judged.aliases.history(tictactoe.LEAGUE)[0]
+    assert event.verdict == judged.verdicts.all(tictactoe.LEAGUE)[2].id
     assert event.actor == "league nightly"
     assert "beat tictactoe@2" in event.reason
 
 
-def test_verdicts_have_their_evidence(registry: Registry) -> None:
-    nightly(CONFIG, registry=registry)
-    for row in registry.verdicts.all(tictactoe.LEAGUE):
+def test_verdicts_have_their_evidence(judged: Registry) -> None:
+    for row in judged.verdicts.all(tictactoe.LEAGUE):
         assert row.evidence is not None
         assert sum(row.evidence["counts"]) == row.evidence["blocks"] == row.evidence["games"] / 2
         lower, upper = row.evidence["bounds"]
@@ -96,21 +109,19 @@ def test_verdicts_have_their_evidence(registry: Registry) -> None:
         assert 0 < row.evidence["unique_games"] <= row.evidence["games"]
 
 
-def test_the_next_run_has_nothing_to_do(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    nightly(CONFIG, registry=registry)
-    state_before = state(registry)
+def test_the_next_run_has_nothing_to_do(judged: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    state_before = state(judged)
     monkeypatch.setattr(tournament, "match_worker", None)
-    report = nightly(CONFIG, registry=registry)
+    report = nightly(CONFIG, registry=judged)
     assert report.verdicts == ()
     assert (report.champion_before, report.champion) == ("tictactoe@3", "tictactoe@3")
-    assert state(registry) == state_before
+    assert state(judged) == state_before
 
 
-def test_a_new_version_is_tested_against_the_current_champion(registry: Registry) -> None:
-    nightly(CONFIG, registry=registry)
-    tictactoe.publish(registry, STRONGEST)
-    registry.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=3, actor="me", reason="by hand")
-    report = nightly(CONFIG, registry=registry)
+def test_a_new_version_is_tested_against_the_current_champion(judged: Registry) -> None:
+    tictactoe.publish(judged, STRONGEST)
+    judged.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=3, actor="me", reason="by hand")
+    report = nightly(CONFIG, registry=judged)
     assert outcomes(report) == [("tictactoe@5", "tictactoe@2", "promote", True)]
 
 
@@ -205,12 +216,12 @@ def test_a_killed_run_continues(registry: Registry, tmp_path: Path) -> None:
     assert state(registry) == state(quiet)
 
 
-def test_a_concurrent_run_is_rejected(registry: Registry) -> None:
-    home = registry.storage.home
+def test_a_concurrent_run_is_rejected(judged: Registry) -> None:
+    home = judged.storage.home
     (home / "locks").mkdir(exist_ok=True)
     with FileLock(home / "locks" / "nightly-tictactoe.lock"), pytest.raises(AlreadyRunning, match="tictactoe"):
-        nightly(CONFIG, registry=registry)
-    assert nightly(CONFIG, registry=registry).champion == "tictactoe@3"
+        nightly(CONFIG, registry=judged)
+    assert nightly(CONFIG, registry=judged).champion == "tictactoe@3"
 
 
 def test_a_champion_moved_during_the_test_is_not_overruled(registry: Registry) -> None:
@@ -454,19 +465,20 @@ def test_a_verdict_voided_during_its_test_spends_its_alpha(tmp_path: Path) -> No
     assert again.alpha_spent == pytest.approx(2 * 0.05 / 365)
 
 
-def test_purged_games_are_kept_but_ignored(registry: Registry) -> None:
-    first = nightly(CONFIG, registry=registry).verdicts[1]
-    number = len(Ledger(registry).results(tictactoe.LEAGUE))
-    verdicts.void(registry, first.verdict, actor="me", reason="a broken machine", purge=True)
-    row = registry.verdicts.get(first.verdict)
+def test_purged_games_are_kept_but_ignored(judged: Registry) -> None:
+    first = judged.verdicts.all(tictactoe.LEAGUE)[1]
+    assert first.evidence is not None
+    number = len(Ledger(judged).results(tictactoe.LEAGUE))
+    verdicts.void(judged, first.id, actor="me", reason="a broken machine", purge=True)
+    row = judged.verdicts.get(first.id)
     assert row.outcome == "void"
     own = [row.schedule, row.settings["confirmation"], *(anchor["schedule"] for anchor in row.settings["anchors"])]
-    played = sum(len(Ledger(registry).positions(schedule)) for schedule in own)
-    assert len(Ledger(registry).results(tictactoe.LEAGUE)) == number - played
-    assert len(Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.blocks
-    assert verify(first.verdict, registry=registry).outcome == "void"
-    page = league_report(registry, tictactoe.LEAGUE)
-    assert page.games == sum(result.games for result in Ledger(registry).results(tictactoe.LEAGUE))
+    played = sum(len(Ledger(judged).positions(schedule)) for schedule in own)
+    assert len(Ledger(judged).results(tictactoe.LEAGUE)) == number - played
+    assert len(Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.evidence["blocks"]
+    assert verify(first.id, registry=judged).outcome == "void"
+    page = league_report(judged, tictactoe.LEAGUE)
+    assert page.games == sum(result.games for result in Ledger(judged).results(tictactoe.LEAGUE))
 
 
 def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registry) -> None:

@@ -75,6 +75,7 @@ def test_it_does_not_learn_without_the_required_setting(name: str, below: float)
     assert updates_until(solvable(name), {"shared": below}, limit=15) is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_a_slow_runner_is_waited_for_and_a_lost_one_ends_training() -> None:
     league = tictactoe(runners=1, train_batch_size=64, minibatch_size=64, epochs=1)
