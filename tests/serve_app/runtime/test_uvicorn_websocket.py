@@ -25,6 +25,8 @@ from tests.support.waiting import until
 
 BODY = json.dumps({"observation": BOARD})
 ONE = json.dumps({"observation": [1]})
+DEADLINE = 60
+"""Seconds for an answer. A slow machine that measures coverage takes many."""
 
 
 @pytest.fixture(scope="module", params=["asyncio", "uvloop"])
@@ -35,7 +37,7 @@ def listener(storage: Storage, request: pytest.FixtureRequest) -> Iterator[Liste
 
 
 def open_stream(listener: Listening, model: str = "board", query: str = "", **options: Any) -> ClientConnection:
-    return connect(listener.stream(model, query), compression=None, proxy=None, **options)
+    return connect(listener.stream(model, query), compression=None, proxy=None, open_timeout=DEADLINE, **options)
 
 
 def answer_to(stream: ClientConnection, message: str | bytes) -> dict[str, Any]:
@@ -44,13 +46,13 @@ def answer_to(stream: ClientConnection, message: str | bytes) -> dict[str, Any]:
 
 
 def receive(stream: ClientConnection) -> dict[str, Any]:
-    return json.loads(stream.recv(20))
+    return json.loads(stream.recv(DEADLINE))
 
 
 def close_of(stream: ClientConnection) -> tuple[int, str]:
     """The code and reason with which the server closes a stream."""
     with pytest.raises(ConnectionClosed) as caught:
-        stream.recv(20)
+        stream.recv(DEADLINE)
     assert caught.value.rcvd is not None
     return caught.value.rcvd.code, caught.value.rcvd.reason
 
@@ -71,7 +73,7 @@ def test_messages_of_one_connection_share_one_state(listener: Listening) -> None
             stream.send(ONE if kind % 2 else encode_request([np.ones((1, 1), "<f4")], 1, reset=not kind))
         actions = []
         for kind in range(40):
-            reply = stream.recv(20)
+            reply = stream.recv(DEADLINE)
             assert isinstance(reply, str) == bool(kind % 2)
             actions.append(
                 json.loads(reply)["action"] if kind % 2 else int.from_bytes(reply[RESPONSE.size :], "little")
@@ -106,7 +108,7 @@ def test_a_fragmented_message_is_one_message(listener: Listening) -> None:
         binary = encode_request([np.array([BOARD[name]], np.int8) for name in BOARD], 1)
         stream.send(binary)
         stream.send([binary[:1], b"", binary[1:50], binary[50:]])
-        assert stream.recv(20) == stream.recv(20)
+        assert stream.recv(DEADLINE) == stream.recv(DEADLINE)
 
 
 def test_pings_are_answered_between_fragments(listener: Listening) -> None:
@@ -129,7 +131,12 @@ class RawClient:
 
     def __init__(self, listener: Listening, model: str = "board") -> None:
         host, port = listener.url.removeprefix("http://").split(":")
-        self.socket = socket.create_connection((host, int(port)), 20)
+        self.socket = socket.socket()
+        for buffer in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+            # Small ones are full after some messages, megabytes after tens of thousands.
+            self.socket.setsockopt(socket.SOL_SOCKET, buffer, 16384)
+        self.socket.settimeout(DEADLINE)
+        self.socket.connect((host, int(port)))
         self.socket.sendall(
             f"GET /v1/policies/{model}/stream HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
             "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
@@ -265,7 +272,7 @@ def test_the_server_stops_reading_from_a_client_that_does_not_read(listener: Lis
     sent = raw.flood(INVALID_MESSAGE)
     with open_stream(listener) as stream:
         assert answer_to(stream, BODY)["version"] == 1
-    raw.socket.settimeout(20)
+    raw.socket.settimeout(DEADLINE)
     rejected = raw.frame()
     for _ in range(sent // len(INVALID_MESSAGE) - 1):
         assert raw.frame() == rejected
