@@ -248,17 +248,14 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
 
         from evaluation.service.strength_process import strength_process
         from league.refs import CheckpointRef
-        from training.runs.parent import start_of_exploiter, start_of_night
+        from training.runs.parent import start_version
         from training.runs.train import train as run
 
-        start = None if parent is None else CheckpointRef(config.league, parent)
+        wanted = None if parent is None else CheckpointRef(config.league, parent)
         exploited = None if target is None else CheckpointRef.parse(target)
-        if start is not None and exploited is not None:
-            start = start_of_exploiter(registry, start, config)
-        elif start is not None and (other := start_of_night(registry, start)) != start:
-            if not quiet:
-                say(f"{start} was imported and cannot be trained further: training starts from {other or 'scratch'}")
-            start = other
+        start = None if wanted is None else start_version(registry, wanted, config, exploited)
+        if start != wanted and exploited is None and not quiet:
+            say(f"{wanted} was imported and cannot be trained further: training starts from {start or 'scratch'}")
         with games.paused(), strength_process(registry.storage) as measure:
             run(
                 config,

@@ -155,8 +155,12 @@ def conclude(
     seen = gate_result(registry, verdict)
     if verdict.outcome is not None:
         return report_of(registry, verdict, verdict.outcome, seen, (verdict.evidence or {}).get("note"))
-    # Whether the champion moved before a promotion is decided when it moves.
-    obstacle = _changed_conditions(registry, verdict) if seen.outcome == "promote" else _obstacle(registry, verdict)
+    if is_applied(registry, verdict):
+        obstacle = None
+    elif seen.outcome == "promote":
+        obstacle = _changed_conditions(registry, verdict)  # `promote` finds out whether the champion has moved
+    else:
+        obstacle = _obstacle(registry, verdict)
     if obstacle is not None:
         return _close(registry, verdict, VOID, seen, note=obstacle)
     assert seen.outcome is not None, "a schedule ends with its test"
@@ -237,8 +241,6 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
 
 def _changed_conditions(registry: Registry, verdict: VerdictRow) -> str | None:
     """Why the games of this verdict do not count any more: the league's game or selection of actions has changed."""
-    if is_applied(registry, verdict):
-        return None
     then = Ledger(registry).schedule(verdict.schedule).conditions
     now = registry.leagues.get(verdict.league).conditions
     if then.game_digest != now.game_digest:

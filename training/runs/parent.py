@@ -31,6 +31,20 @@ def parent_version(registry: Registry, ref: CheckpointRef, config: LeagueConfig,
     return version
 
 
+def start_version(
+    registry: Registry, parent: CheckpointRef, config: LeagueConfig, target: CheckpointRef | None
+) -> CheckpointRef | None:
+    """Return the version that a run of a night or a gate starts from, None for one that starts from scratch.
+
+    Args:
+        registry: The registry of the league.
+        parent: The version that it continues if that can be trained further.
+        config: The settings of the run.
+        target: The version that an exploiter is trained against.
+    """
+    return start_of_night(registry, parent) if target is None else start_of_exploiter(registry, parent, config)
+
+
 def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueConfig) -> CheckpointRef | None:
     """Return the version that an exploiter starts from: `ref`, or None if that cannot be trained further.
 

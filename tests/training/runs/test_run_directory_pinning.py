@@ -5,6 +5,7 @@ import pytest
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.errors import ConfigError, InvalidInput, LeagueError, UnknownVersion
+from league.registry.registry import Registry
 from tests.support.leagues import tictactoe
 from training.runs.run_directory import pin_opponents, with_pins
 from training.sampling.opponents import without_mixtures
@@ -41,12 +42,18 @@ def test_the_magnet_is_pinned_too(tmp_path: Path) -> None:
         assert settings.magnet.ref == pinned.get(ref, ref)
 
 
-def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) -> None:
-    registry = tictactoe.registry(tmp_path)
+def mixed_champion(home: Path) -> Registry:
+    """The champion is a mixture, @3, of two versions."""
+    registry = tictactoe.registry(home)
     for _ in range(2):
         tictactoe.publish(registry, tictactoe.graph())
     number = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75}).number
     registry.aliases.set("tictactoe", "champion", number, expected=None, actor="me", reason="first")
+    return registry
+
+
+def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) -> None:
+    registry = mixed_champion(tmp_path)
     spaces = registry.leagues.get("tictactoe").interface
     league = with_opponents("@champion", "script:random")
     pins = pin_opponents(league, registry, spaces)
@@ -61,11 +68,7 @@ def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) ->
 
 
 def test_the_references_of_a_sweeps_trials_are_pinned_too(tmp_path: Path) -> None:
-    registry = tictactoe.registry(tmp_path)
-    for _ in range(2):
-        tictactoe.publish(registry, tictactoe.graph())
-    number = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75}).number
-    registry.aliases.set("tictactoe", "champion", number, expected=None, actor="me", reason="first")
+    registry = mixed_champion(tmp_path)
     spaces = registry.leagues.get("tictactoe").interface
     trials = [with_opponents("@champion"), tictactoe.config().with_training(teacher={"ref": "@2", "weight": 1})]
     pins = pin_opponents(with_opponents("script:random"), registry, spaces, trials)
