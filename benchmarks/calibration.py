@@ -27,6 +27,7 @@ from evaluation.gating.gate import Decision, decide
 from evaluation.gating.gate_result import AnchorResult, combine_results
 from evaluation.statistics.sequential import expected_games
 from league.config.gate import GateConfig
+from league.verdict_tests import AnchorTest
 from tests.support.leagues import tictactoe
 
 CANDIDATES = 8
@@ -97,7 +98,7 @@ def traps(quick: bool) -> bool:
         champion = _decided(settings, against_champion, rng)
         anchor = _decided(settings.against_anchor(None), against_anchor, rng)
         seen = combine_results(
-            champion, [AnchorResult("trap@1", margin, "s", anchor)], planned_companions=1, forfeits=0
+            champion, [AnchorResult(AnchorTest("trap@1", margin, "s"), anchor)], planned_companions=1, forfeits=0
         )
         beaten += champion.outcome == "promote"
         promoted += seen.outcome == "promote"

@@ -29,6 +29,7 @@ from sqlalchemy import Executable, delete, update
 
 from benchmarks.leagues.served_league import builder
 from evaluation.gating.gate import decide_matches
+from evaluation.gating.observations import SequentialTest
 from evaluation.gating.verdicts import conclude, gate_of, open_verdict
 from evaluation.matches.tournament import evaluate
 from evaluation.schedules.builders import gauntlet, round_robin
@@ -125,7 +126,7 @@ class _Crowd:
             self._registry, league, number, f"{LEAGUE}@{champion}" if champion else "script:random", alpha=0.05
         )
         drawn = list(self._drawn(self._ledger.schedule(verdict.schedule), CONFIG.gate.max_blocks))
-        self._write(drawn[: decide_matches(gate_of(verdict), drawn, new).blocks], number, hour=1)
+        self._write(drawn[: decide_matches(SequentialTest(gate_of(verdict), new), drawn).blocks], number, hour=1)
         conclude(self._registry, verdict)
         self._date(verdict.id, number)
         opponents = [f"{LEAGUE}@{n}" for n in range(max(1, number - NEIGHBOURS), number)]

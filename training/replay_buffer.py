@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config.off_policy import PrioritiesConfig
-from league.seeds import generator
+from league.random.seeds import generator
 
 
 class SumTree:

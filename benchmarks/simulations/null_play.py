@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.gating.gate import decide_matches
+from evaluation.gating.observations import SequentialTest
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import verdict
 from league.config.gate import GateConfig
@@ -41,6 +42,6 @@ def promoted(registry: Registry, same: bool, gates: int) -> int:
         matches, decision = [], None
         while decision is None or decision.outcome is None:
             matches += player.play(schedule, range(len(matches), min(len(matches) + CHUNK, schedule.length)))
-            decision = decide_matches(GATE, matches, challenger)
+            decision = decide_matches(SequentialTest(GATE, challenger), matches)
         found += decision.outcome == "promote"
     return found

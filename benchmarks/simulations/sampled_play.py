@@ -11,6 +11,7 @@ from copy import deepcopy
 import numpy as np
 
 from evaluation.gating.gate import decide_matches
+from evaluation.gating.observations import SequentialTest
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import verdict
 from examples.kuhn_poker import AGENTS, KuhnPoker
@@ -66,7 +67,7 @@ def promoted(gates: int) -> tuple[int, float]:
         while decision is None or decision.outcome is None:
             positions = range(len(matches), min(len(matches) + CHUNK, schedule.length))
             matches += play_matches(schedule, positions, environment, described, roster)
-            decision = decide_matches(GATE, matches, refs[0])
+            decision = decide_matches(SequentialTest(GATE, refs[0]), matches)
         found += decision.outcome == "promote"
         scores += [match.score(0) for match in matches]
     return found, float(np.mean(np.array(scores) != 0.5))

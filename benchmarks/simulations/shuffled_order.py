@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.simulations.simulated_gates import EQUALS, stronger
 from evaluation.gating.gate import SequentialMonitor, decide_matches
+from evaluation.gating.observations import SequentialTest
 from evaluation.matches.tournament import ReorderBuffer
 from league.config.gate import GateConfig
 from league.results.records import Game, Match
@@ -44,12 +45,12 @@ def _match(position: int, points: Sequence[float]) -> Match:
 
 
 def _judged(matches: Sequence[Match], workers: int, random: np.random.Generator) -> tuple[str | None, int]:
-    monitor, finished = SequentialMonitor(SETTINGS, "l@2"), list[Match]()
+    monitor, finished = SequentialMonitor(SequentialTest(SETTINGS, "l@2")), list[Match]()
     for chunk in _in_schedule_order(matches, workers, random):
         finished += chunk
         if monitor.is_over(finished):
             break
-    decision = decide_matches(SETTINGS, finished, "l@2")
+    decision = decide_matches(SequentialTest(SETTINGS, "l@2"), finished)
     return decision.outcome, decision.blocks
 
 

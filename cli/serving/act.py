@@ -81,7 +81,7 @@ def _act_here(
     import numpy as np
 
     from league.policies.loading import acting_version, load
-    from league.seeds import generator
+    from league.random.seeds import generator
     from serve_app.codecs.observation_codec import ObservationReader, reject_strings
 
     registry = open_registry()

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.gating.observations import Observations, matches_each, observe
+from evaluation.gating.observations import Observations, SequentialTest, observe
 from evaluation.matches.game_records import unique_games
 from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config.gate import GateConfig
@@ -108,31 +108,17 @@ def decide(
     )
 
 
-def decide_matches(settings: GateConfig, matches: Sequence[Match], candidate: str) -> Decision:
-    """Decide from matches, and count the unique games among those that count.
+def decide_matches(test: SequentialTest, matches: Sequence[Match]) -> Decision:
+    """Decide from matches in schedule order, and count the unique games among those that count.
 
-    Args:
-        settings: Configuration of the gate.
-        matches: Matches in schedule order.
-        candidate: Reference of the candidate.
+    A comparison of candidate and champion against exploiters has no estimate in Elo.
     """
-    seen = observe(settings, matches, candidate)
-    decision = decide(settings, seen.scores, seen.comparisons, seen.differences)
-    return replace(decision, unique_games=unique_games(matches[: decision.blocks]))
-
-
-def decide_pairs(
-    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, pairs: int = 1
-) -> Decision:
-    """Decide from matches of candidate and champion against exploiters, one match of each in turn.
-
-    pairs: pairs of matches in a round, which is one observation.
-    """
-    seen = observe(settings, matches, candidate, champion, pairs)
-    decision = decide(settings, seen.scores, seen.comparisons, seen.differences)
-    counted = matches[: decision.blocks * matches_each(champion, pairs)]
+    seen = observe(test, matches)
+    decision = decide(test.settings, seen.scores, seen.comparisons, seen.differences)
+    counted = matches[: decision.blocks * test.matches_each]
     games = len(counted) * GAMES_PER_BLOCK
-    return replace(decision, games=games, unique_games=unique_games(counted), estimate=None)
+    estimate = decision.estimate if test.champion is None else None
+    return replace(decision, games=games, unique_games=unique_games(counted), estimate=estimate)
 
 
 def shadow_shortfall(
@@ -178,19 +164,9 @@ class SequentialMonitor:
     It processes each block once. `decide_matches` makes the decision itself.
     """
 
-    def __init__(
-        self,
-        settings: GateConfig,
-        candidate: str,
-        champion: str | None = None,
-        pairs: int = 1,
-        at_least: int = 0,
-    ) -> None:
-        """champion, pairs: as in `observe`. at_least: observations to be made even if fewer decide the test."""
-        self._settings, self._candidate, self._champion, self._pairs = settings, candidate, champion, pairs
-        self._each, self._at_least = matches_each(champion, pairs), at_least
-        self._is_decided = False
-        self.bounds = decision_bounds(settings)
+    def __init__(self, test: SequentialTest) -> None:
+        self._test, self._is_decided = test, False
+        self.bounds = decision_bounds(test.settings)
         self.llr = 0.0
         self._counts: NDArray[np.int64] | None = None
         self._differences: list[float] = []
@@ -201,23 +177,24 @@ class SequentialMonitor:
 
         matches: all matches of the schedule so far, in order.
         """
-        end = min(len(matches) // self._each, self._settings.max_blocks)
+        each, most = self._test.matches_each, self._test.settings.max_blocks
+        end = min(len(matches) // each, most)
         if end > self._seen:
-            new = matches[self._seen * self._each : end * self._each]
-            curve = self._curve(observe(self._settings, new, self._candidate, self._champion, self._pairs))
+            curve = self._curve(observe(self._test, matches[self._seen * each : end * each]))
             self.llr, self._seen = float(curve[-1]), end
             self._is_decided = self._is_decided or bool(_crossed(curve, self.bounds).size)
-        is_sufficient = self._is_decided and self._seen >= self._at_least
-        return is_sufficient or self._seen >= self._settings.max_blocks
+        is_sufficient = self._is_decided and self._seen >= self._test.at_least
+        return is_sufficient or self._seen >= most
 
     def _curve(self, new: Observations) -> NDArray[np.float64]:
-        if self._settings.model == "returns":
+        settings = self._test.settings
+        if settings.model == "returns":
             self._differences += new.differences
-            return _wealth(self._settings, self._differences)
+            return _wealth(settings, self._differences)
         counts = _cumulated(new.scores, new.comparisons)
         counts = counts if self._counts is None else counts + self._counts
         self._counts = counts[-1]
-        return gsprt_llr(counts, self._settings.elo0, self._settings.elo1, self._settings.model)
+        return gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
 
 
 def cell_counts(matches: Sequence[Match], candidate: str) -> tuple[int, ...]:

@@ -6,58 +6,50 @@ hypothesis testing and acceptance sampling", Technometrics 24, 1982).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evaluation.gating.gate import Decision, Outcome, decide_pairs
-from evaluation.gating.observations import matches_each, observe
+from evaluation.gating.gate import Decision, Outcome, decide_matches
+from evaluation.gating.observations import SequentialTest, observe
 from evaluation.results import Difference
 from evaluation.statistics.payoff import crossed_interval, student_interval
 from league.config.gate import GateConfig
 from league.results.records import Match
+from league.verdict_tests import AnchorTest, CompanionTest, ExploitabilityTest, ExploiterTest
 
 
 @dataclass(frozen=True, slots=True)
 class AnchorResult:
-    """A non-inferiority test against one anchor. margin: by how much the candidate may be weaker."""
+    """Result of a non-inferiority test against one anchor."""
 
-    ref: str
-    margin: float
-    schedule: str
+    test: AnchorTest
     decision: Decision
 
     @property
     def failure(self) -> str:
         """What a `reject` shows."""
-        return f"is weaker than {self.ref}"
+        return f"is weaker than {self.test.ref}"
 
     @property
     def claim(self) -> str:
         """What a `promote` shows."""
-        return f"is at most {self.margin:g} weaker than {self.ref}"
+        return f"is at most {self.test.margin:g} weaker than {self.test.ref}"
 
 
 @dataclass(frozen=True, slots=True)
 class ExploiterResult:
-    """A paired test of candidate and champion against one exploiter.
+    """Result of a paired test of candidate and champion against one exploiter.
 
     Attributes:
-        ref: The exploiter.
-        exploits: The champion that it was trained against.
-        margin: By how much the candidate may be worse than the champion.
-        schedule: Id of the schedule.
-        decision: The test, whose blocks are pairs of blocks.
+        test: The test.
+        decision: Its decision, whose blocks are pairs of blocks.
         scores: Mean scores of candidate and champion over the counted pairs; None without pairs.
         difference: Score of the candidate minus the champion's, or its difference of returns if the gate tests returns.
     """
 
-    ref: str
-    exploits: str
-    margin: float
-    schedule: str
+    test: ExploiterTest
     decision: Decision
     scores: tuple[float, float] | None
     difference: Difference | None
@@ -65,58 +57,35 @@ class ExploiterResult:
     @property
     def failure(self) -> str:
         """What a `reject` shows."""
-        return f"does worse than the champion against {self.ref}, an exploiter of {self.exploits}"
+        return f"does worse than the champion against {self._exploiter}"
 
     @property
     def claim(self) -> str:
         """What a `promote` shows."""
-        return f"is at most {self.margin:g} worse than the champion against {self.ref}, an exploiter of {self.exploits}"
+        return f"is at most {self.test.margin:g} worse than the champion against {self._exploiter}"
 
-
-def exploiter_result(
-    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, exploiter: Mapping[str, Any]
-) -> ExploiterResult:
-    """Test candidate and champion against an exploiter. exploiter: its record in the settings of the verdict."""
-    ref, exploits, margin, schedule = (exploiter[name] for name in ("ref", "exploits", "margin", "schedule"))
-    test = settings.against_exploiter(margin)
-    decision = decide_pairs(test, matches, candidate, champion)
-    counted = matches[: 2 * decision.blocks]
-    gaps, scores = observe(test, counted, candidate, champion).gaps, None
-    if counted:
-        own, other = (
-            sum(match.score(match.contestants.index(each)) for match in counted if each in match.contestants)
-            for each in (candidate, champion)
-        )
-        scores = own / decision.blocks, other / decision.blocks
-    gap = student_interval(gaps) if gaps else None
-    return ExploiterResult(ref, exploits, margin, schedule, decision, scores, gap)
+    @property
+    def _exploiter(self) -> str:
+        return f"{self.test.ref}, an exploiter of {self.test.exploits}"
 
 
 @dataclass(frozen=True, slots=True)
 class ExploitabilityResult:
-    """A test of candidate and champion, each against exploiters trained against it.
+    """Result of a test of candidate and champion, each against exploiters trained against it.
 
     Attributes:
-        ref: The champion.
-        margin: By how much the candidate may be more exploitable.
-        improvement: By how much it must be less exploitable; 0 if it need not be.
-        schedule: Id of the schedule.
-        decision: The test, whose blocks are rounds: one block of each exploiter.
-        of_candidate: Exploiters of the candidate.
-        of_champion: As many exploiters of the champion.
+        test: The test.
+        champion: Reference of the champion.
+        decision: Its decision, whose blocks are rounds: one block of each exploiter.
         sample: Matches of the fixed number of rounds from which exploitability is estimated; empty before these.
         difference: Score of the candidate's exploiters minus that of the champion's, or the difference of their gains
             if the gate tests returns; with an interval over blocks. None without a sample.
         difference_over_exploiters: The same, with an interval over blocks and exploiters.
     """
 
-    ref: str
-    margin: float
-    improvement: float
-    schedule: str
+    test: ExploitabilityTest
+    champion: str
     decision: Decision
-    of_candidate: tuple[str, ...]
-    of_champion: tuple[str, ...]
     sample: Sequence[Match]
     difference: Difference | None
     difference_over_exploiters: Difference | None
@@ -124,54 +93,75 @@ class ExploitabilityResult:
     @property
     def failure(self) -> str:
         """What a `reject` shows."""
-        more = "not less" if self.improvement else "more"
-        return f"is {more} exploitable than {self.ref} by exploiters trained against each"
+        more = "not less" if self.test.improvement else "more"
+        return f"is {more} exploitable than {self.champion} by exploiters trained against each"
 
     @property
     def claim(self) -> str:
         """What a `promote` shows."""
-        less = "less" if self.improvement else f"at most {self.margin:g} more"
-        return f"is {less} exploitable than {self.ref} by exploiters trained against each"
+        less = "less" if self.test.improvement else f"at most {self.test.margin:g} more"
+        return f"is {less} exploitable than {self.champion} by exploiters trained against each"
 
 
-def exploitability_settings(settings: GateConfig, test: Mapping[str, Any]) -> GateConfig:
-    """Return the settings of a test of exploitability. test: its record in the settings of the verdict."""
-    return settings.of_exploitability(test["margin"], test.get("improvement", 0.0))
+CompanionResult = AnchorResult | ExploiterResult | ExploitabilityResult
 
 
-def exploitability_result(
-    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str, test: Mapping[str, Any]
+def sequential_test(gate: GateConfig, test: CompanionTest, candidate: str, champion: str) -> SequentialTest:
+    """Return how a test of a verdict is decided. gate: the settings of the test against the champion."""
+    match test:
+        case AnchorTest():
+            return SequentialTest(gate.against_anchor(test.margin), candidate)
+        case ExploiterTest():
+            return SequentialTest(gate.against_exploiter(test.margin), candidate, champion)
+        case ExploitabilityTest():
+            settings = gate.of_exploitability(test.margin, test.improvement)
+            return SequentialTest(settings, candidate, champion, pairs=len(test.of_candidate), at_least=test.blocks)
+
+
+def companion_result(
+    gate: GateConfig, test: CompanionTest, candidate: str, champion: str, matches: Sequence[Match]
+) -> CompanionResult:
+    """Decide a test of a verdict. gate: as in `sequential_test`. matches: those of the test, in schedule order."""
+    sequential = sequential_test(gate, test, candidate, champion)
+    decision = decide_matches(sequential, matches)
+    match test:
+        case AnchorTest():
+            return AnchorResult(test, decision)
+        case ExploiterTest():
+            return _exploiter_result(test, decision, sequential, matches[: 2 * decision.blocks])
+        case ExploitabilityTest():
+            size = sequential.at_least * sequential.matches_each
+            return _exploitability_result(test, decision, sequential, matches[:size] if len(matches) >= size else ())
+
+
+def _exploiter_result(
+    test: ExploiterTest, decision: Decision, sequential: SequentialTest, counted: Sequence[Match]
+) -> ExploiterResult:
+    if not counted:
+        return ExploiterResult(test, decision, None, None)
+    own, other = (
+        sum(match.score(match.contestants.index(each)) for match in counted if each in match.contestants)
+        for each in (sequential.candidate, sequential.champion)
+    )
+    scores = own / decision.blocks, other / decision.blocks
+    return ExploiterResult(test, decision, scores, student_interval(observe(sequential, counted).gaps))
+
+
+def _exploitability_result(
+    test: ExploitabilityTest, decision: Decision, sequential: SequentialTest, sample: Sequence[Match]
 ) -> ExploitabilityResult:
-    """Compare the exploitability of candidate and champion. test: its record in the settings of the verdict."""
-    exploiters, against = tuple(test["of_candidate"]), exploitability_settings(settings, test)
-    pairs = len(exploiters)
-    decision = decide_pairs(against, matches, candidate, champion, pairs)
-    size = test["blocks"] * matches_each(champion, pairs)
-    sample = matches[:size] if len(matches) >= size else ()
+    assert sequential.champion is not None, "it compares candidate and champion"
     by_block = by_exploiter = None
     if sample:
-        gaps = -np.array([observe(against, each, candidate, champion).gaps for each in _pairs(sample, pairs)])
+        pair = replace(sequential, pairs=1)
+        gaps = -np.array([observe(pair, each).gaps for each in _pairs(sample, sequential.pairs)])
         by_block, by_exploiter = student_interval(gaps.mean(axis=0).tolist()), crossed_interval(gaps)
-    return ExploitabilityResult(
-        ref=champion,
-        margin=test["margin"],
-        improvement=test.get("improvement", 0.0),
-        schedule=test["schedule"],
-        decision=decision,
-        of_candidate=exploiters,
-        of_champion=tuple(test["of_champion"]),
-        sample=sample,
-        difference=by_block,
-        difference_over_exploiters=by_exploiter,
-    )
+    return ExploitabilityResult(test, sequential.champion, decision, sample, by_block, by_exploiter)
 
 
 def _pairs(matches: Sequence[Match], pairs: int) -> list[list[Match]]:
     """The matches of whole rounds, by the pair of exploiters that played them."""
     return [[match for i, match in enumerate(matches) if i // 2 % pairs == pair] for pair in range(pairs)]
-
-
-CompanionResult = AnchorResult | ExploiterResult | ExploitabilityResult
 
 
 @dataclass(frozen=True, slots=True)

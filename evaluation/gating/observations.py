@@ -21,6 +21,31 @@ from league.results.records import GAMES_PER_BLOCK, Match
 
 
 @dataclass(frozen=True, slots=True)
+class SequentialTest:
+    """A sequential test of a candidate.
+
+    Attributes:
+        settings: The gate's settings, with the hypotheses of this test.
+        candidate: Reference of the candidate.
+        champion: For a comparison with the champion against exploiters, the contestant of every second match. None for
+            a test against one opponent.
+        pairs: Pairs of matches in a round.
+        at_least: Observations to be made even if fewer decide the test.
+    """
+
+    settings: GateConfig
+    candidate: str
+    champion: str | None = None
+    pairs: int = 1
+    at_least: int = 0
+
+    @property
+    def matches_each(self) -> int:
+        """Matches per observation."""
+        return 1 if self.champion is None else 2 * self.pairs
+
+
+@dataclass(frozen=True, slots=True)
 class Observations:
     """Observations of a test, in schedule order.
 
@@ -40,29 +65,16 @@ class Observations:
         return [2 * d for d in self.differences] or [2 * score - 1 for score in self.scores]
 
 
-def matches_each(champion: str | None, pairs: int = 1) -> int:
-    """Matches per observation. champion, pairs: as in `observe`."""
-    return 1 if champion is None else 2 * pairs
+def observe(test: SequentialTest, matches: Sequence[Match]) -> Observations:
+    """Observe matches. The matches of an incomplete last round are ignored.
 
-
-def observe(
-    settings: GateConfig, matches: Sequence[Match], candidate: str, champion: str | None = None, pairs: int = 1
-) -> Observations:
-    """Observe matches.
-
-    Args:
-        settings: Configuration of the gate.
-        matches: Matches in schedule order.
-        candidate: Reference of the candidate.
-        champion: For a comparison with the champion, the contestant of every second match. The matches of an incomplete
-            last round are ignored.
-        pairs: Pairs of matches in a round.
+    matches: in schedule order.
     """
+    settings, pairs, champion = test.settings, test.pairs, test.champion
     if champion is None:
-        return _blocks(settings, matches, candidate)
-    each = matches_each(champion, pairs)
-    whole = matches[: len(matches) // each * each]
-    mine, others = _blocks(settings, whole[::2], candidate), _blocks(settings, whole[1::2], champion)
+        return _blocks(settings, matches, test.candidate)
+    whole = matches[: len(matches) // test.matches_each * test.matches_each]
+    mine, others = _blocks(settings, whole[::2], test.candidate), _blocks(settings, whole[1::2], champion)
     return Observations(
         scores=[(1 + gap) / 2 for gap in _mean_gaps(mine.scores, others.scores, pairs)],
         comparisons=2 * pairs * mine.comparisons,

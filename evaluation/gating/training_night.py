@@ -19,10 +19,10 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, LeagueError, StorageError, UnknownRun, one_line
 from league.policies.loading import check_contestants
+from league.random.seeds import derive
 from league.refs import CHAMPION, CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import TrainingNightRow
-from league.seeds import derive
 
 WAIT = 10.0
 """Seconds between attempts to begin the gate while another nightly run of the league is active."""

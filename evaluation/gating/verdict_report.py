@@ -15,9 +15,9 @@ from evaluation.gating.gate_result import (
     ExploiterResult,
     GateResult,
     combine_results,
-    exploitability_result,
-    exploiter_result,
+    companion_result,
 )
+from evaluation.gating.observations import SequentialTest
 from evaluation.matches.game_records import forfeits
 from evaluation.results import (
     AnchorReport,
@@ -79,31 +79,19 @@ def _matches(registry: Registry, verdict: VerdictRow, schedule: str | None = Non
 
 def gate_result(registry: Registry, verdict: VerdictRow) -> GateResult:
     """Compute the gate result of a verdict from the ledger."""
-    gate, candidate_ref = gate_of(verdict), verdict.candidate_ref
+    gate, candidate_ref, tests = gate_of(verdict), verdict.candidate_ref, verdict.companions
     matches = _matches(registry, verdict)
-    champion = decide_matches(gate, matches, candidate_ref)
+    champion = decide_matches(SequentialTest(gate, candidate_ref), matches)
     forfeited = forfeits(matches[: champion.blocks], candidate_ref)
     companions: list[CompanionResult] = []
-    for anchor in verdict.settings.get("anchors", ()):
-        ref, margin, schedule = anchor["ref"], anchor["margin"], anchor["schedule"]
-        matches = _matches(registry, verdict, schedule)
-        decision = decide_matches(gate.against_anchor(margin), matches, candidate_ref)
-        companions.append(AnchorResult(ref, margin, schedule, decision))
-        forfeited += forfeits(matches[: decision.blocks], candidate_ref)
-    for exploiter in verdict.settings.get("exploiters", ()):
-        matches = _matches(registry, verdict, exploiter["schedule"])
-        result = exploiter_result(gate, matches, candidate_ref, verdict.champion, exploiter)
-        companions.append(result)
-        forfeited += forfeits(matches[: 2 * result.decision.blocks], candidate_ref)
-    planned = len(companions) + ("exploitability" in verdict.settings)
-    if (test := verdict.settings.get("exploitability")) is not None:
-        matches = _matches(registry, verdict, test["schedule"])
-        found = exploitability_result(gate, matches, candidate_ref, verdict.champion, test)
+    for test in tests.ready:
+        matches = _matches(registry, verdict, test.schedule)
+        found = companion_result(gate, test, candidate_ref, verdict.champion, matches)
         companions.append(found)
         forfeited += forfeits(matches[: found.decision.games // GAMES_PER_BLOCK], candidate_ref)
     opponent = "the champion" if isinstance(parse_ref(verdict.champion), CheckpointRef) else verdict.champion
     shown = f"it beat {opponent}" if gate.requires_gain else f"it is not inferior to {opponent}"
-    return combine_results(champion, companions, planned, None if gate.forfeits else forfeited, shown)
+    return combine_results(champion, companions, tests.number, None if gate.forfeits else forfeited, shown)
 
 
 def difference_of_returns(
@@ -149,9 +137,9 @@ OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "in
 def anchor_report(anchor: AnchorResult) -> AnchorReport:
     """Report of one non-inferiority test."""
     return AnchorReport(
-        ref=anchor.ref,
-        margin=anchor.margin,
-        schedule=anchor.schedule,
+        ref=anchor.test.ref,
+        margin=anchor.test.margin,
+        schedule=anchor.test.schedule,
         outcome=OUTCOMES[anchor.decision.outcome],
         **gate_statistics(anchor.decision),
     )
@@ -164,10 +152,10 @@ def exploiter_report(exploiter: ExploiterResult) -> ExploiterReport:
     """Report of one paired test against an exploiter."""
     own, champion = exploiter.scores or (None, None)
     return ExploiterReport(
-        ref=exploiter.ref,
-        exploits=exploiter.exploits,
-        margin=exploiter.margin,
-        schedule=exploiter.schedule,
+        ref=exploiter.test.ref,
+        exploits=exploiter.test.exploits,
+        margin=exploiter.test.margin,
+        schedule=exploiter.test.schedule,
         outcome=PAIRED_OUTCOMES[exploiter.decision.outcome],
         **_test_statistics(exploiter.decision),
         score=own,
@@ -180,24 +168,25 @@ EXPLOITABILITY_OUTCOMES = OUTCOMES | {"promote": "not more exploitable", "reject
 IMPROVEMENT_OUTCOMES = OUTCOMES | {"promote": "less exploitable", "reject": "not less exploitable"}
 
 
-def exploitability_report(test: ExploitabilityResult | None, candidate: str) -> ExploitabilityReport | None:
+def exploitability_report(result: ExploitabilityResult | None, candidate: str) -> ExploitabilityReport | None:
     """Report of the test of exploitability."""
-    if test is None:
+    if result is None:
         return None
-    exploiters = {candidate: test.of_candidate, test.ref: test.of_champion}
-    bounds = {ref: exploitability_bound(ref, own, test.sample) for ref, own in exploiters.items() if test.sample}
+    test, champion = result.test, result.champion
+    exploiters = {candidate: test.of_candidate, champion: test.of_champion}
+    bounds = {ref: exploitability_bound(ref, own, result.sample) for ref, own in exploiters.items() if result.sample}
     outcomes = IMPROVEMENT_OUTCOMES if test.improvement else EXPLOITABILITY_OUTCOMES
     return ExploitabilityReport(
-        ref=test.ref,
+        ref=champion,
         margin=test.margin,
         improvement=test.improvement,
         schedule=test.schedule,
-        outcome=outcomes[test.decision.outcome],
-        **_test_statistics(test.decision),
+        outcome=outcomes[result.decision.outcome],
+        **_test_statistics(result.decision),
         candidate=bounds.get(candidate),
-        champion=bounds.get(test.ref),
-        difference=test.difference,
-        difference_over_exploiters=test.difference_over_exploiters,
+        champion=bounds.get(champion),
+        difference=result.difference,
+        difference_over_exploiters=result.difference_over_exploiters,
     )
 
 
@@ -207,7 +196,7 @@ def confirmation(registry: Registry, verdict: VerdictRow) -> Confirmation | None
     The match has a fixed length and no influence on the decision, so the estimate is unbiased. The estimate of the
     verdict itself is optimistic, because the test stopped when the results looked good.
     """
-    name = verdict.settings.get("confirmation")
+    name = verdict.companions.confirmation
     if name is None:
         return None
     schedule, matches = Ledger(registry).schedule(name), _matches(registry, verdict, name)

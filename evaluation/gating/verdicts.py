@@ -13,18 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 from evaluation.gating.anchors import resolve_anchors
 from evaluation.gating.exploiters import recent_exploiters
 from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
-from evaluation.gating.gate_result import GateResult, exploitability_settings
+from evaluation.gating.gate_result import GateResult, sequential_test
+from evaluation.gating.observations import SequentialTest
 from evaluation.gating.trained_exploiters import Trainer, prepared_test
 from evaluation.gating.verdict_report import confirmation, gate_of, gate_result, is_applied, report_of
 from evaluation.matches import tournament
 from evaluation.results import Confirmation, Listener, Progress, VerdictReport
 from evaluation.schedules.builders import companion, exploiter_test
 from evaluation.schedules.builders import verdict as verdict_schedule
+from league.config.gate import GateConfig
 from league.errors import AliasMoved
 from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, parse_ref
@@ -33,6 +34,7 @@ from league.registry.storage.rows import LeagueRow, VerdictRow
 from league.registry.verdicts import VOID
 from league.results.ledger import Ledger
 from league.results.records import Match, Schedule
+from league.verdict_tests import AnchorTest, CompanionTest, CompanionTests, ExploiterTest
 
 ACTOR = "league nightly"
 
@@ -70,6 +72,10 @@ def promote(registry: Registry, verdict: VerdictRow, reason: str) -> str | None:
     return None
 
 
+def _is_version(opponent: str) -> bool:
+    return isinstance(parse_ref(opponent), CheckpointRef)
+
+
 def is_effective(verdict: VerdictRow) -> bool:
     """Whether a verdict is or will be final: neither void nor refused its promotion."""
     if verdict.outcome == "promote":
@@ -96,28 +102,39 @@ def open_verdict(
     if (resumed := next((row for row in earlier if row.outcome is None), None)) is not None:
         return resumed
     config, candidate_ref, ledger = league.config, f"{league.slug}@{candidate}", Ledger(registry)
-    is_champion = isinstance(parse_ref(opponent), CheckpointRef)
-    gate = config.gate if is_champion else config.gate.against_baseline()
+    gate = config.gate if _is_version(opponent) else config.gate.against_baseline()
     gate = gate.of_one_verdict(gate.alpha if alpha is None else alpha)
     schedule = verdict_schedule(config, league.interface, candidate_ref, opponent, gate, seed=len(earlier))
     ledger.open(schedule)
-    settings: dict[str, Any] = {"gate": gate.model_dump(mode="json"), "night": nightly_run}
-    settings |= {"anchors": [], "exploiters": []}
-    for anchor in resolve_anchors(registry, league, candidate, opponent):
-        own = companion(config, league.interface, "anchor", schedule, anchor.ref, gate.max_blocks)
-        settings["anchors"].append(
-            {"ref": anchor.ref, "margin": anchor.margin or gate.margin, "schedule": ledger.open(own).id}
-        )
-    for exploiter in recent_exploiters(registry, league, opponent):
-        own = exploiter_test(config, league.interface, schedule, exploiter.ref, gate.max_blocks)
-        record = {"ref": exploiter.ref, "exploits": exploiter.exploits, "margin": gate.margin_against_exploiters}
-        settings["exploiters"].append(record | {"schedule": ledger.open(own).id})
-    if gate.exploiters.count and is_champion and len(league.interface.sides) > 1:
-        settings["exploitability"] = None  # until the exploiters are trained
-    if gate.confirmation_blocks:
-        own = companion(config, league.interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
-        settings["confirmation"] = ledger.open(own).id
+    tests = _opened_tests(registry, league, candidate, schedule, gate)
+    settings = {"gate": gate.model_dump(mode="json"), "night": nightly_run} | tests.to_settings()
     return registry.verdicts.open(league.slug, candidate, opponent, schedule.id, settings)
+
+
+def _opened_tests(
+    registry: Registry, league: LeagueRow, candidate: int, schedule: Schedule, gate: GateConfig
+) -> CompanionTests:
+    """Choose the tests of a verdict after that against the champion, and open their schedules."""
+    config, interface, ledger = league.config, league.interface, Ledger(registry)
+    opponent = schedule.contestants[1]
+    anchors, exploiters, confirmation = list[AnchorTest](), list[ExploiterTest](), None
+    for anchor in resolve_anchors(registry, league, candidate, opponent):
+        own = companion(config, interface, "anchor", schedule, anchor.ref, gate.max_blocks)
+        anchors.append(AnchorTest(anchor.ref, anchor.margin or gate.margin, ledger.open(own).id))
+    for exploiter in recent_exploiters(registry, league, opponent):
+        assert exploiter.exploits is not None, "it is an exploiter"
+        own = exploiter_test(config, interface, schedule, exploiter.ref, gate.max_blocks)
+        margin = gate.margin_against_exploiters
+        exploiters.append(ExploiterTest(exploiter.ref, exploiter.exploits, margin, ledger.open(own).id))
+    if gate.confirmation_blocks:
+        own = companion(config, interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
+        confirmation = ledger.open(own).id
+    return CompanionTests(
+        anchors=tuple(anchors),
+        exploiters=tuple(exploiters),
+        includes_exploitability=bool(gate.exploiters.count) and _is_version(opponent) and len(interface.sides) > 1,
+        confirmation=confirmation,
+    )
 
 
 def conclude(
@@ -191,19 +208,21 @@ def _tests(
     Before the last one, the exploiters that it needs are trained. It is left out if the verdict is closed meanwhile, or
     cannot continue.
     """
-    gate, candidate, settings, ledger = gate_of(verdict), verdict.candidate_ref, verdict.settings, Ledger(registry)
-    yield ledger.schedule(verdict.schedule), SequentialMonitor(gate, candidate)
-    for anchor in settings.get("anchors", ()):
-        yield ledger.schedule(anchor["schedule"]), SequentialMonitor(gate.against_anchor(anchor["margin"]), candidate)
-    for each in settings.get("exploiters", ()):
-        against = gate.against_exploiter(each["margin"])
-        yield ledger.schedule(each["schedule"]), SequentialMonitor(against, candidate, verdict.champion)
-    if "exploitability" not in settings or _obstacle(registry, verdict) is not None:
+    gate, candidate, companions, ledger = gate_of(verdict), verdict.candidate_ref, verdict.companions, Ledger(registry)
+
+    def monitored(test: CompanionTest) -> tuple[Schedule, SequentialMonitor]:
+        sequential = sequential_test(gate, test, candidate, verdict.champion)
+        return ledger.schedule(test.schedule), SequentialMonitor(sequential)
+
+    yield ledger.schedule(verdict.schedule), SequentialMonitor(SequentialTest(gate, candidate))
+    for anchor in companions.anchors:
+        yield monitored(anchor)
+    for exploiter in companions.exploiters:
+        yield monitored(exploiter)
+    if not companions.includes_exploitability or _obstacle(registry, verdict) is not None:
         return
     if (test := prepared_test(registry, verdict, train)) is not None:
-        against, pairs = exploitability_settings(gate, test), len(test["of_candidate"])
-        watch = SequentialMonitor(against, candidate, verdict.champion, pairs, at_least=test["blocks"])
-        yield ledger.schedule(test["schedule"]), watch
+        yield monitored(test)
 
 
 def _play(
@@ -275,12 +294,12 @@ def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str 
 
 def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     decision = seen.champion
-    anchors = f", and is not inferior to {', '.join(each.ref for each in seen.anchors)}" if seen.anchors else ""
-    exploiters = ", ".join(each.ref for each in seen.exploiters)
+    anchors = f", and is not inferior to {', '.join(each.test.ref for each in seen.anchors)}" if seen.anchors else ""
+    exploiters = ", ".join(each.test.ref for each in seen.exploiters)
     unexploited = f", and does no worse than it against {exploiters}" if exploiters else ""
     test = seen.exploitability
     exploitability = (
-        f", and is {'less' if test.improvement else 'not more'} exploitable by its own exploiters" if test else ""
+        f", and is {'less' if test.test.improvement else 'not more'} exploitable by its own exploiters" if test else ""
     )
     result = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
     return (
@@ -302,7 +321,7 @@ def confirm(
 
     None if nothing was promoted, no confirmation is configured, or the league's conditions have changed.
     """
-    schedule = verdict.settings.get("confirmation")
+    schedule = verdict.companions.confirmation
     if verdict.outcome != "promote" or not is_effective(verdict) or schedule is None:
         return None
     whole = Ledger(registry).schedule(schedule)

@@ -11,7 +11,7 @@ from league.environments.stepping import Batch, Indices
 from league.policies.draws import UniformNumbers
 from league.random import pcg64, splitmix64
 from league.random.seed_sequence import generate_state
-from league.seeds import generators, spawn_key
+from league.random.seeds import generators, spawn_key
 
 State = dict[str, NDArray]
 """name of a recurrent input → array (k, …)"""

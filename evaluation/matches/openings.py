@@ -10,7 +10,7 @@ from league.interface import Interface
 from league.policies.draws import UniformNumbers
 from league.policies.scripted import Random
 from league.random import pcg64
-from league.seeds import spawn_key
+from league.random.seeds import spawn_key
 
 
 class OpeningMoves:

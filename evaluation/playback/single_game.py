@@ -16,7 +16,7 @@ from league.errors import GameCrashed, UnknownPolicy, one_line
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
-from league.seeds import generator
+from league.random.seeds import generator
 from league.spaces import Space, paths
 
 

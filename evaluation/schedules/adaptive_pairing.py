@@ -20,8 +20,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit, ndtr
 
 from evaluation.statistics.blas import single_threaded_blas
+from league.random.seeds import generator
 from league.results.records import BlockResult
-from league.seeds import generator
 
 Floats = NDArray[np.float64]
 Pairing = tuple[int, int]

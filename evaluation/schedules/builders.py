@@ -32,10 +32,10 @@ from league.config.gate import GateConfig
 from league.config.league import LeagueConfig
 from league.errors import EnvironmentMismatch
 from league.interface import Interface, digest
+from league.random.seeds import derive
 from league.refs import ScriptRef
 from league.results.records import GAMES_PER_BLOCK, BlockResult, Schedule, Scoring
 from league.results.scoring import scoring
-from league.seeds import derive
 
 ANCHOR = str(ScriptRef("random"))
 """The contestant whose rating is 0."""

@@ -19,7 +19,7 @@ from typing import Any
 from league.client import Client
 from league.client.responses import VERSION_GONE, ActionResponse, Model, episode_interrupted, parse_model
 from league.errors import InvalidInput
-from league.seeds import derive
+from league.random.seeds import derive
 
 Player = str | Callable[[Any], Any]
 """A model, `connect_four@3`, or a function from an observation to an action."""

@@ -1,1 +1,1 @@
-"""Random numbers of NumPy for many seeds at once."""
+"""Derived seeds, and random numbers of NumPy for many seeds at once."""

@@ -17,6 +17,7 @@ from league.registry import leagues, versions
 from league.registry.storage.database import Repository, insert, repeat_after_deadlock
 from league.registry.storage.rows import NightlyRunRow, VerdictRow, detached
 from league.registry.storage.tables import AliasEventTable, NightlyRunTable, VerdictTable
+from league.verdict_tests import CompanionTests, ExploitabilityTest
 
 VOID = "void"
 MAX_LISTED = 5
@@ -43,15 +44,15 @@ class VerdictRepository(Repository):
             return _row(verdict)
 
     @repeat_after_deadlock
-    def settle(self, verdict: str, name: str, value: dict[str, Any]) -> VerdictRow:
-        """Set a setting that was None when the verdict was opened, and return the verdict.
+    def settle(self, verdict: str, test: ExploitabilityTest) -> VerdictRow:
+        """Record the test of exploitability of a verdict that was opened without its exploiters. Returns the verdict.
 
-        A setting that is set, and a closed verdict, stay as they are. Raises UnknownVerdict.
+        A test that is recorded, and a closed verdict, stay as they are. Raises UnknownVerdict.
         """
         with self._database.write() as session:
             row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
-            if row.outcome is None and row.settings[name] is None:
-                row.settings = row.settings | {name: value}
+            if row.outcome is None and CompanionTests.of_settings(row.settings).exploitability is None:
+                row.settings = row.settings | {"exploitability": test.to_record()}
             return _row(row)
 
     @repeat_after_deadlock

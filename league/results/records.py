@@ -75,13 +75,13 @@ class Schedule:
 
     def seed_at(self, position: int) -> int:
         """Return the seed of match `position`."""
-        from league.seeds import derive  # NumPy takes 0.1 s to import.
+        from league.random.seeds import derive  # NumPy takes 0.1 s to import.
 
         return derive(self.seed, position // self._matches_per_seed)
 
     def seeds_at(self, positions: Sequence[int]) -> list[int]:
         """Return the seeds of some matches."""
-        from league.seeds import derive_each  # NumPy takes 0.1 s to import.
+        from league.random.seeds import derive_each  # NumPy takes 0.1 s to import.
 
         return derive_each(self.seed, [position // self._matches_per_seed for position in positions]).tolist()
 

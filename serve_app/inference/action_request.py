@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from league.errors import BodyTooLarge, InvalidInput, InvalidState
 from league.policies.draws import probabilities
 from league.policies.policy import Actions
-from league.seeds import generator
+from league.random.seeds import generator
 from league.spaces import ACTION_MASK
 from serve_app.codecs.observation_codec import json_type, read_state, reject_strings
 from serve_app.codecs.request_limits import LARGE_BODY

@@ -23,8 +23,8 @@ from league.errors import one_line
 from league.histograms import Histogram
 from league.policies.policy import Arrays
 from league.policies.probes import same
+from league.random.seeds import generators
 from league.registry.storage.rows import ShadowCounts
-from league.seeds import generators
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.resolver import policy_ref
 from serve_app.models.traffic_split import TrafficSplit, acting

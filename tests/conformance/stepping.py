@@ -15,7 +15,7 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from league.environments.building import action_space, observation_space
 from league.environments.stepping import BatchedEnvironment, Starts, States, Turn
-from league.seeds import generator
+from league.random.seeds import generator
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import tensors
 from league.spaces.conversion import from_gymnasium

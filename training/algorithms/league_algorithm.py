@@ -12,7 +12,7 @@ from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
 from league.config.schedules import ScheduleProgress
 from league.interface import Interface
-from league.seeds import derive
+from league.random.seeds import derive
 from training.algorithms.league_opponents import LeagueOpponents
 from training.rllib_compat import NoResultsDirectory
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner

@@ -18,10 +18,10 @@ from ray.rllib.utils.metrics import NUM_EPISODES
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
 from league.interface import Interface
+from league.random.seeds import generator
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.payoffs import UNKNOWN, Scores, payoff_matrix, shrunk
-from league.seeds import generator
 from league.settings import Storage
 from training.algorithms.opponent_distribution import opponent_distribution, systematic_counts
 from training.sampling.self_play import EPISODES, GAMES, OPPONENTS, SCORE

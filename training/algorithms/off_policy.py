@@ -40,7 +40,7 @@ from league.config.off_policy import OffPolicyConfig, QLearningConfig
 from league.config.opponents import OpponentConfig
 from league.config.training import TrainingSettings
 from league.interface import Interface
-from league.seeds import derive
+from league.random.seeds import derive
 from league.settings import Storage
 from training.algorithms import setup
 from training.algorithms.league_algorithm import LeagueAlgorithm

@@ -20,8 +20,8 @@ from league.interface import Interface
 from league.policies.actions import to_environment
 from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.probes import Probes, excused, same
+from league.random.seeds import derive, generator
 from league.registry.storage.manifest import Parity
-from league.seeds import derive, generator
 from league.spaces import ACTION_MASK, Space
 from training.export.onnx_export import state_names
 from training.modules.policy_module import PolicyModule

@@ -17,8 +17,8 @@ from league.interface import AgentInterface, Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import Probes, excused, same
 from league.policies.scripted import Random
+from league.random.seeds import derive, generator
 from league.registry.storage.manifest import Parity
-from league.seeds import derive, generator
 from league.spaces import ACTION_MASK, DictSpace
 from training.importing.source import Original, State, known_logits
 from training.sampling.recurrent_state import RecurrentStates

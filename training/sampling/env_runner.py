@@ -25,8 +25,8 @@ from league.environments.implementation import stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface
+from league.random.seeds import generator
 from league.results.scoring import scoring
-from league.seeds import generator
 from league.spaces import inputs
 from league.spaces.conversion import to_gymnasium
 from training.rllib_compat import RaisingEnvRunner, includes_component, subcomponents

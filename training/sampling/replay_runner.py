@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from league.config.off_policy import MADDPGConfig
-from league.seeds import derive
+from league.random.seeds import derive
 from training.modules.distributions import TorchGaussian
 from training.replay_buffer import TransitionBlock
 from training.sampling.closed_transitions import JointTransitions, JointTransitionsWithoutState, PolicyTransitions

@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from league.seeds import derive
+from league.random.seeds import derive
 
 SEEDS = 2**31
 """Environments accept seeds of 31 bits."""

@@ -13,7 +13,7 @@ import numpy as np
 from league.config.league import LeagueConfig
 from league.config.sweep import SweepConfig
 from league.errors import ConfigError
-from league.seeds import generator
+from league.random.seeds import generator
 
 Settings = dict[str, Any]
 """Training setting, with dots for nested ones (`per_policy.cars.lr`) → value."""

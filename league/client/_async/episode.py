@@ -9,7 +9,7 @@ from league.client import calls
 from league.client.calls import ApiCall
 from league.client.requests import ActionRequest, Encoding
 from league.client.responses import VERSION_GONE, ActionResponse, Model, episode_interrupted
-from league.seeds import derive
+from league.random.seeds import derive
 
 T = TypeVar("T")
 

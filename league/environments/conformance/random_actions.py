@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from league.seeds import derive
+from league.random.seeds import derive
 
 
 class RandomActions:

@@ -12,6 +12,7 @@ from league.interface import Interface
 from league.refs import short_verdict
 from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Role
 from league.registry.storage.mixture import Mixture
+from league.verdict_tests import CompanionTests
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -328,24 +329,24 @@ class VerdictRow:
         return self.id
 
     @property
+    def companions(self) -> CompanionTests:
+        """Its tests after that against the champion."""
+        return CompanionTests.of_settings(self.settings)
+
+    @property
     def tested_schedules(self) -> list[str]:
         """Ids of the schedules whose results decide the verdict, in order."""
-        settings = self.settings
-        companions = [*settings.get("anchors", ()), *settings.get("exploiters", ()), settings.get("exploitability")]
-        return [self.schedule, *(each["schedule"] for each in companions if each is not None)]
+        return [self.schedule, *(each.schedule for each in self.companions.ready)]
 
     @property
     def contestants(self) -> set[str]:
         """References of all that play in its tests."""
-        settings, exploitability = self.settings, self.settings.get("exploitability") or {}
-        others = {each["ref"] for each in (*settings.get("anchors", ()), *settings.get("exploiters", ()))}
-        trained = {*exploitability.get("of_candidate", ()), *exploitability.get("of_champion", ())}
-        return {self.candidate_ref, self.champion} | others | trained
+        return {self.candidate_ref, self.champion} | self.companions.opponents
 
     @property
     def schedules(self) -> list[str]:
         """Ids of all schedules that belong to the verdict."""
-        confirmation = self.settings.get("confirmation")
+        confirmation = self.companions.confirmation
         return [*self.tested_schedules, *([confirmation] if confirmation else [])]
 
     @property

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from evaluation.gating.gate import SequentialMonitor, decide, decide_matches, shadow_shortfall
+from evaluation.gating.observations import SequentialTest
 from evaluation.matches.game_records import unique_games
 from evaluation.statistics.sequential import bounds, elo_estimate, expected_games, gsprt_llr
 from league.config.gate import GateConfig
@@ -53,9 +54,9 @@ def test_a_winning_streak_is_promoted_at_the_upper_bound() -> None:
 
 def test_a_monitor_waits_for_the_blocks_that_must_be_played() -> None:
     matches = [match(position, (1.0, 1.0)) for position in range(60)]
-    decided = decide_matches(GATE, matches, "league@2").blocks
+    decided = decide_matches(SequentialTest(GATE, "league@2"), matches).blocks
     assert decided < 50
-    watch = SequentialMonitor(GATE, "league@2", at_least=50)
+    watch = SequentialMonitor(SequentialTest(GATE, "league@2", at_least=50))
     assert [watch.is_over(matches[:end]) for end in (decided - 1, decided, 49, 50)] == [False, False, False, True]
 
 
@@ -124,28 +125,28 @@ def test_it_stops_at_the_first_decisive_block(scores: list[float]) -> None:
 def test_monitoring_chunks_equals_deciding_all_matches(scores: list[float], sizes: list[int]) -> None:
     """For any chunks, the monitor stops in the chunk with the stopping block."""
     matches = [match(i, (min(1.0, 2 * s), max(0.0, 2 * s - 1))) for i, s in enumerate(scores)]
-    expected = decide_matches(GATE, matches, "league@2")
-    monitor, seen = SequentialMonitor(GATE, "league@2"), 0
+    expected = decide_matches(SequentialTest(GATE, "league@2"), matches)
+    monitor, seen = SequentialMonitor(SequentialTest(GATE, "league@2")), 0
     over = monitor.is_over([])
     assert not over
     while not over and seen < len(matches):
         seen += sizes[seen % len(sizes)]
         over = monitor.is_over(matches[:seen])
     assert over == (expected.outcome is not None)
-    assert close(decide_matches(GATE, matches[:seen], "league@2"), expected)
+    assert close(decide_matches(SequentialTest(GATE, "league@2"), matches[:seen]), expected)
 
 
 def test_the_challenger_can_be_either_contestant() -> None:
     matches = [match(i, (1.0, 1.0)) for i in range(60)]
-    assert decide_matches(GATE, matches, "league@2").outcome == "promote"
-    assert decide_matches(GATE, matches, "league@1").outcome == "reject"
+    assert decide_matches(SequentialTest(GATE, "league@2"), matches).outcome == "promote"
+    assert decide_matches(SequentialTest(GATE, "league@1"), matches).outcome == "reject"
 
 
 def test_repeated_games_are_counted_once() -> None:
     repeated = [match(7, (1.0, 0.0), moves=(1, 2)), match(7, (1.0, 0.0), moves=(1, 2))]
     assert unique_games(repeated) == 1
     assert unique_games([*repeated, match(8, (1.0, 0.0), moves=(1, 2)), match(7, (1.0, 0.0), moves=(1, 3))]) == 3
-    assert decide_matches(GATE, repeated, "league@2").unique_games == 1
+    assert decide_matches(SequentialTest(GATE, "league@2"), repeated).unique_games == 1
 
 
 @equal_players

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from evaluation.gating.gate import Decision, Outcome
 from evaluation.gating.gate_result import AnchorResult, combine_results
+from league.verdict_tests import AnchorTest
 
 OUTCOMES = (None, *get_args(Outcome))
 
@@ -14,7 +15,7 @@ def decision(outcome: Outcome | None) -> Decision:
 
 
 def anchor_results(*outcomes: Outcome | None) -> list[AnchorResult]:
-    return [AnchorResult(f"l@{i}", 50.0, f"s{i}", decision(outcome)) for i, outcome in enumerate(outcomes)]
+    return [AnchorResult(AnchorTest(f"l@{i}", 50.0, f"s{i}"), decision(outcome)) for i, outcome in enumerate(outcomes)]
 
 
 outcomes = st.sampled_from(OUTCOMES)
@@ -41,7 +42,7 @@ def test_anchors_are_not_tested_unless_the_champion_is_beaten(
 
 def test_the_first_failed_anchor_ends_the_test() -> None:
     result = combine_results(decision("promote"), anchor_results("promote", "reject", "promote"), 3, None)
-    assert [anchor.ref for anchor in result.anchors] == ["l@0", "l@1"]
+    assert [anchor.test.ref for anchor in result.anchors] == ["l@0", "l@1"]
     assert (result.outcome, result.note) == ("reject", "it beat the champion, but is weaker than l@1")
 
 

@@ -472,7 +472,7 @@ def test_purged_games_are_kept_but_ignored(judged: Registry) -> None:
     verdicts.void(judged, first.id, actor="me", reason="a broken machine", purge=True)
     row = judged.verdicts.get(first.id)
     assert row.outcome == "void"
-    own = [row.schedule, row.settings["confirmation"], *(anchor["schedule"] for anchor in row.settings["anchors"])]
+    own = [row.schedule, row.companions.confirmation, *(anchor.schedule for anchor in row.companions.anchors)]
     played = sum(len(Ledger(judged).positions(schedule)) for schedule in own)
     assert len(Ledger(judged).results(tictactoe.LEAGUE)) == number - played
     assert len(Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.evidence["blocks"]
@@ -492,7 +492,7 @@ def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registr
         assert high is not None
         assert low < gain.elo < high
         row = registry.verdicts.get(verdict.verdict)
-        fresh = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.settings["confirmation"])
+        fresh = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.companions.confirmation)
         counted = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.schedule)
         assert {match.seed for match in fresh}.isdisjoint(match.seed for match in counted)
     assert nightly(CONFIG, registry=registry).confirmations == ()

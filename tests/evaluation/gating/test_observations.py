@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
-from evaluation.gating.gate import decide_pairs
-from evaluation.gating.observations import matches_each, observe
+from evaluation.gating.gate import decide_matches
+from evaluation.gating.observations import SequentialTest, observe
 from league.config.gate import GateConfig
 from league.results.records import Game, Match
 
@@ -22,21 +24,22 @@ def round_of(own: tuple[float, ...], other: tuple[float, ...]) -> list[Match]:
 
 def test_a_round_is_one_observation_of_mean_scores() -> None:
     matches = [*round_of((1.0, 0.5), (0.0, 0.5)), *round_of((0.0, 0.0), (1.0, 0.5))]
-    seen = observe(GATE, matches, "a", "b", pairs=2)
+    test = SequentialTest(GATE, "a", "b", pairs=2)
+    seen = observe(test, matches)
     assert seen.scores == pytest.approx([0.5 + 0.25, 0.5 - 0.375])
     assert seen.gaps == pytest.approx([0.5, -0.75])
-    assert (seen.comparisons, matches_each("b", 2)) == (8, 4)
-    decision = decide_pairs(GATE.against_exploiter(0.1), matches, "a", "b", pairs=2)
+    assert (seen.comparisons, test.matches_each) == (8, 4)
+    decision = decide_matches(replace(test, settings=GATE.against_exploiter(0.1)), matches)
     assert (decision.blocks, decision.games, len(decision.counts)) == (2, 16, 17)
 
 
 def test_an_incomplete_round_is_ignored() -> None:
     matches = round_of((1.0, 0.5), (0.0, 0.5))
     for end in range(4):
-        assert observe(GATE, matches[:end], "a", "b", pairs=2).scores == []
+        assert observe(SequentialTest(GATE, "a", "b", pairs=2), matches[:end]).scores == []
 
 
 def test_differences_of_returns_are_means_of_a_round() -> None:
     returns = GateConfig(model="returns", return_bound=2, margin=0.5)
-    seen = observe(returns, round_of((1.0, 0.5), (0.0, 0.5)), "a", "b", pairs=2)
+    seen = observe(SequentialTest(returns, "a", "b", pairs=2), round_of((1.0, 0.5), (0.0, 0.5)))
     assert seen.gaps == pytest.approx([1.0])

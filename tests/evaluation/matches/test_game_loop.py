@@ -9,8 +9,8 @@ from evaluation.playback.replay import replay
 from evaluation.schedules.builders import round_robin
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, GameHung
+from league.random.seeds import generator
 from league.results.records import Match, Schedule
-from league.seeds import generator
 from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, WINNER, build_roster
 from tests.support.leagues import tictactoe
 

@@ -2,7 +2,7 @@ import numpy as np
 
 from evaluation.matches.game_state import AgentGenerators, AgentStates
 from league.environments.stepping import Batch
-from league.seeds import generator
+from league.random.seeds import generator
 
 
 def batch(envs: list[int], agents: list[int]) -> Batch:

@@ -3,7 +3,7 @@ import pytest
 
 from evaluation.matches.openings import OpeningMoves
 from league.environments.stepping import Batch
-from league.seeds import generator
+from league.random.seeds import generator
 from tests.support.environments.kinds import KINDS, Kind
 
 TEAM, CONTINUOUS = KINDS["team"], KINDS["continuous team"]

@@ -18,8 +18,8 @@ from league.environments.lockstep import stock_stepping
 from league.policies.draws import probabilities
 from league.policies.onnx import OnnxPolicy
 from league.policies.scripted import script
+from league.random.seeds import derive
 from league.results.records import Match, Schedule
-from league.seeds import derive
 from league.spaces import Discrete
 from tests.support.environments.kinds import KINDS
 from tests.support.policies.graphs import masked_mlp

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from league.environments.stepping import Batch, Ending, NextEpisodes, Turn
 from league.environments.vector.vector_env import AgentRows
 from league.interface import AgentInterface, Interface
-from league.seeds import generator
+from league.random.seeds import generator
 from league.spaces import Box, DictSpace, Discrete
 
 ACTIONS = 3

@@ -16,7 +16,7 @@ from league.config.ppo import PPOConfig
 from league.environments.building import interface as interface_of
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch
-from league.seeds import generator
+from league.random.seeds import generator
 from tests.support.environments.scripted_environment import AgentRecord, Scripted, interface
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward

@@ -14,8 +14,8 @@ from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
 from league.errors import ConfigError
 from league.policies.actions import to_environment
+from league.random.seeds import generator
 from league.results.records import Scoring
-from league.seeds import generator
 from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.sampling.episode_chunks import as_episodes

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.seeds import derive, derive_each, generator, generators
+from league.random.seeds import derive, derive_each, generator, generators
 
 seeds = st.integers(0, 2**63 - 1)
 paths = st.lists(st.integers(0, 2**31) | st.text(max_size=8), min_size=1, max_size=4)

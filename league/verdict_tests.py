@@ -1,0 +1,131 @@
+"""The tests of a verdict after that against the champion, as they are recorded in its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorTest:
+    """Whether the candidate is not inferior to an anchor.
+
+    ref: the anchor. margin: by how much the candidate may be weaker. schedule: id of the schedule of its matches.
+    """
+
+    ref: str
+    margin: float
+    schedule: str
+
+
+@dataclass(frozen=True, slots=True)
+class ExploiterTest:
+    """Whether the candidate does not do worse than the champion against an exploiter.
+
+    Attributes:
+        ref: The exploiter.
+        exploits: The champion that it was trained against.
+        margin: By how much the candidate may be worse than the champion.
+        schedule: Id of the schedule of its matches.
+    """
+
+    ref: str
+    exploits: str
+    margin: float
+    schedule: str
+
+
+@dataclass(frozen=True, slots=True)
+class ExploitabilityTest:
+    """Whether the candidate is not more exploitable than the champion, by exploiters trained against each.
+
+    Attributes:
+        of_candidate: Exploiters of the candidate.
+        of_champion: As many exploiters of the champion.
+        margin: By how much the candidate may be more exploitable.
+        blocks: Rounds to be played at least, from which exploitability is estimated.
+        schedule: Id of the schedule of its matches.
+        improvement: By how much the candidate must be less exploitable; 0 if it need not be.
+    """
+
+    of_candidate: tuple[str, ...]
+    of_champion: tuple[str, ...]
+    margin: float
+    blocks: int
+    schedule: str
+    improvement: float = 0.0
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> ExploitabilityTest:
+        """Read the test from its record in the settings of a verdict."""
+        exploiters = {name: tuple(record[name]) for name in ("of_candidate", "of_champion")}
+        return cls(**{**record, **exploiters})
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the record, in the types of JSON. The inverse of `of_record`."""
+        return asdict(self) | {"of_candidate": list(self.of_candidate), "of_champion": list(self.of_champion)}
+
+
+CompanionTest = AnchorTest | ExploiterTest | ExploitabilityTest
+
+
+@dataclass(frozen=True, slots=True)
+class CompanionTests:
+    """The tests that a candidate must pass besides that against the champion.
+
+    Attributes:
+        anchors: In the order in which they are played, before the exploiters.
+        exploiters: In the order in which they are played.
+        exploitability: The last test; None if the verdict has none, or while its exploiters are not trained.
+        includes_exploitability: Whether the verdict has a test of exploitability.
+        confirmation: Id of the schedule of the confirmation match, which has no influence on the decision.
+    """
+
+    anchors: tuple[AnchorTest, ...] = ()
+    exploiters: tuple[ExploiterTest, ...] = ()
+    exploitability: ExploitabilityTest | None = None
+    includes_exploitability: bool = False
+    confirmation: str | None = None
+
+    @classmethod
+    def of_settings(cls, settings: Mapping[str, Any]) -> CompanionTests:
+        """Read the tests from the settings of a verdict."""
+        trained = settings.get("exploitability")
+        return cls(
+            anchors=tuple(AnchorTest(**each) for each in settings.get("anchors", ())),
+            exploiters=tuple(ExploiterTest(**each) for each in settings.get("exploiters", ())),
+            exploitability=None if trained is None else ExploitabilityTest.of_record(trained),
+            includes_exploitability="exploitability" in settings,
+            confirmation=settings.get("confirmation"),
+        )
+
+    def to_settings(self) -> dict[str, Any]:
+        """Return the settings in which the tests are recorded. The inverse of `of_settings`."""
+        settings: dict[str, Any] = {
+            "anchors": [asdict(each) for each in self.anchors],
+            "exploiters": [asdict(each) for each in self.exploiters],
+        }
+        if self.includes_exploitability:
+            settings["exploitability"] = None if self.exploitability is None else self.exploitability.to_record()
+        if self.confirmation is not None:
+            settings["confirmation"] = self.confirmation
+        return settings
+
+    @property
+    def ready(self) -> tuple[CompanionTest, ...]:
+        """The tests that have a schedule, in the order in which they are played."""
+        last = () if self.exploitability is None else (self.exploitability,)
+        return (*self.anchors, *self.exploiters, *last)
+
+    @property
+    def number(self) -> int:
+        """Number of tests, including one whose exploiters are not trained yet."""
+        return len(self.anchors) + len(self.exploiters) + self.includes_exploitability
+
+    @property
+    def opponents(self) -> set[str]:
+        """References of all anchors and exploiters."""
+        last = self.exploitability
+        trained = () if last is None else (*last.of_candidate, *last.of_champion)
+        return {*(each.ref for each in self.anchors), *(each.ref for each in self.exploiters), *trained}
