@@ -14,6 +14,7 @@ from hypothesis import settings
 from league.registry.storage import database
 from league.settings import Storage
 from tests.support.databases import StorageAt
+from tests.support.durability import without_syncing
 from tests.support.schema import migrated_once
 from tests.support.servers import postgresql
 
@@ -58,6 +59,13 @@ def schema() -> Iterator[None]:
     """Run migrations, the slowest part of many tests, once in a process."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(database, "_apply", migrated_once(database._apply))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def unsynced() -> Iterator[None]:
+    """Do not wait for the disk at each of thousands of transactions."""
+    with without_syncing():
         yield
 
 

@@ -33,10 +33,10 @@ def test_the_vectorised_game_equals_the_stock_game(plan: Plan) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_million_steps_of_the_vectorised_game_equal_those_of_the_stock_game() -> None:
-    found = compare(CONFIG, KuhnPokerVector(256), 1_000_000, seed=1)
+def test_many_steps_of_the_vectorised_game_equal_those_of_the_stock_game() -> None:
+    found = compare(CONFIG, KuhnPokerVector(256), 200_000, seed=1)
     assert found.difference is None
-    assert found.episodes > 300_000
+    assert found.episodes > 60_000
 
 
 def cards(seed: int) -> tuple[int, int]:
