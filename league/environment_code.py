@@ -21,6 +21,8 @@ WITHOUT_INFLUENCE = frozenset(
 )
 """Packages that show games or annotate code and do not decide results."""
 _LIBRARIES = tuple(Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib"))
+_LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
+"""Names of further folders of libraries: those of the system, of the user, and of other virtual environments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,7 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
         spec = _spec(name, folder if top == package else None)
         if spec is None or not spec.origin or not Path(spec.origin).is_file():
             continue
-        is_library = any(Path(spec.origin).is_relative_to(folder) for folder in _LIBRARIES)
+        is_library = _is_library(Path(spec.origin))
         if is_library:
             libraries.add(top)
         if (is_library and top != package) or not spec.origin.endswith(".py"):
@@ -74,6 +76,10 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
     for name in sorted(texts):
         source.update(f"{name}\0{texts[name]}\0".encode())
     return EnvironmentCode(source.hexdigest(), dict(sorted(_versions(libraries))))
+
+
+def _is_library(file: Path) -> bool:
+    return any(map(file.is_relative_to, _LIBRARIES)) or not _LIBRARY_FOLDERS.isdisjoint(file.parts)
 
 
 def _spec(name: str, folder: str | None) -> ModuleSpec | None:

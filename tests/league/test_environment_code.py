@@ -50,6 +50,24 @@ def test_a_library_is_identified_by_its_version_and_those_of_its_imports() -> No
     assert code.source == read("mpe2.simple_spread_v3").source
 
 
+@pytest.mark.parametrize("folder", ["site-packages", "dist-packages"])
+def test_libraries_of_the_system_and_of_other_environments_are_libraries(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    """A virtual environment can have several folders of libraries (`--system-site-packages`)."""
+    others = tmp_path / "usr" / "lib" / folder
+    metadata = others / "wood-1.2.dist-info" / "METADATA"
+    metadata.parent.mkdir(parents=True)
+    metadata.write_text("Metadata-Version: 2.1\nName: wood\nVersion: 1.2\n")
+    (others / "wood.py").write_text("import scipy\n")
+    monkeypatch.syspath_prepend(str(others))
+    (package / "rules.py").write_text("import wood\n")
+    code = read()
+    assert code.libraries == {"numpy": version("numpy"), "wood": "1.2"}
+    (others / "wood.py").write_text("WIN = 1\n")
+    assert read() == code
+
+
 def test_a_module_that_does_not_exist_has_no_code() -> None:
     assert read("no_such_package.game:env").libraries == {}
 
