@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import pytest
@@ -317,10 +317,18 @@ SLOW = tictactoe(steps=1536, **SETTINGS | {"epochs": 16, "minibatch_size": 32})
 """Long enough to be killed between two checkpoints."""
 
 
+@pytest.fixture(scope="module")
+def uninterrupted(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> list[VersionRow]:
+    """The versions of a run that was not killed."""
+    with closing(Registry.open(Storage.at(tmp_path_factory.mktemp("whole")))) as registry:
+        return train(SLOW, registry=registry)
+
+
 @pytest.mark.slow
-@pytest.mark.usefixtures("ray_session")
 @pytest.mark.parametrize("home_is_lost", [False, True], ids=["same machine", "other machine"])
-def test_a_killed_run_publishes_the_same_versions_after_resuming(tmp_path: Path, home_is_lost: bool) -> None:
+def test_a_killed_run_publishes_the_same_versions_after_resuming(
+    tmp_path: Path, uninterrupted: list[VersionRow], home_is_lost: bool
+) -> None:
     """The driver is killed with SIGKILL during the run. It is resumed on a machine that has its directory, or has only
     the registry and the versions."""
     home = tmp_path / "killed"
@@ -337,10 +345,9 @@ def test_a_killed_run_publishes_the_same_versions_after_resuming(tmp_path: Path,
         shutil.rmtree(home / "runs")
     resumed = train(SLOW, registry=killed, resume=True)
 
-    whole = train(SLOW, registry=Registry.open(Storage.at(tmp_path / "whole")))
-    assert [version.steps for version in whole] == [512, 1024, 1536]
-    assert [graphs(version) for version in resumed] == [graphs(version) for version in whole]
-    assert len({json.dumps(graphs(version)) for version in whole}) == 3, "the weights must change"
+    assert [version.steps for version in uninterrupted] == [512, 1024, 1536]
+    assert [graphs(version) for version in resumed] == [graphs(version) for version in uninterrupted]
+    assert len({json.dumps(graphs(version)) for version in uninterrupted}) == 3, "the weights must change"
     assert [version.sha256 for version in resumed[: len(before)]] == [version.sha256 for version in before]
     assert [version.parent for version in resumed] == [None, *(version.number for version in resumed[:-1])]
     (record,) = killed.runs.newest("tictactoe")
