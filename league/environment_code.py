@@ -7,8 +7,7 @@ run time are not found: `environment.revision` covers them.
 import ast
 import hashlib
 import sys
-import sysconfig
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -20,14 +19,13 @@ WITHOUT_INFLUENCE = frozenset(
     {"PIL", "cv2", "farama_notifications", "imageio", "matplotlib", "pygame", "pyglet", "typing_extensions"}
 )
 """Packages that show games or annotate code and do not decide results."""
-_LIBRARIES = tuple(Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib"))
-_LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
-"""Names of further folders of libraries: those of the system, of the user, and of other virtual environments."""
+_LIBRARY_FOLDERS = frozenset({"site-packages", "dist-packages"})
+"""Names of the folders of libraries: of this virtual environment, of others, of the user and of the system."""
 
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentCode:
-    """source: SHA-256 of the source files that are not installed libraries. libraries: distribution → version."""
+    """source: SHA-256 of the source files that are not libraries. libraries: distribution → version."""
 
     source: str
     libraries: dict[str, str]
@@ -46,12 +44,14 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
     folder: where its package is searched first.
 
     It is read once per process, which also imports the environment once. Source files are the entry point's module and
-    every module outside of the installed libraries that it imports, directly or through others. An entry point that
-    does not exist has no code.
+    every module that it imports, directly or through others, and that does not belong to a library. Libraries are
+    identified by the versions of their distributions: code without one is a source file, wherever it is. An entry point
+    that does not exist has no code.
     """
     start = entry_point.partition(":")[0]
     package = start.partition(".")[0]
-    source, libraries = hashlib.sha256(), set[str]()
+    source, libraries = hashlib.sha256(), dict[str, str]()
+    is_in_folder = folder is not None and module_in(folder, package) is not None
     seen, waiting = set[str](), [start]
     texts: dict[str, str] = {}
     while waiting:
@@ -63,9 +63,9 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
         spec = _spec(name, folder if top == package else None)
         if spec is None or not spec.origin or not Path(spec.origin).is_file():
             continue
-        is_library = _is_library(Path(spec.origin))
-        if is_library:
-            libraries.add(top)
+        versions = {} if top == package and is_in_folder else _versions(top, Path(spec.origin))
+        is_library = bool(versions)
+        libraries |= versions
         if (is_library and top != package) or not spec.origin.endswith(".py"):
             continue
         text = Path(spec.origin).read_text(encoding="utf-8")
@@ -75,11 +75,12 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
         waiting += _imports(text, name, is_package=spec.submodule_search_locations is not None)
     for name in sorted(texts):
         source.update(f"{name}\0{texts[name]}\0".encode())
-    return EnvironmentCode(source.hexdigest(), dict(sorted(_versions(libraries))))
+    return EnvironmentCode(source.hexdigest(), dict(sorted(libraries.items())))
 
 
-def _is_library(file: Path) -> bool:
-    return any(map(file.is_relative_to, _LIBRARIES)) or not _LIBRARY_FOLDERS.isdisjoint(file.parts)
+def _versions(package: str, file: Path) -> dict[str, str]:
+    """Return distribution → version if a top-level package, one of whose files is given, belongs to a library."""
+    return {} if _LIBRARY_FOLDERS.isdisjoint(file.parts) else _distributions(package)
 
 
 def _spec(name: str, folder: str | None) -> ModuleSpec | None:
@@ -114,14 +115,15 @@ def _imports(text: str, module: str, *, is_package: bool) -> Iterator[str]:
             yield from (f"{origin}.{alias.name}" for alias in node.names if alias.name != "*")
 
 
-def _versions(packages: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield distribution and version of each installed package."""
-    unknown = set[str]()
-    for package in packages:
-        try:
-            yield package, metadata.version(package)
-        except metadata.PackageNotFoundError:
-            unknown.add(package)
-    if unknown:
-        names = metadata.packages_distributions()
-        yield from ((name, metadata.version(name)) for package in unknown for name in names.get(package, ()))
+@cache
+def _distributions(package: str) -> dict[str, str]:
+    """Return distribution → version of the distributions that contain a top-level package."""
+    try:
+        return {package: metadata.version(package)}
+    except metadata.PackageNotFoundError:
+        return {name: metadata.version(name) for name in _distribution_names().get(package, ())}
+
+
+@cache
+def _distribution_names() -> Mapping[str, list[str]]:
+    return metadata.packages_distributions()

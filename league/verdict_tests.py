@@ -59,8 +59,14 @@ class ExploitabilityTest:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> ExploitabilityTest:
         """Read the test from its record in the settings of a verdict."""
-        exploiters = {name: tuple(record[name]) for name in ("of_candidate", "of_champion")}
-        return cls(**{**record, **exploiters})
+        return cls(
+            of_candidate=tuple(record["of_candidate"]),
+            of_champion=tuple(record["of_champion"]),
+            margin=record["margin"],
+            blocks=record["blocks"],
+            schedule=record["schedule"],
+            improvement=record.get("improvement", 0.0),
+        )
 
     def to_record(self) -> dict[str, Any]:
         """Return the record, in the types of JSON. The inverse of `of_record`."""
@@ -78,25 +84,28 @@ class CompanionTests:
         anchors: In the order in which they are played, before the exploiters.
         exploiters: In the order in which they are played.
         exploitability: The last test; None if the verdict has none, or while its exploiters are not trained.
-        includes_exploitability: Whether the verdict has a test of exploitability.
+        awaits_exploiters: Whether the verdict has a test of exploitability whose exploiters are not trained.
         confirmation: Id of the schedule of the confirmation match, which has no influence on the decision.
     """
 
     anchors: tuple[AnchorTest, ...] = ()
     exploiters: tuple[ExploiterTest, ...] = ()
     exploitability: ExploitabilityTest | None = None
-    includes_exploitability: bool = False
+    awaits_exploiters: bool = False
     confirmation: str | None = None
 
     @classmethod
     def of_settings(cls, settings: Mapping[str, Any]) -> CompanionTests:
-        """Read the tests from the settings of a verdict."""
+        """Read the tests from the settings of a verdict. Unknown settings, of other releases, are ignored."""
+        anchors, exploiters = settings.get("anchors", ()), settings.get("exploiters", ())
         trained = settings.get("exploitability")
         return cls(
-            anchors=tuple(AnchorTest(**each) for each in settings.get("anchors", ())),
-            exploiters=tuple(ExploiterTest(**each) for each in settings.get("exploiters", ())),
+            anchors=tuple(AnchorTest(each["ref"], each["margin"], each["schedule"]) for each in anchors),
+            exploiters=tuple(
+                ExploiterTest(each["ref"], each["exploits"], each["margin"], each["schedule"]) for each in exploiters
+            ),
             exploitability=None if trained is None else ExploitabilityTest.of_record(trained),
-            includes_exploitability="exploitability" in settings,
+            awaits_exploiters="exploitability" in settings and trained is None,
             confirmation=settings.get("confirmation"),
         )
 
@@ -106,11 +115,18 @@ class CompanionTests:
             "anchors": [asdict(each) for each in self.anchors],
             "exploiters": [asdict(each) for each in self.exploiters],
         }
-        if self.includes_exploitability:
-            settings["exploitability"] = None if self.exploitability is None else self.exploitability.to_record()
+        if self.exploitability is not None:
+            settings["exploitability"] = self.exploitability.to_record()
+        elif self.awaits_exploiters:
+            settings["exploitability"] = None
         if self.confirmation is not None:
             settings["confirmation"] = self.confirmation
         return settings
+
+    @property
+    def includes_exploitability(self) -> bool:
+        """Whether the verdict has a test of exploitability."""
+        return self.awaits_exploiters or self.exploitability is not None
 
     @property
     def ready(self) -> tuple[CompanionTest, ...]:
@@ -121,7 +137,7 @@ class CompanionTests:
     @property
     def number(self) -> int:
         """Number of tests, including one whose exploiters are not trained yet."""
-        return len(self.anchors) + len(self.exploiters) + self.includes_exploitability
+        return len(self.ready) + self.awaits_exploiters
 
     @property
     def opponents(self) -> set[str]:

@@ -82,7 +82,7 @@ def unsynced() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def ray_session() -> Iterator[None]:
-    """One Ray with two CPUs for all tests that need it."""
+    """One Ray with two CPUs for all tests of this process that need it."""
     import ray
 
     ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")

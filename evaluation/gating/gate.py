@@ -40,7 +40,8 @@ class Decision:
         counts: Blocks per cell, worst for the candidate first.
         curve: LLR after each block. For a betting test, the log wealth of the bettor against H0 (positive) or against
             H1 (negative), whichever is larger.
-        estimate: Logistic Elo of the candidate above its opponent; None without blocks.
+        estimate: Logistic Elo of the candidate above its opponent; None without blocks, and for a comparison of
+            candidate and champion against exploiters.
     """
 
     outcome: Outcome | None

@@ -128,7 +128,7 @@ def companion_result(
         case AnchorTest():
             return AnchorResult(test, decision)
         case ExploiterTest():
-            return _exploiter_result(test, decision, sequential, matches[: 2 * decision.blocks])
+            return _exploiter_result(test, decision, sequential, matches[: decision.blocks * sequential.matches_each])
         case ExploitabilityTest():
             size = sequential.at_least * sequential.matches_each
             return _exploitability_result(test, decision, sequential, matches[:size] if len(matches) >= size else ())

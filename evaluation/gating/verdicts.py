@@ -72,10 +72,6 @@ def promote(registry: Registry, verdict: VerdictRow, reason: str) -> str | None:
     return None
 
 
-def _is_version(opponent: str) -> bool:
-    return isinstance(parse_ref(opponent), CheckpointRef)
-
-
 def is_effective(verdict: VerdictRow) -> bool:
     """Whether a verdict is or will be final: neither void nor refused its promotion."""
     if verdict.outcome == "promote":
@@ -111,6 +107,10 @@ def open_verdict(
     return registry.verdicts.open(league.slug, candidate, opponent, schedule.id, settings)
 
 
+def _is_version(opponent: str) -> bool:
+    return isinstance(parse_ref(opponent), CheckpointRef)
+
+
 def _opened_tests(
     registry: Registry, league: LeagueRow, candidate: int, schedule: Schedule, gate: GateConfig
 ) -> CompanionTests:
@@ -132,7 +132,7 @@ def _opened_tests(
     return CompanionTests(
         anchors=tuple(anchors),
         exploiters=tuple(exploiters),
-        includes_exploitability=bool(gate.exploiters.count) and _is_version(opponent) and len(interface.sides) > 1,
+        awaits_exploiters=bool(gate.exploiters.count) and _is_version(opponent) and len(interface.sides) > 1,
         confirmation=confirmation,
     )
 
@@ -297,13 +297,14 @@ def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     anchors = f", and is not inferior to {', '.join(each.test.ref for each in seen.anchors)}" if seen.anchors else ""
     exploiters = ", ".join(each.test.ref for each in seen.exploiters)
     unexploited = f", and does no worse than it against {exploiters}" if exploiters else ""
-    test = seen.exploitability
-    exploitability = (
-        f", and is {'less' if test.test.improvement else 'not more'} exploitable by its own exploiters" if test else ""
-    )
-    result = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
+    exploitability = ""
+    if (result := seen.exploitability) is not None:
+        exploitability = (
+            f", and is {'less' if result.test.improvement else 'not more'} exploitable by its own exploiters"
+        )
+    shown = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
     return (
-        f"{result} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
+        f"{shown} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
         f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{unexploited}{exploitability}"
     )
 

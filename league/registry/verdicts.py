@@ -45,13 +45,13 @@ class VerdictRepository(Repository):
 
     @repeat_after_deadlock
     def settle(self, verdict: str, test: ExploitabilityTest) -> VerdictRow:
-        """Record the test of exploitability of a verdict that was opened without its exploiters. Returns the verdict.
+        """Record the test of exploitability of a verdict that awaits its exploiters, and return the verdict.
 
-        A test that is recorded, and a closed verdict, stay as they are. Raises UnknownVerdict.
+        Other verdicts stay as they are. Raises UnknownVerdict.
         """
         with self._database.write() as session:
             row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
-            if row.outcome is None and CompanionTests.of_settings(row.settings).exploitability is None:
+            if row.outcome is None and CompanionTests.of_settings(row.settings).awaits_exploiters:
                 row.settings = row.settings | {"exploitability": test.to_record()}
             return _row(row)
 

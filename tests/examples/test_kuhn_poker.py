@@ -32,7 +32,6 @@ def test_the_vectorised_game_equals_the_stock_game(plan: Plan) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_many_steps_of_the_vectorised_game_equal_those_of_the_stock_game() -> None:
     found = compare(CONFIG, KuhnPokerVector(256), 200_000, seed=1)
     assert found.difference is None

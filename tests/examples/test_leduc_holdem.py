@@ -23,7 +23,6 @@ def test_the_vectorised_game_equals_the_stock_game(plan: Plan) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_many_steps_of_the_vectorised_game_equal_those_of_the_stock_game() -> None:
     assert compare(CONFIG, LeducWithHistoryVector(256), 200_000, seed=1).difference is None
 

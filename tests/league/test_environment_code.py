@@ -68,6 +68,35 @@ def test_libraries_of_the_system_and_of_other_environments_are_libraries(
     assert read() == code
 
 
+@pytest.mark.parametrize("is_in_folder", [True, False], ids=["folder", "path"])
+def test_code_without_a_distribution_is_source_wherever_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_in_folder: bool
+) -> None:
+    """Such as a project below `site-packages`, or packages that were copied there by hand."""
+    folder = tmp_path / "install" / "site-packages"
+    folder.mkdir(parents=True)
+    (folder / "tiles.py").write_text("import numpy\nWIN = 1\n")
+    if not is_in_folder:
+        monkeypatch.syspath_prepend(str(folder))
+
+    def read() -> EnvironmentCode:
+        environment_code.cache_clear()
+        return environment_code("tiles:env", str(folder) if is_in_folder else None)
+
+    before = read()
+    (folder / "tiles.py").write_text("import numpy\nWIN = 2\n")
+    assert read().source != before.source
+    assert read().libraries == before.libraries == {"numpy": version("numpy")}
+
+
+def test_the_users_module_is_source_although_a_distribution_has_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    (folder / "yaml.py").write_text("WIN = 1\n")
+    environment_code.cache_clear()
+    assert environment_code("yaml:env", str(folder)).libraries == {}
+
+
 def test_a_module_that_does_not_exist_has_no_code() -> None:
     assert read("no_such_package.game:env").libraries == {}
 

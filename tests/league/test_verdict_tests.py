@@ -21,9 +21,9 @@ companion_tests = st.builds(
     anchors=st.lists(st.builds(AnchorTest, refs, margins, st.text(min_size=1))).map(tuple),
     exploiters=st.lists(st.builds(ExploiterTest, refs, refs, margins, st.text(min_size=1))).map(tuple),
     exploitability=st.none() | exploitability,
-    includes_exploitability=st.booleans(),
+    awaits_exploiters=st.booleans(),
     confirmation=st.none() | st.text(min_size=1),
-).filter(lambda tests: tests.includes_exploitability or tests.exploitability is None)
+).filter(lambda tests: tests.exploitability is None or not tests.awaits_exploiters)
 
 
 @given(companion_tests)
@@ -38,11 +38,17 @@ def test_verdicts_of_earlier_releases_have_fewer_tests(settings: dict[str, objec
     assert CompanionTests.of_settings(settings) == CompanionTests()
 
 
+def test_settings_of_a_later_release_are_ignored() -> None:
+    """Versions are still removed, and snapshots made, by programs that were not updated yet."""
+    anchor = {"ref": "l@1", "margin": 50.0, "schedule": "a", "new": 1}
+    assert CompanionTests.of_settings({"anchors": [anchor]}).anchors == (AnchorTest("l@1", 50.0, "a"),)
+
+
 def test_a_test_of_exploitability_of_an_earlier_release_has_no_improvement() -> None:
     record = {"of_candidate": ["l@3"], "of_champion": ["l@4"], "margin": 0.2, "blocks": 10, "schedule": "s"}
     assert ExploitabilityTest.of_record(record).improvement == 0
 
 
 def test_a_test_whose_exploiters_are_not_trained_counts_but_is_not_ready() -> None:
-    tests = CompanionTests(anchors=(AnchorTest("l@1", 50.0, "a"),), includes_exploitability=True)
+    tests = CompanionTests(anchors=(AnchorTest("l@1", 50.0, "a"),), awaits_exploiters=True)
     assert (tests.ready, tests.number) == (tests.anchors, 2)

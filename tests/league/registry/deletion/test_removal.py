@@ -99,7 +99,7 @@ def test_exploiters_that_were_trained_for_a_verdict_are_in_use(used: Registry) -
     publish(used, "run/4")
     verdict = f"{LEAGUE}-verdict-1f3a62d1c8b45e97-1b2c3d4e"
     test = ExploitabilityTest((f"{LEAGUE}@4",), (), margin=0.1, blocks=20, schedule=f"{LEAGUE}-exploitability-1")
-    tests = replace(TESTS, exploitability=test, includes_exploitability=True)
+    tests = replace(TESTS, exploitability=test)
     used.verdicts.open(LEAGUE, 3, f"{LEAGUE}@2", verdict, SETTINGS | tests.to_settings())
     used.verdicts.close(verdict, "reject", {})
     with pytest.raises(Conflict, match=r"1 verdict \(1f3a62d1\)"):
