@@ -1,20 +1,20 @@
 """Imports functions and classes of users' code by their entry points, `my_package.module:name`.
 
 The first part of the name is searched in the league's folder, which is by default that of its file, before it is
-searched as Python does. What the user's code imports is found in installed packages first, and then in that folder, so
-that a file in it cannot replace a library.
+searched as Python does. What the user's code imports is found in installed packages first, then in that folder, and
+then in the working directory, so that a file in them cannot replace a library.
 """
 
 import difflib
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.util import module_from_spec
 from types import ModuleType
 from typing import Any
 
-from league.environment_code import module_in
+from league.environment_code import environment_code, module_in
 from league.errors import ConfigError, raised_at
 
 _folders: list[str] = []
@@ -22,9 +22,11 @@ _folders: list[str] = []
 
 def search_in(folder: str) -> None:
     """Search entry points in a league's folder, for as long as this process lives."""
-    for folders in (_folders, sys.path):
-        if folder not in folders:
-            folders.append(folder)
+    if folder not in _folders:
+        _folders.append(folder)
+    if folder not in sys.path:
+        # The command appends its working directory, which may contain modules of another league.
+        sys.path.insert(len(sys.path) - (sys.path[-1:] == [os.getcwd()]), folder)
 
 
 def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
@@ -40,8 +42,11 @@ def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
     """
     folders = _folders if folder is None else [folder]
     try:
+        _check_files(key, name, folder)
         _import_own(key, name.partition(".")[0], folders)
-        return importlib.import_module(name)
+        module = importlib.import_module(name)
+        _check_files(key, name, folder)
+        return module
     except ConfigError:
         raise
     except ImportError as error:
@@ -77,6 +82,26 @@ def missing(module: ModuleType, name: str) -> str:
     return f"{module.__name__!r} ({getattr(module, '__file__', 'built in')}) has no {name!r}{guess}"
 
 
+def _check_files(key: str, name: str, folder: str | None) -> None:
+    """Raise ConfigError if this process has imported another file than that of the league, for it or what it imports.
+
+    Modules of several leagues have the same name, for example. A process can import only one of them.
+    """
+    if folder is None or module_in(folder, name.partition(".")[0]) is None:
+        return
+    for module, file in environment_code(name, folder).files.items():
+        loaded = getattr(sys.modules.get(module), "__file__", None)
+        if loaded is not None and os.path.realpath(loaded) != os.path.realpath(file):
+            raise ConfigError(_several(key, module, (file, loaded)))
+
+
+def _several(key: str, module: str, files: Iterable[str]) -> str:
+    return (
+        f"{key}: {module!r} is the name of several modules, {' and '.join(files)}: rename all but one, or name a single"
+        " league in the command"
+    )
+
+
 def _import_own(key: str, package: str, folders: Sequence[str]) -> None:
     """Import a top-level module or package if one of the folders contains it."""
     found = {os.path.realpath(str(spec.origin)): spec for folder in folders if (spec := module_in(folder, package))}
@@ -84,10 +109,7 @@ def _import_own(key: str, package: str, folders: Sequence[str]) -> None:
     loaded = getattr(present, "__file__", None)
     files = dict.fromkeys([*found, *([os.path.realpath(loaded)] if loaded and found else [])])
     if len(files) > 1:
-        raise ConfigError(
-            f"{key}: {package!r} is the name of several modules, {' and '.join(files)}: rename all but one, or name"
-            " a single league in the command"
-        )
+        raise ConfigError(_several(key, package, files))
     if not found or present is not None:
         return
     (spec,) = found.values()

@@ -7,8 +7,9 @@ run time are not found: `environment.revision` covers them.
 import ast
 import hashlib
 import sys
+import tokenize
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from importlib.machinery import SOURCE_SUFFIXES, FileFinder, ModuleSpec, SourceFileLoader
@@ -25,10 +26,17 @@ _LIBRARY_FOLDERS = frozenset({"site-packages", "dist-packages"})
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentCode:
-    """source: SHA-256 of the source files that are not libraries. libraries: distribution → version."""
+    """The code of an environment.
+
+    Attributes:
+        source: SHA-256 of the source files that are not libraries.
+        libraries: Distribution → version.
+        files: Module → its source file, of those in `source`. No part of the identity.
+    """
 
     source: str
     libraries: dict[str, str]
+    files: dict[str, str] = field(default_factory=dict, compare=False)
 
 
 def module_in(folder: str, name: str) -> ModuleSpec | None:
@@ -41,7 +49,7 @@ def module_in(folder: str, name: str) -> ModuleSpec | None:
 def environment_code(entry_point: str, folder: str | None = None) -> EnvironmentCode:
     """Return the code behind an entry point, `package.module` or `package.module:function`.
 
-    folder: where its package is searched first.
+    folder: where its package is searched first, and what it imports after the installed libraries.
 
     It is read once per process, which also imports the environment once. Source files are the entry point's module and
     every module that it imports, directly or through others, and that does not belong to a library. Libraries are
@@ -50,32 +58,41 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
     """
     start = entry_point.partition(":")[0]
     package = start.partition(".")[0]
-    source, libraries = hashlib.sha256(), dict[str, str]()
     is_in_folder = folder is not None and module_in(folder, package) is not None
+    libraries, files, texts = dict[str, str](), dict[str, str](), dict[str, str]()
     seen, waiting = set[str](), [start]
-    texts: dict[str, str] = {}
     while waiting:
         name = waiting.pop()
         top = name.partition(".")[0]
-        if name in seen or top in sys.stdlib_module_names or top in WITHOUT_INFLUENCE:
+        is_own = top == package and is_in_folder
+        if name in seen or top in WITHOUT_INFLUENCE or (top in sys.stdlib_module_names and not is_own):
             continue
         seen.add(name)
-        spec = _spec(name, folder if top == package else None)
+        spec = _spec(name, folder, is_own=is_own)
         if spec is None or not spec.origin or not Path(spec.origin).is_file():
             continue
-        versions = {} if top == package and is_in_folder else _versions(top, Path(spec.origin))
-        is_library = bool(versions)
+        versions = {} if is_own else _versions(top, Path(spec.origin))
         libraries |= versions
-        if (is_library and top != package) or not spec.origin.endswith(".py"):
+        if (versions and top != package) or not spec.origin.endswith(".py"):
             continue
-        text = Path(spec.origin).read_text(encoding="utf-8")
-        if not is_library:
-            texts[name] = text
+        text = _text(Path(spec.origin))
+        if not versions:
+            files[name], texts[name] = spec.origin, text
         waiting += [name.rpartition(".")[0]] if "." in name else []
         waiting += _imports(text, name, is_package=spec.submodule_search_locations is not None)
+    source = hashlib.sha256()
     for name in sorted(texts):
         source.update(f"{name}\0{texts[name]}\0".encode())
-    return EnvironmentCode(source.hexdigest(), dict(sorted(libraries.items())))
+    return EnvironmentCode(source.hexdigest(), dict(sorted(libraries.items())), files)
+
+
+def _text(file: Path) -> str:
+    """Read a source file as Python does: in its declared encoding, without a byte order mark."""
+    try:
+        with tokenize.open(file) as text:
+            return text.read()
+    except (SyntaxError, UnicodeDecodeError):  # The module cannot be imported either.
+        return file.read_text(encoding="latin-1")
 
 
 def _versions(package: str, file: Path) -> dict[str, str]:
@@ -83,20 +100,23 @@ def _versions(package: str, file: Path) -> dict[str, str]:
     return {} if _LIBRARY_FOLDERS.isdisjoint(file.parts) else _distributions(package)
 
 
-def _spec(name: str, folder: str | None) -> ModuleSpec | None:
-    """Find a module without importing its parents."""
+def _spec(name: str, folder: str | None, *, is_own: bool) -> ModuleSpec | None:
+    """Find a module without importing its parents. is_own: search the folder before the libraries."""
     parent, _, _ = name.rpartition(".")
     if not parent:
-        if folder is not None and (own := module_in(folder, name)) is not None:
-            return own
+        in_folder = None if folder is None else module_in(folder, name)
+        if in_folder is not None and is_own:
+            return in_folder
         try:
-            return find_spec(name)
+            found = find_spec(name)
         except ValueError:  # A module without a specification, such as __main__.
-            return None
-    above = _spec(parent, folder)
+            found = None
+        is_library = found is not None and found.origin is not None and bool(_versions(name, Path(found.origin)))
+        return found if in_folder is None or is_library else in_folder
+    above = _spec(parent, folder, is_own=is_own)
     folders = above.submodule_search_locations if above else None
-    found = (FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name) for folder in folders or ())
-    return next(filter(None, found), None)
+    specs = (FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name) for folder in folders or ())
+    return next(filter(None, specs), None)
 
 
 def _imports(text: str, module: str, *, is_package: bool) -> Iterator[str]:
@@ -110,7 +130,12 @@ def _imports(text: str, module: str, *, is_package: bool) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            origin = resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module or ""
+            try:
+                origin = (
+                    resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module or ""
+                )
+            except ImportError:  # Beyond the top-level package. Code may try this, and catch the exception.
+                continue
             yield origin
             yield from (f"{origin}.{alias.name}" for alias in node.names if alias.name != "*")
 

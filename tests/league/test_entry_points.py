@@ -68,6 +68,31 @@ def test_modules_of_the_folder_import_each_other(tmp_path: Path) -> None:
     build(LeagueConfig.load(write(tmp_path, text="from own_rules import make_env")).environment).close()
 
 
+def test_the_folder_is_searched_before_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which the command appends to the path."""
+    for name in ("here", "there"):
+        write(tmp_path / name, text="from own_rules import *\n")
+        (tmp_path / name / "own_rules.py").write_text(f"WHERE = {name!r}\n")
+    monkeypatch.chdir(tmp_path / "here")
+    sys.path.append(str(tmp_path / "here"))
+    config = LeagueConfig.load(tmp_path / "there" / "league.yaml")
+    assert import_entry_point("key", "own_game:WHERE", config.folder) == "there"
+
+
+@pytest.mark.parametrize("is_on_path", [True, False], ids=["on the path", "of another league"])
+def test_modules_of_two_leagues_are_not_confused(tmp_path: Path, is_on_path: bool) -> None:
+    for name in ("one", "two"):
+        write(tmp_path / name, f"own_{name}", "from own_rules import *\n")
+        (tmp_path / name / "own_rules.py").write_text(f"WHERE = {name!r}\n")
+    if is_on_path:
+        sys.path.insert(0, str(tmp_path / "one"))
+    else:
+        assert import_entry_point("key", "own_one:WHERE", LeagueConfig.load(tmp_path / "one" / "league.yaml").folder)
+    config = LeagueConfig.load(tmp_path / "two" / "league.yaml")
+    with pytest.raises(ConfigError, match=r"'own_rules' is the name of several modules, .*two.* and .*one.*: rename"):
+        import_module("key", "own_two", config.folder)
+
+
 def test_a_folder_is_relative_to_the_file(tmp_path: Path) -> None:
     write(tmp_path / "source")
     path = tmp_path / "league.yaml"

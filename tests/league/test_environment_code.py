@@ -106,3 +106,42 @@ def test_a_module_that_is_not_python_is_compared_as_text(package: Path) -> None:
     before = read()
     (package / "rules.py").write_text("def (:  \n")
     assert read().source != before.source
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "latin-1"])
+def test_sources_are_read_in_their_encoding(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "tiles.py").write_text(f"# coding: {encoding}\n# für\nimport numpy\nimport grout\n", encoding=encoding)
+    before = read_in(tmp_path, "tiles:env", grout="WIN = 1\n")
+    after = read_in(tmp_path, "tiles:env", grout="WIN = 2\n")
+    assert before.source != after.source
+    assert before.libraries == after.libraries == {"numpy": version("numpy")}
+
+
+def test_a_module_may_try_an_import_beyond_its_package(tmp_path: Path) -> None:
+    (tmp_path / "tiles.py").write_text(
+        "try:\n    from .grout import WIN\nexcept ImportError:\n    from grout import WIN\n"
+    )
+    assert set(read_in(tmp_path, "tiles:env", grout="WIN = 1\n").files) == {"tiles", "grout"}
+
+
+def test_the_users_module_may_have_a_name_of_the_standard_library(tmp_path: Path) -> None:
+    assert set(read_in(tmp_path, "turtle:env", turtle="import numpy\n").files) == {"turtle"}
+
+
+def test_modules_of_a_league_come_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not from another folder on the path, and not from a module of the same name that is loaded."""
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "grout.py").write_text(f"NAME = '{name}'\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "one"))
+    code = read_in(tmp_path / "two", "tiles:env", tiles="import grout\nimport yaml\n", yaml="")
+    assert code.files["grout"] == str(tmp_path / "two" / "grout.py")
+    assert "PyYAML" in code.libraries, "a file of the folder does not replace a library"
+
+
+def read_in(folder: Path, entry_point: str, **files: str) -> EnvironmentCode:
+    """Read the code of an environment in a league's folder, where these modules are written first."""
+    for name, text in files.items():
+        (folder / f"{name}.py").write_text(text)
+    environment_code.cache_clear()
+    return environment_code(entry_point, str(folder))
