@@ -24,7 +24,9 @@ class Storage:
     def at(cls, home: Path | str) -> "Storage":
         """Return a SQLite database and an artefact directory inside `home`."""
         home = Path(home).expanduser().absolute()
-        return cls(home, f"sqlite:///{home / 'league.db'}", home / "artifacts")
+        # In URLs, a query begins with ? and an escape sequence with %.
+        database = str(home / "league.db").replace("%", "%25").replace("?", "%3F")
+        return cls(home, f"sqlite:///{database}", home / "artifacts")
 
     @classmethod
     def from_environment(cls) -> "Storage":

@@ -323,11 +323,11 @@ def _change(report: "NightlyReport") -> str:
 
 
 def _gain(gain: "Confirmation") -> str:
-    low, high = (f"{bound:+.0f}" if bound is not None else "∞" for bound in gain.interval)
+    low, high = gain.interval
+    interval = f"[{'−∞' if low is None else f'{low:+.0f}'}, {'+∞' if high is None else f'{high:+.0f}'}]"
     returns = f", returns {difference(gain.difference)}" if gain.difference else ""
     return (
-        f"{gain.candidate} against {gain.opponent} in {gain.games} new games: {gain.elo:+.0f} Elo [{low}, {high}]"
-        f"{returns}."
+        f"{gain.candidate} against {gain.opponent} in {gain.games} new games: {gain.elo:+.0f} Elo {interval}{returns}."
     )
 
 

@@ -20,6 +20,7 @@ def verify(
 ) -> None:
     """Recompute a verdict from the ledger and compare the results."""
     from evaluation.gating.verification import verify as run
+    from league.registry.verdicts import VOID
 
     found = run(verdict, registry=open_registry(), replays=replays)
     if as_json:
@@ -29,7 +30,8 @@ def verify(
     if found.replayed:
         say(f"{counted(found.replayed, 'game')} replayed with identical results.")
     if not found.is_current:
-        say("The game of the league has changed since. The verdict stands, but its games count in no current rating.")
+        games = "Its" if found.outcome == VOID else "The verdict stands, but its"
+        say(f"The league's game or selection of actions has changed since. {games} games count in no current rating.")
 
 
 def void(
@@ -44,6 +46,13 @@ def void(
     resulted from the verdict remains; use `league rollback` to undo it.
     """
     from evaluation.gating.verdicts import void as run
+    from league.registry.verdicts import VOID
 
-    row = run(open_registry(), verdict, actor=actor or getpass.getuser(), reason=reason, purge=purge)
-    say(f"Verdict {row.short_id} on {row.league}@{row.candidate} is now void.")
+    registry = open_registry()
+    before = registry.verdicts.find(verdict)
+    row = run(registry, verdict, actor=actor or getpass.getuser(), reason=reason, purge=purge)
+    subject = f"Verdict {row.short_id} on {row.league}@{row.candidate}"
+    if before.outcome == VOID:
+        say(f"{subject} was already void, {(before.evidence or {}).get('note')}. The first reason is kept.")
+    else:
+        say(f"{subject} is now void.")

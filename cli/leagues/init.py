@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,7 +65,7 @@ def init(
     for finding in proposal.found.findings:
         if "play.opening_plies" not in finding.text:  # the file sets it
             say(f"Note: {finding}")
-    say(f"Wrote {path}. Next: league train {path}")
+    say(f"Wrote {path}. Next: league train {shlex.quote(str(path))}")
 
 
 def _pair(text: str) -> tuple[str, Any]:

@@ -1,6 +1,7 @@
 """`league train`."""
 
 import os
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -122,7 +123,7 @@ def train(
 def next_step(config: str, version: "VersionRow") -> str:
     """The command that usually follows a run, whose newest version is `version`."""
     if version.exploits is None:
-        return f"league nightly {config}   (find the strongest version)"
+        return f"league nightly {shlex.quote(config)}   (find the strongest version)"
     return f"league exploitability {version.exploits}   (play its exploiters against it)"
 
 

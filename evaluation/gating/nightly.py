@@ -170,7 +170,7 @@ class _NightlyRun:
         if alpha > 0:
             return self._registry.nightly_runs.open(self._league.slug, candidates, alpha)
         self.faults.append(
-            f"{len(candidates)} versions are waiting: the verdicts of the last 365 days spent all of gate.alpha"
+            f"versions are waiting ({len(candidates)}): the verdicts of the last 365 days spent all of gate.alpha"
             f" ({gate.alpha:g}); for more than {gate.nights} nightly runs per year, raise gate.nights"
         )
         return None

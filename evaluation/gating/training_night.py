@@ -44,12 +44,23 @@ class _Night:
         rows = self.registry.versions.all(self.config.league)
         return [row.ref for row in rows if row.run == run]
 
-    def earlier(self, step: str, target: str) -> dict[str, Any] | None:
-        """The newest successful result of a step for the same champion in an earlier night."""
-        nights = self.registry.training_nights.all(self.config.league)
-        results = [night.steps.get(step, {}) for night in nights if night.id < self.row.id]
-        same = (each for each in reversed(results) if each.get("target") == target and "error" not in each)
-        return next(same, None)
+    def earlier_exploiters(self, target: str) -> dict[str, Any] | None:
+        """The newest result of an earlier night that trained exploiters of the same champion in the same environment.
+
+        A failed result, and one of whose versions one was removed, does not count.
+        """
+        league = self.registry.leagues.get(self.config.league)
+        usable = {
+            row.ref
+            for row in self.registry.versions.all(league.slug)
+            if row.manifest.environment_digest == league.environment_digest
+        }
+        nights = self.registry.training_nights.all(league.slug)
+        for result in (night.steps.get("exploiter", {}) for night in reversed(nights) if night.id < self.row.id):
+            versions = result.get("versions")
+            if result.get("target") == target and "error" not in result and versions and usable.issuperset(versions):
+                return result
+        return None
 
 
 def training_night(
@@ -174,7 +185,7 @@ def _exploiter(night: _Night) -> dict[str, Any]:
     if not (training := night.config.training).supports_opponents:
         night.announce(f"{league.slug}: {training.algorithm} does not support opponents, so {target} gets no exploiter")
         return {"target": target, "versions": []}
-    if (earlier := night.earlier("exploiter", target)) is not None and earlier["versions"]:
+    if (earlier := night.earlier_exploiters(target)) is not None:
         return earlier
     run, config = night.row.exploiter_run, night.config.of_night(_seed(night, "exploiter"), share)
     if not night.versions(run) and (known := trained_exploiters(night.registry, league, target, config)):
@@ -186,13 +197,14 @@ def _exploiter(night: _Night) -> dict[str, Any]:
 
 
 def _measure(night: _Night) -> dict[str, Any]:
-    """Play the champion against its exploiters: the last version of each run."""
+    """Play the champion against its exploiters: the last version of each run.
+
+    Matches under the same conditions are in the ledger and not played again.
+    """
     exploiter = night.row.steps["exploiter"]
     target, versions = exploiter["target"], exploiter["versions"]
     if not versions:
         return {"target": target, "exploitability": None}
-    if (earlier := night.earlier("measure", target)) is not None and earlier["exploitability"]:
-        return earlier
     last = {row.run: row.ref for row in night.registry.versions.all(night.config.league) if row.ref in versions}
     try:
         found = exploitability(

@@ -211,6 +211,6 @@ def confirmation(registry: Registry, verdict: VerdictRow) -> Confirmation | None
         games=2 * len(matches),
         score=sum(i * n for i, n in enumerate(counts)) / (len(counts) - 1) / len(matches),
         elo=estimate.elo,
-        interval=(estimate.low, estimate.high),
+        interval=(_finite(estimate.low), _finite(estimate.high)),
         difference=difference_of_returns(registry, verdict, name=name),
     )

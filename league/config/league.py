@@ -8,7 +8,7 @@ import yaml
 from pydantic import ValidationError, field_validator, model_validator
 
 from league.config.algorithms import AnyTraining, TrainingConfig
-from league.config.base import JSON, Part
+from league.config.base import JSON, Part, UniqueKeyLoader
 from league.config.environment import EnvironmentConfig
 from league.config.gate import GateConfig
 from league.config.play import PlayConfig
@@ -77,7 +77,7 @@ class LeagueConfig(Part):
     def load(cls, path: Path | str) -> Self:
         """Read a YAML file. Raises ConfigError if it cannot be read, or the configuration is invalid."""
         try:
-            document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+            document = yaml.load(Path(path).read_text(encoding="utf-8"), UniqueKeyLoader)
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -119,6 +119,15 @@ def test_a_misspelt_key(league: League, folder: Path) -> None:
     assert one_line(result.err) == "league: guess.yaml: training.stesp: unknown key, did you mean 'steps'?"
 
 
+def test_a_key_that_occurs_twice(league: League, folder: Path) -> None:
+    path = write(folder)
+    path.write_text(path.read_text() + "league: again\n")
+    line = len(path.read_text().splitlines())
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    assert one_line(result.err) == f"league: guess.yaml: line {line}: not valid YAML: the key 'league' occurs twice"
+
+
 def test_a_line_that_is_not_yaml(league: League, folder: Path) -> None:
     with write(folder).open("a") as file:
         file.write("gate: {anchors: [}\n")

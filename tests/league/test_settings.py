@@ -1,8 +1,10 @@
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from league.errors import ConfigError
+from league.registry.registry import Registry
 from league.settings import Storage
 
 SERVER = "postgresql://db/league"
@@ -18,6 +20,14 @@ def test_defaults_are_inside_the_home(monkeypatch: pytest.MonkeyPatch, tmp_path:
     monkeypatch.setenv("LEAGUE_DATABASE_URL", SERVER)
     monkeypatch.setenv("LEAGUE_ARTIFACTS", "shelf")
     assert Storage.from_environment() == Storage(tmp_path / "elsewhere", SERVER, tmp_path / "shelf")
+
+
+@pytest.mark.parametrize("name", ["a?b", "a%41", "a%", "a#b", "ä b"])
+def test_the_database_is_inside_any_home(tmp_path: Path, name: str) -> None:
+    home = tmp_path / name
+    with closing(Registry.open(Storage.at(home))):
+        assert (home / "league.db").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_exported_settings_are_read_back_from_any_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ class TrainingNightRepository(Repository):
         """Record the result of a step. A step that is recorded keeps its first result."""
         with self._database.write() as session:
             row = session.get_one(TrainingNightTable, night, with_for_update=True)
-            row.steps = {step: result} | row.steps
+            row.steps = row.steps | {step: row.steps.get(step, result)}
             return _row(session, row)
 
     @repeat_after_deadlock

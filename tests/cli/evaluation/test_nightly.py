@@ -166,6 +166,9 @@ def test_a_verdict_is_voided_with_a_reason(league: League, registry: Registry) -
     row = registry.verdicts.get(verdict)
     assert row.evidence is not None
     assert (row.outcome, row.evidence["note"]) == ("void", "voided by ann: a broken machine")
+    again = league("void", short, "--reason", "fire", "--actor", "bob")
+    assert again.out.startswith(f"Verdict {short} on tictactoe@1 was already void, voided by ann: a broken machine.")
+    assert league("verify", short).out.startswith("void: ")
     ambiguous = league("void", "tictactoe-verdict", "--reason", "x")
     assert (ambiguous.code, short in ambiguous.err) == (2, True)
     assert league("void", "nothing", "--reason", "x").code == 2

@@ -198,4 +198,5 @@ def test_the_next_step_depends_on_the_role(registry: Registry) -> None:
     main = registry.versions.get("tictactoe", 3)
     exploiter = tictactoe.publish(registry, tictactoe.graph(wins=True), exploits=main.ref)
     assert next_step("tictactoe.yaml", main).startswith("league nightly tictactoe.yaml ")
+    assert next_step("my games/a.yaml", main).startswith("league nightly 'my games/a.yaml' ")
     assert next_step("tictactoe.yaml", exploiter).startswith("league exploitability tictactoe@3 ")

@@ -11,6 +11,7 @@ from filelock import FileLock
 from evaluation.gating.training_night import training_night
 from league.config.league import LeagueConfig
 from league.errors import AlreadyRunning, ConfigError
+from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -91,6 +92,33 @@ def test_a_champion_that_stays_keeps_its_exploiter_and_its_measurement(registry:
     assert trainer.calls[2:] == [(second.run, 1, None)]
     assert second.steps["gate"]["champion"] == "tictactoe@1"
     assert second.steps["measure"] == first.steps["measure"]
+
+
+def test_a_champion_that_stays_is_measured_again_under_other_conditions(registry: Registry) -> None:
+    trainer = trainer_of(registry, STRONG, STRONGEST, WEAK)
+    training_night(CONFIG, registry=registry, train=trainer)
+    sampled = CONFIG.model_copy(update={"play": CONFIG.play.model_copy(update={"actions": "sampled"})})
+    registry.leagues.register(sampled, registry.leagues.get(LEAGUE).interface)
+    night, _ = training_night(sampled, registry=registry, train=trainer)
+    assert night.steps["exploiter"]["versions"] == ["tictactoe@2"]
+    played = Ledger(registry).matches(league=LEAGUE)
+    challenges = {each.schedule for each in played if {*each.contestants} == {"tictactoe@1", "tictactoe@2"}}
+    actions = {Ledger(registry).schedule(each).conditions.actions for each in challenges}
+    assert actions == {"greedy", "sampled"}
+
+
+def test_an_exploiter_that_was_removed_is_replaced(registry: Registry) -> None:
+    trainer = trainer_of(registry, STRONG, STRONGEST, WEAK, STRONGEST)
+    training_night(CONFIG, registry=registry, train=trainer)
+    registry.removal.remove_version(CheckpointRef(LEAGUE, 2), force=True)
+    night, _ = training_night(CONFIG, registry=registry, train=trainer)
+    assert night.steps["exploiter"]["versions"] == ["tictactoe@4"]
+    assert night.steps["measure"]["exploitability"]["exploiters"][0]["ref"] == "tictactoe@4"
+
+
+def test_the_steps_of_a_night_are_in_order(registry: Registry) -> None:
+    night, _ = training_night(CONFIG, registry=registry, train=trainer_of(registry, STRONG, STRONGEST))
+    assert list(night.steps) == ["train", "gate", "exploiter", "measure"]
 
 
 def test_a_champion_that_changes_during_training_is_the_opponent_of_the_gate(registry: Registry) -> None:
