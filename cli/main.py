@@ -169,6 +169,10 @@ def _league() -> None:
 def run() -> None:
     """Run the command. A LeagueError becomes one line on stderr and exit code 2 (invalid input) or 1."""
     _add_working_directory_to_path()
+    if "--json" in sys.argv:
+        from cli.output import reserve_stdout
+
+        reserve_stdout()
     try:
         app()
     except LeagueError as error:

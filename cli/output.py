@@ -1,11 +1,13 @@
 """Output of the commands: text, tables, progress bars and JSON."""
 
+import os
 import re
+import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import orjson
 from rich.cells import cell_len
@@ -28,7 +30,20 @@ CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 def emit(document: Any) -> None:
     """Print one JSON document and nothing else."""
-    print(orjson.dumps(document, option=orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY).decode())
+    text = orjson.dumps(document, option=orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY).decode()
+    print(text, file=_documents, flush=True)
+
+
+_documents: TextIO | None = None
+"""Where `emit` prints; None: stdout."""
+
+
+def reserve_stdout() -> None:
+    """Redirect to stderr what this process prints to stdout, except by `emit`: environments and bots may print."""
+    global _documents
+    sys.stdout.flush()
+    _documents = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
 
 
 def say(sentence: str = "") -> None:

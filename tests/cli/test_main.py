@@ -159,3 +159,14 @@ def _last_line(program: str, **environment: str) -> str:
         check=True,
     )
     return done.stdout.splitlines()[-1]
+
+
+def test_json_is_alone_on_stdout_although_the_environment_prints(league_process: League, tmp_path: Path) -> None:
+    (tmp_path / "talkative.py").write_text(
+        "import os\n\nfrom pettingzoo.classic.tictactoe_v3 import env\n\nprint('hello')\nos.system('echo hello')\n"
+    )
+    config = tmp_path / "talkative.yaml"
+    config.write_text("league: talkative\nenvironment: {entry_point: 'talkative:env'}\n")
+    result = league_process("check-env", str(config), "--json")
+    assert result.json["policies"], result.out
+    assert "hello" in result.err
