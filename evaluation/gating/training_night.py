@@ -47,7 +47,7 @@ class _Night:
     def earlier_exploiters(self, target: str) -> dict[str, Any] | None:
         """The newest result of an earlier night that trained exploiters of the same champion in the same environment.
 
-        A failed result, and one of whose versions one was removed, does not count.
+        Failed results and results with removed versions do not count.
         """
         league = self.registry.leagues.get(self.config.league)
         usable = {
