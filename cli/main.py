@@ -169,12 +169,14 @@ def _league() -> None:
 def run() -> None:
     """Run the command. A LeagueError becomes one line on stderr and exit code 2 (invalid input) or 1."""
     _add_working_directory_to_path()
-    if "--json" in sys.argv:
-        from cli.output import reserve_stdout
-
-        reserve_stdout()
     try:
-        app()
+        if "--json" in sys.argv:
+            from cli.output import only_json_on_stdout
+
+            with only_json_on_stdout():
+                app()
+        else:
+            app()
     except LeagueError as error:
         from cli.output import complain
 

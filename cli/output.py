@@ -1,11 +1,10 @@
 """Output of the commands: text, tables, progress bars and JSON."""
 
-import os
 import re
 import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -38,12 +37,16 @@ _documents: TextIO | None = None
 """Where `emit` prints; None: stdout."""
 
 
-def reserve_stdout() -> None:
-    """Redirect to stderr what this process prints to stdout, except by `emit`: environments and bots may print."""
+@contextmanager
+def only_json_on_stdout() -> Iterator[None]:
+    """While the context lasts, redirect prints to stderr, except those of `emit`: environments and bots may print."""
     global _documents
-    sys.stdout.flush()
-    _documents = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
+    _documents = sys.stdout
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _documents = None
 
 
 def say(sentence: str = "") -> None:
