@@ -22,9 +22,9 @@ from benchmarks.simulations import coverage, exploiter_gates, golden, null_play,
 from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completion
 from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulations.simulated_years import boundary, chance, walk
-from evaluation.gating.alpha_spending import NIGHTS, alpha_per_verdict
 from evaluation.gating.gate import Decision, decide
 from evaluation.gating.gate_result import AnchorResult, combine_results
+from evaluation.statistics.alpha_spending import NIGHTS, alpha_per_verdict
 from evaluation.statistics.sequential import expected_games
 from league.config.gate import GateConfig
 from league.verdict_tests import AnchorTest

@@ -29,7 +29,7 @@ from sqlalchemy import Executable, delete, update
 
 from benchmarks.leagues.served_league import builder
 from evaluation.gating.gate import decide_matches
-from evaluation.gating.observations import SequentialTest
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.gating.verdicts import conclude, gate_of, open_verdict
 from evaluation.matches.tournament import evaluate
 from evaluation.schedules.builders import gauntlet, round_robin

@@ -11,7 +11,7 @@ from copy import deepcopy
 import numpy as np
 
 from evaluation.gating.gate import decide_matches
-from evaluation.gating.observations import SequentialTest
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import verdict
 from examples.kuhn_poker import AGENTS, KuhnPoker

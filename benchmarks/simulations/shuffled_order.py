@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.simulations.simulated_gates import EQUALS, stronger
 from evaluation.gating.gate import SequentialMonitor, decide_matches
-from evaluation.gating.observations import SequentialTest
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.tournament import ReorderBuffer
 from league.config.gate import GateConfig
 from league.results.records import Game, Match

@@ -16,7 +16,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.gating.observations import Observations, SequentialTest, observe
+from evaluation.gating.observations import Observations, observe
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_records import unique_games
 from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config.gate import GateConfig

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evaluation.gating.gate import Decision, Outcome, decide_matches
-from evaluation.gating.observations import SequentialTest, observe
+from evaluation.gating.observations import observe
+from evaluation.gating.sequential_tests import SequentialTest, sequential_test
 from evaluation.results import Difference
 from evaluation.statistics.payoff import crossed_interval, student_interval
 from league.config.gate import GateConfig
@@ -104,18 +105,6 @@ class ExploitabilityResult:
 
 
 CompanionResult = AnchorResult | ExploiterResult | ExploitabilityResult
-
-
-def sequential_test(gate: GateConfig, test: CompanionTest, candidate: str, champion: str) -> SequentialTest:
-    """Return how a test of a verdict is decided. gate: the settings of the test against the champion."""
-    match test:
-        case AnchorTest():
-            return SequentialTest(gate.against_anchor(test.margin), candidate)
-        case ExploiterTest():
-            return SequentialTest(gate.against_exploiter(test.margin), candidate, champion)
-        case ExploitabilityTest():
-            settings = gate.of_exploitability(test.margin, test.improvement)
-            return SequentialTest(settings, candidate, champion, pairs=len(test.of_candidate), at_least=test.blocks)
 
 
 def companion_result(

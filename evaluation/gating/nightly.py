@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 
 from evaluation.gating import verdicts
-from evaluation.gating.alpha_spending import alpha_share, alpha_spent
 from evaluation.gating.anchors import rolled_back
 from evaluation.gating.trained_exploiters import Trainer, check_exploiters
 from evaluation.gating.verdict_report import confirmation
@@ -21,6 +20,7 @@ from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.matches.tournament import fixed_baselines
 from evaluation.results import Confirmation, Listener, NightlyReport, VerdictReport
 from evaluation.schedules.builders import ANCHOR, gauntlet
+from evaluation.statistics.alpha_spending import alpha_share, alpha_spent
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import (

@@ -15,34 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_records import forfeit_difference
 from league.config.gate import GateConfig
 from league.results.records import GAMES_PER_BLOCK, Match
-
-
-@dataclass(frozen=True, slots=True)
-class SequentialTest:
-    """A sequential test of a candidate.
-
-    Attributes:
-        settings: The gate's settings, with the hypotheses of this test.
-        candidate: Reference of the candidate.
-        champion: For a comparison with the champion against exploiters, the contestant of every second match. None for
-            a test against one opponent.
-        pairs: Pairs of matches in a round.
-        at_least: Observations to be made even if fewer decide the test.
-    """
-
-    settings: GateConfig
-    candidate: str
-    champion: str | None = None
-    pairs: int = 1
-    at_least: int = 0
-
-    @property
-    def matches_each(self) -> int:
-        """Matches per observation."""
-        return 1 if self.champion is None else 2 * self.pairs
 
 
 @dataclass(frozen=True, slots=True)

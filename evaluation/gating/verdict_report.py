@@ -17,7 +17,7 @@ from evaluation.gating.gate_result import (
     combine_results,
     companion_result,
 )
-from evaluation.gating.observations import SequentialTest
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_records import forfeits
 from evaluation.results import (
     AnchorReport,

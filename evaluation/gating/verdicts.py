@@ -17,8 +17,8 @@ from dataclasses import replace
 from evaluation.gating.anchors import resolve_anchors
 from evaluation.gating.exploiters import recent_exploiters
 from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
-from evaluation.gating.gate_result import GateResult, sequential_test
-from evaluation.gating.observations import SequentialTest
+from evaluation.gating.gate_result import GateResult
+from evaluation.gating.sequential_tests import SequentialTest, sequential_test
 from evaluation.gating.trained_exploiters import Trainer, prepared_test
 from evaluation.gating.verdict_report import confirmation, gate_of, gate_result, is_applied, report_of
 from evaluation.matches import tournament

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from evaluation.gating.gate import SequentialMonitor, decide, decide_matches, shadow_shortfall
-from evaluation.gating.observations import SequentialTest
+from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_records import unique_games
 from evaluation.statistics.sequential import bounds, elo_estimate, expected_games, gsprt_llr
 from league.config.gate import GateConfig

@@ -3,7 +3,8 @@ from dataclasses import replace
 import pytest
 
 from evaluation.gating.gate import decide_matches
-from evaluation.gating.observations import SequentialTest, observe
+from evaluation.gating.observations import observe
+from evaluation.gating.sequential_tests import SequentialTest
 from league.config.gate import GateConfig
 from league.results.records import Game, Match
 

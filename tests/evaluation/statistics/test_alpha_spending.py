@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.gating.alpha_spending import alpha_per_verdict, alpha_share, alpha_spent
+from evaluation.statistics.alpha_spending import alpha_per_verdict, alpha_share, alpha_spent
 
 
 @given(st.lists(st.integers(1, 20), min_size=1, max_size=365), st.floats(1e-6, 0.5))
