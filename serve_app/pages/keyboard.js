@@ -1,12 +1,13 @@
 // Keyboard shortcuts of a page, except for keys that the focused field, button or dialog handles itself.
 
-import { useEffect, useRef } from "./vendor/preact-htm.js";
+import { useLayoutEffect, useRef } from "./vendor/preact-htm.js";
 
 /** `onKey(key)` returns whether it has handled the key. */
 export function useKeys(onKey) {
   const latest = useRef(onKey);
   latest.current = onKey;
-  useEffect(() => {
+  // A layout effect: an effect would run after the page is visible, and miss a key pressed before.
+  useLayoutEffect(() => {
     const onKeyDown = (event) => {
       if (event.metaKey || event.ctrlKey || event.altKey || isHandledBy(event.target, event.key)) return;
       if (latest.current(event.key)) event.preventDefault();

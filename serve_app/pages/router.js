@@ -1,6 +1,6 @@
 // Client-side routing: links between pages change the address without reloading the document.
 
-import { useEffect, useState } from "./vendor/preact-htm.js";
+import { useLayoutEffect, useState } from "./vendor/preact-htm.js";
 
 const NAVIGATED = "league:navigated";
 
@@ -15,7 +15,8 @@ export function navigate(address, { replace = false } = {}) {
 /** {path, parameters, fragment} of the current address; updated on navigation. */
 export function useAddress() {
   const [address, setAddress] = useState(currentAddress);
-  useEffect(() => {
+  // A layout effect: an effect would run after the page is visible, and miss a navigation before.
+  useLayoutEffect(() => {
     const update = () => setAddress(currentAddress());
     const events = [NAVIGATED, "popstate", "hashchange"];
     events.forEach((event) => addEventListener(event, update));

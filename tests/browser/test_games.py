@@ -61,6 +61,21 @@ def test_a_game_is_played_back_step_by_step(tab: Tab, served: Served) -> None:
     expect(info).to_contain_text("Start")
 
 
+AS_SOON_AS_VISIBLE = """
+new MutationObserver((_, observer) => {
+  if (!document.querySelector(".seek output")) return;
+  observer.disconnect();
+  dispatchEvent(new KeyboardEvent("keydown", { key: "End" }));
+}).observe(document, { childList: true, subtree: true });
+"""
+
+
+def test_a_key_pressed_as_soon_as_the_game_is_visible(tab: Tab, served: Served) -> None:
+    tab.page.add_init_script(AS_SOON_AS_VISIBLE)
+    page = tab.open(game_of(served))
+    expect(page.locator(".game-info")).to_contain_text("· end")
+
+
 def test_playback_and_seeking(tab: Tab, served: Served) -> None:
     page = tab.open(game_of(served))
     expect(page.locator(".picture img")).to_be_visible()
