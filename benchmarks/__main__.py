@@ -11,6 +11,7 @@ ORDER = (
     "sampling",
     "replay",
     "phases",
+    "gpu",
     "learning",
     "maddpg",
     "league_training",

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from league.errors import InvalidReference
 
-SLUG = re.compile(r"[a-z0-9_-]+")
+SLUG = re.compile(r"[a-z0-9_][a-z0-9_-]*")
 MAX_SLUG = 100
 """Characters. Ids of schedules and verdicts contain the league's name and must fit into 255 characters."""
 ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
@@ -43,6 +43,8 @@ def check_slug(kind: str, text: str) -> str:
     """Return `text` if it is a valid name of a league, policy, side or alias; raise InvalidReference otherwise."""
     if len(text) > MAX_SLUG:
         raise InvalidReference(f"{kind} {text[:32]!r}… has {len(text)} characters, expected at most {MAX_SLUG}")
+    if text.startswith("-"):
+        raise InvalidReference(f"{kind} {text!r} must not begin with '-', as the options of a command do")
     if not SLUG.fullmatch(text):
         raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'{_guess(text)}")
     return text

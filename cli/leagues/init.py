@@ -86,7 +86,7 @@ def _name(entry_point: str, kwargs: dict[str, Any]) -> str:
         stem = str(kwargs.get("game", ADAPTER)).partition("(")[0]
     else:
         stem = re.sub(r"_v\d+$", "", entry_point.partition(":")[0].rpartition(".")[2])
-    return re.sub(r"[^a-z0-9_-]", "_", stem.lower())
+    return re.sub(r"[^a-z0-9_-]|^-", "_", stem.lower())
 
 
 def _search(entry_point: str, folder: Path) -> tuple[str, str | None]:

@@ -83,10 +83,14 @@ class LeagueRepository(Repository):
             return [detached(EarlierGameRow, each) for each in session.scalars(query) if each.digest != row.game_digest]
 
     def follow_code(self, league: str) -> LeagueRow:
-        """Return one league, registered again if the code of its environment has changed. Raises UnknownLeague."""
+        """Return one league, registered again if the code of its environment has changed.
+
+        Raises UnknownLeague, or ConfigError if the environment cannot be imported.
+        """
         row = self.get(league)
         if row.config.game_digest() == row.game_digest:
             return row
+        row.config.environment.import_module()  # What cannot be imported has no code, which is not another game.
         self.register(row.config, row.interface)
         return self.get(league)
 

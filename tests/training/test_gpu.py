@@ -32,8 +32,9 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "ppo with images": ("pistonball_gpu", PPO),
     "ppo with continuous actions": ("simple_spread", PPO),
     "dqn": ("connect_four_dqn", OFF_POLICY),
+    "dqn with a GRU": ("connect_four_dqn", OFF_POLICY | {"recurrence": MEMORY, "n_step": 1, "priorities": None}),
     "qmix": ("simple_spread_qmix", OFF_POLICY),
-    "qmix with an LSTM": ("simple_spread_qmix", OFF_POLICY | {"recurrence": MEMORY}),
+    "qmix with a GRU": ("simple_spread_qmix", OFF_POLICY | {"recurrence": MEMORY}),
     "maddpg": ("simple_adversary", OFF_POLICY),
 }
 

@@ -1,9 +1,11 @@
 import logging
+from pathlib import Path
 
 import pytest
 
 from league.config.league import LeagueConfig
-from league.errors import InterfaceChanged, LeagueArchived, UnknownLeague
+from league.environment_code import environment_code
+from league.errors import ConfigError, InterfaceChanged, LeagueArchived, UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
@@ -113,6 +115,20 @@ def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkey
     after = registry.leagues.follow_code(LEAGUE)
     assert after.game_digest == config().game_digest() != before.game_digest
     assert after.config == before.config
+
+
+def test_code_that_cannot_be_imported_is_not_another_game(registry: Registry, tmp_path: Path) -> None:
+    module = tmp_path / "moved_game.py"
+    module.write_text("from pettingzoo.classic.tictactoe_v3 import env")
+    environment = {"entry_point": "moved_game:env"}
+    league = LeagueConfig.from_mapping({"league": LEAGUE, "environment": environment, "folder": str(tmp_path)})
+    registry.leagues.register(league, interface())
+    before = registry.leagues.get(LEAGUE)
+    module.unlink()
+    environment_code.cache_clear()
+    with pytest.raises(ConfigError, match=r"environment\.entry_point: cannot import 'moved_game'"):
+        registry.leagues.follow_code(LEAGUE)
+    assert registry.leagues.get(LEAGUE) == before
 
 
 def test_nothing_is_registered_or_published_in_an_archived_league(registry: Registry) -> None:
