@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("| configuration | variant | sampling | learning | time |")
     with local_ray(cpus=2):
         for part in given.parts or PARTS:
-            measure(part, 3.0 if given.quick else 15.0)
+            measure(part, 2.0 if given.quick else 8.0)
     return 0
 
 

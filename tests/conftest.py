@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 
 from league.registry.storage import database
+from league.registry.storage.database import Database
 from league.settings import Storage
 from tests.support.databases import StorageAt
 from tests.support.durability import without_syncing
@@ -71,6 +72,23 @@ def schema() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(database, "_apply", migrated_once(database._apply))
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def closed_databases() -> Iterator[None]:
+    """Close the connections that a test file leaves to the garbage collector, which seldom runs."""
+    opened: list[Database] = []
+    connect = Database.__init__
+
+    def record(self: Database, *arguments: Any, **options: Any) -> None:
+        connect(self, *arguments, **options)
+        opened.append(self)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Database, "__init__", record)
+        yield
+    for each in opened:
+        each.close()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 from collections import OrderedDict
 from collections.abc import Iterable
-from functools import lru_cache
 
 from evaluation.matches.game_loop import play_matches
 from evaluation.matches.seating import Roster
@@ -25,6 +24,9 @@ from league.settings import Storage
 
 MOST_CONTESTANTS = 64
 """Contestants that stay loaded in one process."""
+MOST_WORKERS = 4
+"""Leagues whose environments and contestants stay loaded in one process."""
+_workers: OrderedDict[tuple[Storage, str], MatchWorker] = OrderedDict()
 
 
 class MatchWorker:
@@ -68,6 +70,10 @@ class MatchWorker:
         self._environment = environment
         return matches
 
+    def close(self) -> None:
+        """Close the connections to the registry."""
+        self._registry.close()
+
     def _mixture(self, ref: str) -> Mixture | None:
         """The members of a fixed reference, if it is a mixture."""
         if ref not in self._mixtures:
@@ -99,7 +105,13 @@ def num_envs(config: LeagueConfig) -> int:
     return STOCK_ENVS if implementation(config.environment).vector is None else VECTOR_ENVS
 
 
-@lru_cache(maxsize=4)
 def match_worker(storage: Storage, config: str) -> MatchWorker:
-    """This process's worker for the league with this configuration, a JSON document."""
-    return MatchWorker(LeagueConfig.model_validate_json(config), Registry.open(storage))
+    """This process's worker for the league with this configuration, a JSON document. Not thread-safe."""
+    key = storage, config
+    worker = _workers.get(key) or MatchWorker(LeagueConfig.model_validate_json(config), Registry.open(storage))
+    _workers[key] = worker
+    _workers.move_to_end(key)
+    if len(_workers) > MOST_WORKERS:
+        # Frozen objects are not collected: its connections would stay open.
+        _workers.popitem(last=False)[1].close()
+    return worker

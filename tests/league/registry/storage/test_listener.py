@@ -49,7 +49,9 @@ def is_readable(listener: Listener, seconds: float) -> bool:
     socket = listener.socket()
     assert socket is not None
     try:
-        return bool(select.select([socket], [], [], seconds)[0])
+        waiting = select.poll()  # select() does not accept the numbers of files after the 1,024th
+        waiting.register(socket, select.POLLIN)
+        return bool(waiting.poll(seconds * 1000))
     finally:
         os.close(socket)
 
