@@ -33,9 +33,11 @@ DOWNSCALE_DELAY = 10.0
 HIDDEN = (2048, 2048)
 """Units of the network. Inference dominates the cost of a request, which hence does not depend on the rate."""
 SAMPLE = 30.0
-"""Requests per second with which the cost of a request is measured."""
+"""The difference between the rates, in requests per second, with which the cost of a request is measured."""
 STEADY = 15.0
 """Seconds with a constant load."""
+SHORTEST = 8.0
+"""Seconds in which the cost of a request is measured, at least."""
 DEADLINE = 120.0
 
 
@@ -80,22 +82,23 @@ def main() -> int:
     return int(found.appeared > APPEARED or len(seen.lost) > LOST)
 
 
-def follow(steady: float, target: float = TARGET) -> Following:
+def follow(steady: float, target: float = TARGET, first: float = FIRST, factor: float = FACTOR) -> Following:
     """Serve, and step the load up and down.
 
-    steady: seconds of each constant load. target: load that a replica should have, as a share of a core.
+    steady: seconds of each constant load. target: load that a replica should have, as a share of a core. first: the
+    first load as a share of the target. factor: the step.
 
     Raises AssertionError if the number of replicas changes under a constant load, and TimeoutError if it does not
     follow a step.
     """
     with _served(target) as (url, registry):
         with stepping(url) as load:
-            cost = _cost(registry, load, steady)
-            rate = FIRST * target / cost
+            cost = _cost(registry, load, max(steady, SHORTEST))
+            rate = first * target / cost
             load.set_rate(rate)
             _hold(registry, 1, steady)
             up = time.monotonic()
-            load.set_rate(FACTOR * rate)
+            load.set_rate(factor * rate)
             _await(lambda: len(replica_processes(registry.storage.home)), 2)
             started = time.monotonic() - up
             _await(lambda: _replicas(registry), 2)
@@ -129,9 +132,11 @@ def _served(target: float) -> Iterator[tuple[str, Registry]]:
 def _cost(registry: Registry, load: StepLoad, seconds: float) -> float:
     """Processor time of a request in seconds."""
     (replica,) = replica_processes(registry.storage.home)
-    idle = _busy(replica.cpu_times, seconds)
     load.set_rate(SAMPLE)
-    return (_busy(replica.cpu_times, seconds) - idle) / SAMPLE
+    _busy(replica.cpu_times, seconds / 2)  # after the start, the program still loads what it rarely needs
+    once = _busy(replica.cpu_times, seconds)
+    load.set_rate(2 * SAMPLE)
+    return (_busy(replica.cpu_times, seconds) - once) / SAMPLE
 
 
 def _busy(times: Callable[[], object], seconds: float) -> float:

@@ -1,6 +1,7 @@
 """The `league` command: subcommands that are imported on demand, and the mapping of errors to exit codes."""
 
 import os
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from importlib import import_module
@@ -13,6 +14,8 @@ from league.errors import InvalidInput, LeagueError, NotFound, one_line
 
 USAGE_ERROR = 2
 FAILURE = 1
+TERMINATED = 143
+"""Exit code of a process ended by SIGTERM: 128 + 15."""
 
 
 class Subcommand(NamedTuple):
@@ -182,6 +185,10 @@ def run() -> None:
 
         complain(f"league: {one_line(error)}")
         sys.exit(USAGE_ERROR if isinstance(error, InvalidInput | NotFound) else FAILURE)
+    except SystemExit as end:
+        if end.code == signal.SIGTERM:  # Ray's handler exits with the number of the signal.
+            sys.exit(TERMINATED)
+        raise
 
 
 def _add_working_directory_to_path() -> None:

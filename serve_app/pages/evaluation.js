@@ -20,7 +20,7 @@ export function Evaluation({ league, evaluation, about }) {
   return html`<section aria-labelledby="heading">
     <p class="crumbs"><a href=${leaguePath(league, "evaluations")}>Evaluations</a></p>
     <div class="head"><h2 id="heading">Evaluation ${evaluation}</h2><span role="status">${current && html`<${State} value=${current.state} />`}</span>
-      ${current && ACTIVE.includes(current.state) && html`<${Stop} path=${path} evaluation=${evaluation} stopped=${setLatest} />`}</div>
+      ${current && ACTIVE.includes(current.state) && html`<${Stop} path=${path} evaluation=${evaluation} stopped=${(reply) => setLatest((now) => (now && !ACTIVE.includes(now.state) ? now : reply))} />`}</div>
     <${Await} result=${initial}>${current && html`<${Details} evaluation=${current} champion=${about.champion} />`}<//>
   </section>`;
 }

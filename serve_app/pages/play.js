@@ -62,16 +62,16 @@ function Game({ league, playable, game }) {
   const [showProbabilities, setShowProbabilities] = useState(false);
   const [state, setState] = useState(null);
   const [error, setError] = useState(null);
-  const [busy, setBusy] = useState(true);
+  const [answered, setAnswered] = useState(null);
   const [attempt, setAttempt] = useState(0);
   const { opponent, agent, seed, actions } = game;
   const requestKey = `${actions.join()} ${showProbabilities} ${attempt}`;
+  const busy = answered !== requestKey; // at once: a second click is no second move
   useEffect(() => {
     const closed = new AbortController();
-    setBusy(true);
     request(apiPath(league, "play"), { method: "POST", body: { opponent, agent, seed, actions, chances: showProbabilities }, signal: closed.signal, repeatable: true }).then(
-      (loaded) => { if (!closed.signal.aborted) { setState(loaded); setError(null); setBusy(false); if (loaded.opponent !== opponent) navigate(fragmentOf({ ...game, opponent: loaded.opponent }), { replace: true }); } },
-      (failure) => { if (!closed.signal.aborted) { setError(failure); setBusy(false); } },
+      (loaded) => { if (!closed.signal.aborted) { setState(loaded); setError(null); setAnswered(requestKey); if (loaded.opponent !== opponent) navigate(fragmentOf({ ...game, opponent: loaded.opponent }), { replace: true }); } },
+      (failure) => { if (!closed.signal.aborted) { setError(failure); setAnswered(requestKey); } },
     );
     return () => closed.abort();
   }, [requestKey]);

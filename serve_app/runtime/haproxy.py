@@ -35,6 +35,8 @@ GRPC_PORT_FILE = "grpc"
 """File with the first gRPC port that a server has claimed."""
 GRPC_PORTS = range(10_000, 20_000, 100)
 """First ports of the blocks for the gRPC servers of replicas; a block exceeds the number of replicas of a machine."""
+DISTANCE = PORTS.start - GRPC_PORTS.start
+"""From a claimed block to that of the other ports of the same server, which are bound seconds later."""
 SOFT_STOP_TIMEOUT = 1.0
 """Seconds for HAProxy to finish requests in progress."""
 HARD_STOP_TIMEOUT = 5.0
@@ -48,8 +50,9 @@ IDLE_CLIENT_TIMEOUT = 60
 
 def environment(directory: Path) -> dict[str, str]:
     """Ray's variables for a server whose HAProxy has its files in `directory`. deploy.yaml explains the first ones."""
-    stats, metrics, fallback_http, fallback_grpc = free_ports(4)
     grpc = _claim_grpc_ports(directory)
+    own = range(grpc.start + DISTANCE, grpc.stop + DISTANCE)
+    stats, metrics, fallback_http, fallback_grpc = free_ports(4, ports=own)
     return _install_script(directory, stats, metrics) | {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
@@ -121,15 +124,15 @@ def _install_script(directory: Path, stats: int, metrics: int) -> dict[str, str]
     return {haproxy_script.BINARY_PATH: str(haproxy_script.install(directory, found, stats, metrics))}
 
 
-def free_ports(count: int, host: str = "") -> list[int]:
+def free_ports(count: int, host: str = "", ports: range = PORTS) -> list[int]:
     """Unused ports of `host` (default: all interfaces)."""
     found = []
-    for port in random.sample(PORTS, len(PORTS)):
+    for port in random.sample(ports, len(ports)):
         if is_free(host, port):
             found.append(port)
         if len(found) == count:
             return found
-    raise NotReady(f"found fewer than {count} free ports from {PORTS.start} to {PORTS.stop - 1}")
+    raise NotReady(f"found fewer than {count} free ports from {ports.start} to {ports.stop - 1}")
 
 
 def _own_directories() -> list[Path]:

@@ -15,6 +15,8 @@ pytestmark = pytest.mark.slow  # a browser and a server take all cores
 
 L = f"/leagues/{LEAGUE}"
 KEY_DIALOG = "API key"
+SLOW = 240_000
+"""Timeout in milliseconds for work of the evaluation service, which has the lowest priority."""
 
 
 def enter_key(page: Page, key: str) -> None:
@@ -172,15 +174,15 @@ def test_an_evaluation_is_started_followed_and_stopped(tab: Tab, served: Served)
     page.get_by_role("button", name="Start").click()
     enter_key(page, served.keys["evaluator"])
     expect(page.get_by_role("heading", level=2)).to_have_text(re.compile(r"Evaluation \d+"))
-    expect(page.locator("section")).to_contain_text("running", timeout=60_000)
+    expect(page.locator("section")).to_contain_text("running", timeout=SLOW)
     bar = page.get_by_role("progressbar", name="Matches played")
-    expect(bar).not_to_have_attribute("value", "0", timeout=60_000)
+    expect(bar).not_to_have_attribute("value", "0", timeout=SLOW)
     before = bar.get_attribute("value")
-    expect(bar).not_to_have_attribute("value", str(before), timeout=60_000)
+    expect(bar).not_to_have_attribute("value", str(before), timeout=SLOW)
     expect(page.locator("section")).to_contain_text(HOSTILE)
     page.get_by_role("button", name="Stop …").click()
     page.get_by_role("dialog").get_by_role("button", name="Stop", exact=True).click()
-    expect(page.get_by_role("status").filter(has_text="stopped")).to_be_visible(timeout=60_000)
+    expect(page.get_by_role("status").filter(has_text="stopped")).to_be_visible(timeout=SLOW)
     expect(page.get_by_role("button", name="Stop …")).to_have_count(0)
     tab.ignore(401)
     assert served.registry.evaluations.newest(LEAGUE)[0].state == "stopped"
@@ -196,7 +198,7 @@ def test_a_completed_evaluation_shows_its_leaderboard(tab: Tab, served: Served) 
     page.get_by_label("Seed").fill("5")
     page.get_by_role("button", name="Start").click()
     table = page.get_by_role("table", name="Leaderboard")
-    expect(table).to_contain_text(f"{LEAGUE}@2", timeout=90_000)
+    expect(table).to_contain_text(f"{LEAGUE}@2", timeout=SLOW)
     expect(page.locator("section")).to_contain_text("18 games")
     page.get_by_role("link", name="Evaluations").first.click()
     expect(page.get_by_role("table", name="Evaluations, newest first")).to_contain_text("✓ done")

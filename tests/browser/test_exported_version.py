@@ -43,7 +43,8 @@ def runtime(request: pytest.FixtureRequest) -> Path:
     if not files.is_dir():
         with tempfile.TemporaryDirectory(dir=cache) as partial:
             options = ("--prefix", partial, "--no-save", "--no-audit", "--no-fund", "--ignore-scripts")
-            done = subprocess.run([npm, "install", *options, PACKAGE], capture_output=True, text=True)
+            network = ("--fetch-timeout=60000", "--fetch-retries=1")
+            done = subprocess.run([npm, "install", *options, *network, PACKAGE], capture_output=True, text=True)
             if done.returncode:
                 pytest.skip(f"npm cannot install {PACKAGE}: {done.stderr.strip()[-300:]}")
             (Path(partial) / "node_modules" / "onnxruntime-web" / "dist").rename(files)

@@ -65,5 +65,5 @@ def ray_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayServer]:
         with running(registry.storage, replicas=2, grpc_port=grpc_port, insecure=True, deploy=deploy) as url:
             until(lambda: serving(registry, 1) == 2)
             yield RayServer(url, f"127.0.0.1:{grpc_port}", registry, deploy)
-    until(lambda: not processes(registry.storage, ""), seconds=10)  # no process outlives the server
+    until(lambda: not processes(registry.storage, ""))  # no process outlives the server
     registry.close()

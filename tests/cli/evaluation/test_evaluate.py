@@ -1,14 +1,18 @@
+import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from pettingzoo.classic.tictactoe import tictactoe as tictactoe_v3
+from sqlalchemy import select
 
 from league.registry.registry import Registry
-from league.registry.storage.tables import VerdictTable
-from tests.support.command import League
+from league.registry.storage.tables import MatchTable, VerdictTable
+from tests.support.command import COMMAND, League, environment
 from tests.support.leagues import tictactoe
+from tests.support.waiting import until
 
 
 @pytest.fixture
@@ -52,6 +56,20 @@ def test_evaluate_reports_shares_of_a_complete_table(league: League, registry: R
     for shares in population.values():
         assert sum(share["value"] for share in shares) == pytest.approx(1)
         assert all(share["low"] <= share["high"] for share in shares)
+
+
+@pytest.mark.slow
+def test_a_terminated_evaluation_exits_like_any_terminated_process(registry: Registry, home: Path) -> None:
+    """Also once Ray has set its handler."""
+    played = select(MatchTable.position).limit(1)
+    options = ("--blocks", "100000", "--workers", "1", "--schedule", "round_robin")
+    command = [*COMMAND, "evaluate", "tictactoe", *options]
+    with subprocess.Popen(command, env=os.environ | environment(home), stderr=subprocess.PIPE, text=True) as process:
+        until(lambda: registry.database.rows(played) or process.poll() is not None)
+        process.terminate()
+        _, errors = process.communicate()
+    assert process.returncode == 143, errors
+    assert "Traceback" not in errors
 
 
 def test_nightly_tests_promotes_and_rates_and_the_next_run_has_nothing_to_do(

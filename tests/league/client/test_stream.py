@@ -192,7 +192,7 @@ def slow() -> Iterator[tuple[Slow, str]]:
 
 def test_a_late_answer_is_not_taken_for_the_next_one(connect: Connect, slow: tuple[Slow, str]) -> None:
     handler, url = slow
-    with connect(url, timeout=0.3).stream("board") as stream:
+    with connect(url, timeout=1.0).stream("board") as stream:
         assert stream.act(BOARD, explore=True) == 2, "retried over another connection"
         assert handler.received[0] == handler.received[1], "the retry has the same seed"
         handler.respond.set()

@@ -102,7 +102,7 @@ def test_all_listeners_share_a_poll_and_there_is_none_without_listeners(
             listeners = [stack.enter_context(listen(server)) for _ in range(5)]
             assert server.server.events.connections.open == 6
             wait_for_polls("memory", 10)
-            assert polls.count("board") <= 11
+            assert polls.count("board") <= polls.count("memory") + 1
             promote(registry, "board", 2)
             until(lambda: all(each.last["aliases"] == {"champion": 2} for each in listeners))
         until(lambda: server.server.events.topics == 1)
@@ -143,7 +143,7 @@ def test_a_head_request_is_answered_at_once(server: Listening) -> None:
 
 def test_the_timeout_of_requests_does_not_apply_to_streams(registry: Registry) -> None:
     with (
-        listening(registry.storage, SOON.model_copy(update={"timeout": 0.5})) as server,
+        listening(registry.storage, SOON.model_copy(update={"timeout": 1.5})) as server,
         listen(server, **{"x-request-timeout-ms": "1"}) as stream,
     ):
         for version in (2, 3, 1):

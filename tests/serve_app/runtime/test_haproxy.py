@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,15 @@ def test_free_ports_are_free() -> None:
         server.listen()
         assert not haproxy.is_free("127.0.0.1", port)
     assert len(set(haproxy.free_ports(5))) == 5
+
+
+def test_servers_that_start_at_the_same_time_do_not_draw_the_same_ports(directories: Path) -> None:
+    drawn: list[str] = []
+    with ExitStack() as servers:
+        for _ in range(5):
+            variables = haproxy.environment(servers.enter_context(haproxy.private_directory()))
+            drawn += [value for name, value in variables.items() if "PORT" in name and value.isdigit()]
+    assert len(drawn) == len(set(drawn)) == 5 * 6
 
 
 def test_missing_free_ports_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:

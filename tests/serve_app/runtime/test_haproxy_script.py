@@ -127,7 +127,7 @@ def test_the_last_known_replicas_are_kept_while_the_controller_finds_them_again(
     assert sorted(servers_after("")) == [head, "one", "two"], "however often it is announced"
     assert servers_after(REPLICAS.replace("two", "three")) == ["one", "three", head], "one is replaced"
     assert sorted(servers_after("")) == [head, "one", "three"]
-    until(lambda: not processes_of(tmp_path), 10)  # no stand-in waits for the end of an HAProxy that has ended
+    until(lambda: not processes_of(tmp_path))  # no stand-in waits for the end of an HAProxy that has ended
 
 
 PROXY = """defaults
