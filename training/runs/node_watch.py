@@ -11,10 +11,11 @@ from typing import Any
 from ray import tune
 from ray.exceptions import RpcError
 
+from league.config.training import TrainingSettings
 from league.errors import ConfigError
 from league.ray_cluster import draining_nodes, node_resources
 from training.rllib_compat import NotPickled
-from training.runs.tune import cpu_share
+from training.runs.tune import cpu_share, requested_gpus
 
 NODE_POLL = 1.0
 """Seconds."""
@@ -23,15 +24,15 @@ NODE_POLL = 1.0
 class NodeWatch(NotPickled, tune.Callback):
     """Watches during one attempt.
 
-    runners, share: the number of runners; the CPUs of each of them and of the learner. say: prints a line.
-    request_move: asks the trial to save and end; `reason` then says why.
+    share: CPUs of the learner and of each runner. say: prints a line. request_move: asks the trial to save and end;
+    `reason` then says why.
     """
 
     def __init__(
-        self, runners: int, share: float, say: Callable[[str], None], request_move: Callable[[], None]
+        self, settings: TrainingSettings, share: float, say: Callable[[str], None], request_move: Callable[[], None]
     ) -> None:
         self.reason: str | None = None
-        self._runners, self._share = runners, share
+        self._runners, self._share, self._gpus = settings.runners, share, requested_gpus(settings)
         self._say, self._request_move = say, request_move
         self._nodes: frozenset[str] = frozenset()
         self._shown = ""
@@ -51,9 +52,12 @@ class NodeWatch(NotPickled, tune.Callback):
             return
 
     def _look(self) -> None:
-        cpus = [node["CPU"] for node in node_resources() if node.get("CPU")]
-        used = self._share * (1 + self._runners)
-        shown = f"Training on {len(self._nodes)} of {len(cpus)} nodes, {used:g} of {sum(cpus):g} CPUs."
+        nodes = [node for node in node_resources() if node.get("CPU")]
+        cpus, gpus = (sum(node.get(name, 0.0) for node in nodes) for name in ("CPU", "GPU"))
+        used = f"{self._share * (1 + self._runners):g} of {cpus:g} CPUs"
+        if self._gpus:
+            used += f", {self._gpus:g} of {gpus:g} GPUs"
+        shown = f"Training on {len(self._nodes)} of {len(nodes)} nodes, {used}."
         if self.reason is None and (reason := self._reason_to_move()) is not None:
             self.reason = reason
             self._request_move()

@@ -291,7 +291,7 @@ def _tune(
         plan.stop_file.touch()
         progress.say("Ending after this update, then publishing. Press Ctrl-C again to end immediately.")
 
-    watch = NodeWatch(config.training.runners, share, progress.say, plan.stop_file.touch)
+    watch = NodeWatch(config.training, share, progress.say, plan.stop_file.touch)
     tuner = tune.Tuner(
         tune.with_resources(Trial, placement(config.training, share)),
         param_space={

@@ -44,7 +44,7 @@ def placement(settings: TrainingSettings, cpus: float) -> tune.PlacementGroupFac
     nodes.
     """
     learner = settings.gpus + (settings.runner_gpus if settings.runners == 0 else 0)
-    requested = learner + settings.runners * settings.runner_gpus
+    requested = requested_gpus(settings)
     available = sum(node.get("GPU", 0.0) for node in node_resources())
     if requested > available and not has_autoscaler():
         raise ConfigError(
@@ -54,6 +54,11 @@ def placement(settings: TrainingSettings, cpus: float) -> tune.PlacementGroupFac
     if not has_autoscaler():
         _check_nodes(first, runner, settings.runners)
     return tune.PlacementGroupFactory([first] + [runner] * settings.runners)
+
+
+def requested_gpus(settings: TrainingSettings) -> float:
+    """Return the GPUs of the learner and of all runners."""
+    return settings.gpus + max(settings.runners, 1) * settings.runner_gpus
 
 
 def _check_nodes(learner: Mapping[str, float], runner: Mapping[str, float], runners: int) -> None:

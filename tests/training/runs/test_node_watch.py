@@ -5,18 +5,22 @@ import ray
 from ray.exceptions import RpcError
 
 from league import ray_cluster
+from league.config.ppo import PPOConfig
 from training.runs import node_watch, tune
 from training.runs.node_watch import NodeWatch
 
 
 class Nodes:
-    """A cluster whose nodes are named by letters, with two CPUs each but for the head, and a run with two runners."""
+    """A cluster whose nodes are named by letters, with two CPUs and a GPU each but for the head.
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    The run has two runners.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float, gpus: float = 0.0) -> None:
         self.alive, self.draining = "ab", set[str]()
         self.said: list[str] = []
         self.moves = 0
-        self.watch = NodeWatch(2, share, self.said.append, self._move)
+        self.watch = NodeWatch(PPOConfig(runners=2, gpus=gpus), share, self.said.append, self._move)
         monkeypatch.setattr(ray, "nodes", self._nodes)
         monkeypatch.setattr(ray_cluster, "draining_nodes", lambda: self.draining)
         monkeypatch.setattr(node_watch, "draining_nodes", lambda: self.draining)
@@ -25,7 +29,7 @@ class Nodes:
 
     def _nodes(self) -> list[dict[str, object]]:
         head = {"NodeID": "head", "Alive": True, "Resources": {"memory": 1.0}}
-        return [head, *({"NodeID": name, "Alive": True, "Resources": {"CPU": 2.0}} for name in self.alive)]
+        return [head, *({"NodeID": name, "Alive": True, "Resources": {"CPU": 2.0, "GPU": 1.0}} for name in self.alive)]
 
     def _move(self) -> None:
         self.moves += 1
@@ -48,6 +52,12 @@ def test_the_nodes_are_shown_as_they_change(monkeypatch: pytest.MonkeyPatch) -> 
     nodes.look()
     assert nodes.said == ["Training on 2 of 2 nodes, 3 of 4 CPUs.", "Training on 2 of 3 nodes, 3 of 6 CPUs."]
     assert (nodes.moves, nodes.watch.reason) == (0, None)
+
+
+def test_the_gpus_of_a_run_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = Nodes(monkeypatch, share=1.0, gpus=1.5)
+    nodes.run_on("ab")
+    assert nodes.said == ["Training on 2 of 2 nodes, 3 of 4 CPUs, 1.5 of 2 GPUs."]
 
 
 def test_a_run_leaves_a_node_that_is_drained(monkeypatch: pytest.MonkeyPatch) -> None:
