@@ -31,7 +31,7 @@ import yaml
 from benchmarks.exploitability import MEASUREMENTS
 from benchmarks.training.learned import report_target
 from cli.output import difference
-from configs import find
+from configs.bundled import find
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
 from evaluation.statistics.payoff import paired_difference, score_interval

@@ -10,7 +10,7 @@ from rich.rule import Rule
 
 from cli.options import DEFAULT_URL, open_registry
 from cli.output import console, say
-from configs import find
+from configs.bundled import find
 from league.settings import Storage
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from packaging.utils import canonicalize_name
 
-from configs import names
+from configs.bundled import names
 from league.settings import Storage
 from serve_app.observability.prometheus import METRICS
 from serve_app.runtime import haproxy_script
@@ -338,7 +338,7 @@ def test_the_job_without_training_runs_leagues_that_the_image_of_the_server_can_
         import sys
         for name in {sorted(ONLY_IN_TRAINER)}:
             sys.modules[name] = None  # imports of it fail
-        from configs import find
+        from configs.bundled import find
         from league.config.league import LeagueConfig
         from league.environments.building import interface
         from league.policies.loading import configured_contestants

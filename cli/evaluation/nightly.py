@@ -11,7 +11,7 @@ import typer
 from cli.interrupt import exit_on_interrupt
 from cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
 from cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
-from configs import find, names
+from configs.bundled import find, names
 from league.errors import (
     AlreadyRunning,
     ConfigError,

@@ -7,7 +7,7 @@ import typer
 
 from cli.options import AsJson, Config, open_registry
 from cli.output import emit, say, table
-from configs import find
+from configs.bundled import find
 
 if TYPE_CHECKING:
     from league.config.league import LeagueConfig

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from configs import find
+from configs.bundled import find
 
 if TYPE_CHECKING:
     from league.config.league import LeagueConfig

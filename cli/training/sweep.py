@@ -20,7 +20,7 @@ from cli.training.options import (
     load_config,
     without_none,
 )
-from configs import find
+from configs.bundled import find
 
 if TYPE_CHECKING:
     from training.sweeps.sweep import SweepReport

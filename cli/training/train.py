@@ -23,7 +23,7 @@ from cli.training.options import (
     load_config,
     without_none,
 )
-from configs import find
+from configs.bundled import find
 from league.errors import ConfigError
 from league.refs import CheckpointRef, of_league
 

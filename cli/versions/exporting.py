@@ -25,7 +25,7 @@ def export(
     from league.registry.storage.exports import export_version
 
     registry = open_registry()
-    version = registry.versions.resolve(CheckpointRef.parse(ref))
+    version = registry.versions.with_files(CheckpointRef.parse(ref))
     require_one_policy(version)
     target = directory or Path(f"{version.league}-{version.number}")
     for file in export_version(version, registry.artifacts, target):

@@ -40,6 +40,7 @@ from evaluation.schedules.tournament_plan import (
 )
 from evaluation.statistics.payoff import cross_play_table, tabulate
 from evaluation.statistics.population import population
+from league.environments import building
 from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
 from league.policies.loading import baselines, check_anchors, check_eligible, check_plays, eligible, pinned
 from league.ray_cluster import (
@@ -191,10 +192,10 @@ def evaluate(
     Raises:
         InvalidInput: Options that do not fit together.
         ConfigError: A version among the anchors of the league does not exist or cannot play.
-        LeagueError: UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch, and the errors of
-            `play_schedule`.
+        LeagueError: UnknownLeague, InterfaceChanged, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch,
+            and the errors of `play_schedule`.
     """
-    row = registry.leagues.follow_code(league)
+    row = registry.leagues.follow_code(league, building.interface)
     _check_options(schedule, against, budget)
     check_anchors(row.config, registry)
     requested = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]

@@ -11,6 +11,7 @@ import numpy as np
 from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.single_game import GameStep, play_game, policy_output
 from league.config.league import LeagueConfig
+from league.environments import building
 from league.environments.stepping import BatchedEnvironment
 from league.errors import (
     EnvironmentMismatch,
@@ -167,7 +168,8 @@ def live_game(refs: Sequence[str], registry: Registry, side: str | None = None, 
         )
     row = registry.leagues.get(versions[0].league)
     names = [acting_ref(pinned(ref, row.slug, registry), registry, f"game {seed}") for ref in refs]
-    players = {ref: contestant(ref, registry, row.interface) for ref in names}
+    current = building.interface(row.config)  # may have changed since the league was registered
+    players = {ref: contestant(ref, registry, current) for ref in names}
     controllers = _controllers(names, row.interface, side)
     policies = {agent: players[ref][agent][1] for agent, ref in controllers.items()}
     return GameSource(

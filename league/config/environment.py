@@ -1,13 +1,11 @@
 """The `environment` section, which each manifest repeats."""
 
 from importlib.metadata import version
-from types import ModuleType
 from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
 from league.config.base import JSON, Part
-from league.entry_points import import_module
 from league.environment_code import environment_code
 from league.interface import digest
 
@@ -74,10 +72,6 @@ class EnvironmentConfig(Part):
     def folder(self) -> str | None:
         """The folder in which entry points are searched first: that of the league."""
         return self._folder
-
-    def import_module(self) -> ModuleType:
-        """Import the module of the entry point. Raises ConfigError if it cannot be imported."""
-        return import_module("environment.entry_point", self.resolved_entry_point.partition(":")[0], self.folder)
 
     def code(self) -> JSON:
         """Return what identifies the environment's code: revision or source digest, and the versions of libraries."""

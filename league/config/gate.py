@@ -124,7 +124,10 @@ class GateConfig(Part):
                 f" got {self.return0:g} and {self.return1:g}"
             )
         if margin >= self.return_bound:
-            raise ValueError(f"margin must be smaller than return_bound ({self.return_bound:g}), got {margin:g}")
+            raise ValueError(
+                f"margin, which is a return with model: returns, must be smaller than return_bound"
+                f" ({self.return_bound:g}), got {margin:g}"
+            )
 
     @model_validator(mode="after")
     def _margins_are_possible(self) -> Self:

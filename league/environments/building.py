@@ -22,7 +22,7 @@ from league.conditions import hides_information
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
-from league.entry_points import import_entry_point, missing
+from league.entry_points import import_entry_point, import_module, missing
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
@@ -199,7 +199,7 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
 
 def _constructor(config: EnvironmentConfig) -> Any:
     module_name, colon, function = config.resolved_entry_point.partition(":")
-    module = config.import_module()
+    module = import_module("environment.entry_point", module_name, config.folder)
     if colon:
         name = function
     elif config.api == "aec" or (config.api is None and not hasattr(module, "parallel_env")):

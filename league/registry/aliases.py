@@ -169,7 +169,12 @@ def _roll_back(
     _require(last, league, alias, expected)
     beneath = session.get(AliasEventTable, last.beneath) if last and last.beneath else None
     if beneath is None:
-        was = f"has had no version before {league}@{last.version}" if last else "was never set"
+        if last is not None:
+            was = f"has had no version before {league}@{last.version}, or none since another champion was removed"
+        elif session.scalar(select(AliasEventTable.id).filter_by(league=league, alias=alias).limit(1)):
+            was = "is not set, since the version that it named was removed: promote another one"
+        else:
+            was = "was never set"
         raise NothingToRollBack(f"alias {alias} of league {league} {was}")
     event = AliasEventTable(
         kind="rollback",

@@ -17,6 +17,8 @@ from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, re
 from league.registry.storage.tables import READY, EarlierGameTable, LeagueTable, MatchTable, VersionTable
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from league.config.league import LeagueConfig
 
 
@@ -82,16 +84,16 @@ class LeagueRepository(Repository):
             row = session.get(LeagueTable, league) or _unknown(session, league)
             return [detached(EarlierGameRow, each) for each in session.scalars(query) if each.digest != row.game_digest]
 
-    def follow_code(self, league: str) -> LeagueRow:
+    def follow_code(self, league: str, describe: "Callable[[LeagueConfig], Interface]") -> LeagueRow:
         """Return one league, registered again if the code of its environment has changed.
 
-        Raises UnknownLeague, or ConfigError if the environment cannot be imported.
+        describe: creates the environment and returns its interface. Raises UnknownLeague, InterfaceChanged, and the
+        errors of `describe`; then nothing is changed.
         """
         row = self.get(league)
         if row.config.game_digest() == row.game_digest:
             return row
-        row.config.environment.import_module()  # What cannot be imported has no code, which is not another game.
-        self.register(row.config, row.interface)
+        self.register(row.config, describe(row.config))
         return self.get(league)
 
     def archive(self, league: str, undo: bool = False) -> LeagueRow:

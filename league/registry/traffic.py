@@ -119,18 +119,32 @@ def _set(
     reason: str,
 ) -> Traffic:
     now = current_setting(session, league)
-    wanted = tuple(
-        before if portion is KEEP else portion for portion, before in ((canary, now.canary), (shadow, now.shadow))
+    wanted = (
+        now.canary if isinstance(canary, Unchanged) else canary,
+        now.shadow if isinstance(shadow, Unchanged) else shadow,
     )
-    for portion in wanted:
+    for portion in (canary, shadow):
         if isinstance(portion, Portion):
             _check(session, league, portion)
     if now.id is not None and wanted == (now.canary, now.shadow):
         return now
     change_counter.count(session, "traffic")
+    return _record(session, league, *wanted, actor=actor, reason=reason)
+
+
+def end(session: Session, league: str, portions: Collection[str], *, actor: str, reason: str) -> None:
+    """End the canary, the shadow, or both, in a transaction that has counted it."""
+    now = current_setting(session, league)
+    kept = (None if name in portions else getattr(now, name) for name in ("canary", "shadow"))
+    _record(session, league, *kept, actor=actor, reason=reason)
+
+
+def _record(
+    session: Session, league: str, canary: Portion | None, shadow: Portion | None, *, actor: str, reason: str
+) -> Traffic:
     event = TrafficEventTable(league=league, actor=actor, reason=reason, at=datetime.now(UTC))
     (event.canary, event.canary_share), (event.shadow, event.shadow_share) = (
-        (str(portion.version), portion.share) if isinstance(portion, Portion) else (None, None) for portion in wanted
+        (None, None) if portion is None else (str(portion.version), portion.share) for portion in (canary, shadow)
     )
     session.add(event)
     session.flush()

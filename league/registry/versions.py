@@ -14,7 +14,7 @@ from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
 from league.registry.storage.manifest import EXPLOITER, MIXTURE, TRAINING, Manifest
 from league.registry.storage.mixture import Mixture
-from league.registry.storage.rows import Note, VersionRow, detached
+from league.registry.storage.rows import Note, VersionRow, VersionState, detached
 from league.registry.storage.tables import READY, AliasTable, VersionNoteTable, VersionTable
 
 MAX_NOTE_LENGTH = 2000
@@ -32,6 +32,13 @@ class VersionRepository(Repository):
         """Return one version. Raises UnknownLeague or UnknownVersion."""
         with self._database.read() as session:
             return _get(session, league, number)
+
+    def with_files(self, ref: CheckpointRef) -> VersionRow:
+        """Return the version that a reference names now. Raises VersionRetired, and what `resolve` raises."""
+        with self._database.read() as session:
+            version = resolve(session, ref)
+            require_files(session, version.league, version.number)
+            return version
 
     def resolve(self, ref: CheckpointRef | str) -> VersionRow:
         """Return the version that a reference names now.
@@ -89,6 +96,15 @@ class VersionRepository(Repository):
             for name, number in session.execute(query if league is None else query.filter_by(league=league)):
                 found.setdefault(name, []).append(number)
         return found
+
+    def states(self, keys: Collection[tuple[str, int]]) -> dict[tuple[str, int], VersionState | None]:
+        """Return (league, number) → the state of a version, None if it was removed."""
+        table = VersionTable
+        query = select(table.league, table.number, table.sha256, table.retired_at.is_not(None))
+        query = query.where(table.state == READY, table.league.in_({league for league, _ in keys}))
+        query = query.where(table.number.in_({number for _, number in keys}))
+        found = {(league, number): VersionState(*state) for league, number, *state in self._database.rows(query)}
+        return {key: found.get(key) for key in keys}
 
     def mixtures(self, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
         """Return the mixtures among some versions, by one cheap query."""

@@ -6,12 +6,14 @@ alias moves → load in a thread (verify, load, warm up) → swap → the old ve
 
 import asyncio
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
 from league.errors import LeagueError
 from league.refs import CHAMPION
-from serve_app.models.version_cache import LoadedVersion, VersionCache
+from league.registry.storage.rows import VersionState
+from serve_app.models.version_cache import LoadedVersion, VersionCache, VersionKey
 from serve_app.runtime.ray_serve import logger
 
 Alias = tuple[str, str]
@@ -33,6 +35,8 @@ class AliasSlots:
         self._versions = versions
         self._slots: dict[Alias, LoadedVersion] = {}
         self._wanted: dict[Alias, int] = {}
+        self._known: set[Alias] = set()
+        """All aliases since the start."""
         self._faults: dict[Alias, str] = {}
         self._swaps: dict[Alias, _Swap] = {}
         self.swaps: Counter[str] = Counter()
@@ -41,6 +45,10 @@ class AliasSlots:
     def get(self, league: str, alias: str) -> LoadedVersion | None:
         """The version that answers for an alias."""
         return self._slots.get((league, alias))
+
+    def was_removed(self, league: str, alias: str) -> bool:
+        """Whether an alias does not exist any more. One that was not read yet was not removed."""
+        return (league, alias) in self._known and (league, alias) not in self._wanted
 
     def leagues(self) -> list[str]:
         """The leagues that have an alias."""
@@ -76,11 +84,24 @@ class AliasSlots:
             found.setdefault(league, []).append(f"{alias}: {fault}")
         return {league: "; ".join(faults) for league, faults in found.items()}
 
+    def loaded(self) -> set[VersionKey]:
+        """The versions in memory."""
+        return {(version.league, version.number) for version in self._slots.values()} | self._versions.cached_keys()
+
+    def drop_changed(self, states: Mapping[VersionKey, VersionState | None]) -> None:
+        """Stop serving versions that were removed, or replaced by others with the same numbers."""
+        self._versions.drop_changed(states)
+        for alias, version in list(self._slots.items()):
+            key = version.league, version.number
+            if key in states and ((state := states[key]) is None or state.sha256 != version.sha256):
+                del self._slots[alias]
+
     def update(self, wanted: dict[Alias, int]) -> None:
         """Start to load the version that each alias names now, unless it is served. Each alias has its own load, which
         a later update replaces if the alias names another version by then.
         """
         self._wanted = wanted
+        self._known |= wanted.keys()
         for gone in self._slots.keys() - wanted.keys():
             del self._slots[gone]
         for gone in self._faults.keys() - wanted.keys():

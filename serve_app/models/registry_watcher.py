@@ -8,7 +8,7 @@ otherwise by polling.
 import asyncio
 import random
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Set
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 
@@ -16,13 +16,14 @@ from league.conditions import ActionSelection
 from league.errors import LeagueError, StorageError
 from league.registry.registry import Registry
 from league.registry.replicas import KEPT
-from league.registry.storage.rows import AliasTarget, ChangeCounts, KeyRow, ReadPosition, ServedState
+from league.registry.storage.rows import AliasTarget, ChangeCounts, KeyRow, ReadPosition, ServedState, VersionState
 from league.registry.storage.rows import Traffic as Setting
 from serve_app.models.action_selections import ActionSelections
 from serve_app.models.alias_slots import Alias, AliasSlots
 from serve_app.models.polling import JITTER, Polling
 from serve_app.models.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
 from serve_app.models.traffic_split import TrafficSplit, pinned_slots
+from serve_app.models.version_cache import VersionKey
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.replica_process import ReplicaProcess
 from serve_app.settings import ServeSettings
@@ -46,6 +47,8 @@ class _Read:
     traffic: Mapping[str, Setting] | None
     keys: list[KeyRow] | None
     selections: Mapping[str, ActionSelection] | None
+    versions: Mapping[VersionKey, VersionState | None] | None
+    """The versions in memory: they may have been removed."""
 
 
 @dataclass(slots=True)
@@ -130,8 +133,11 @@ class RegistryWatcher:
         if time.monotonic() >= self._heartbeat_at:
             # Before the aliases are read for the first time: nobody waits for a replica that is not registered.
             await self._register()
-        read = await self._connection.call(self._read)
+        loaded = self._slots.loaded()
+        read = await self._connection.call(lambda registry: self._read(registry, loaded))
         self._accept(read)
+        if read.versions is not None:
+            self._slots.drop_changed(read.versions)
         if read.aliases is not None or read.traffic is not None or self._slots.differing():
             wanted = {alias: target.version for alias, target in self._aliases.items()}
             self._slots.update(wanted | pinned_slots(self._wanted_traffic))
@@ -170,7 +176,7 @@ class RegistryWatcher:
         self._on_heartbeat()
         return is_known, replicas.registered - replicas.draining
 
-    def _read(self, registry: Registry) -> _Read:
+    def _read(self, registry: Registry, loaded: Set[VersionKey]) -> _Read:
         """Read the parts that have changed, or all through a new connection: it may be a different database."""
         self._connection.discard_notifications()
         counts, connection = registry.changes.counts(), self._connection.opened
@@ -184,6 +190,7 @@ class RegistryWatcher:
             registry.traffic.all() if known is None or known.traffic != counts.traffic else None,
             registry.keys.all() if known is None or known.keys != counts.keys else None,
             registry.leagues.action_selections() if known is None or known.leagues != counts.leagues else None,
+            registry.versions.states(loaded) if known is None or known.leagues != counts.leagues else None,
         )
 
     def _accept(self, read: _Read) -> None:

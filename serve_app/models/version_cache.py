@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from league.policies.probes import Probes
 from league.registry.registry import Registry
 from league.registry.storage.manifest import PolicyManifest
 from league.registry.storage.mixture import Mixture
+from league.registry.storage.rows import VersionState
 from league.spaces import Box, Leaf
 from serve_app.codecs.observation_codec import ObservationReader
 from serve_app.codecs.request_limits import RequestLimits
@@ -193,6 +194,13 @@ class VersionCache:
         if (version := self._loaded.get((league, number))) is not None:
             self._loaded.move_to_end((league, number))
         return version
+
+    def drop_changed(self, states: Mapping[VersionKey, VersionState | None]) -> None:
+        """Forget versions that were removed, retired, or replaced by others with the same numbers."""
+        for key, state in states.items():
+            version = self._loaded.get(key)
+            if version is not None and (state is None or state.is_retired or state.sha256 != version.sha256):
+                del self._loaded[key]
 
     def cached_keys(self) -> Set[VersionKey]:
         """The versions in memory, without marking them as used."""

@@ -102,6 +102,16 @@ def test_an_unreachable_server_is_reported_in_one_line(
     assert "http://127.0.0.1:9" in result.err
 
 
+@pytest.mark.parametrize("folder", ["configs", "training", "evaluation", "league"])
+def test_a_folder_with_the_name_of_a_package_does_no_harm(
+    league_process: League, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    (tmp_path / folder).mkdir()
+    monkeypatch.chdir(tmp_path)
+    result = league_process("train", "--help")
+    assert (result.code, result.err) == (0, "")
+
+
 @pytest.mark.parametrize("name", sorted(SUBCOMMANDS))
 def test_the_listed_help_of_a_command_is_the_first_paragraph_of_its_help(name: str) -> None:
     own = COMMANDS[name].help.partition("\n\n")[0]

@@ -130,6 +130,8 @@ class LeagueOpponents:
             self._unpublished[checkpoint] = dict(self._scores)
         self._payoff = payoff_matrix(self.candidates, results, self._rows)
         if parent is not None:
+            # The priors contain what the run of the parent has found.
+            self._episodes, self._all_episodes, self._scores = {}, 0.0, {}
             known = tuple(dict.fromkeys((f"{self._league.league}@{parent}", *self.candidates)))
             self._priors = dict(zip(known, payoff_matrix(known, results, self._rows)[0].tolist(), strict=True))
 

@@ -1,10 +1,11 @@
 """Scores the learner's games against its opponents by the rule of the league's matches.
 
 `league.results.scoring` defines the rule. If sides are symmetric, the learner's return is compared with the opponent's
-in each game. If they are not, two games with the learner on either side form a block, and returns on the same side are
-compared; a game waits for its partner until the episodes are reset. Unlike those of a match, the games of such a block
-have different seeds. If there are more than two such sides, games are not scored: the learner never has all sides but
-one.
+in each game. The opponent has all other sides: if there are several, the score is the mean over them, so that equal
+policies score ½ on average, as in the two games of a block. If sides are not symmetric, two games with the learner on
+either side form a block, and returns on the same side are compared; a game waits for its partner until the episodes are
+reset. Unlike those of a match, the games of such a block have different seeds. If there are more than two such sides,
+games are not scored: the learner never has all sides but one.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,9 @@ class OpponentResults:
 
 @dataclass(frozen=True, slots=True)
 class OpposedGames:
-    """m finished games: the opponent's number, the learner's side, and the returns of both, each (m,)."""
+    """m finished games: the opponent's number, the learner's side and its return, each (m,), and the returns of the
+    opponent's sides, (m, others).
+    """
 
     opponents: Indices
     sides: Indices
@@ -59,15 +62,16 @@ class OpposedGames:
 
     def scores(self) -> NDArray[np.float64]:
         """Return the learner's score in each game, (m,)."""
-        return np.where(self.own > self.other, 1.0, np.where(self.own == self.other, 0.5, 0.0))
+        own = self.own[:, np.newaxis]
+        return np.where(own > self.other, 1.0, np.where(own == self.other, 0.5, 0.0)).mean(axis=1)
 
 
-NO_GAMES = OpposedGames(NO_ROWS, NO_ROWS, np.zeros(0), np.zeros(0))
+def _no_games(others: int) -> OpposedGames:
+    return OpposedGames(NO_ROWS, NO_ROWS, np.zeros(0), np.zeros((0, others)))
 
 
 def _concatenated(games: Sequence[OpposedGames]) -> OpposedGames:
-    columns = (np.concatenate([getattr(each, name) for each in [NO_GAMES, *games]]) for name in OpposedGames.__slots__)
-    return OpposedGames(*columns)
+    return OpposedGames(*(np.concatenate([getattr(each, name) for each in games]) for name in OpposedGames.__slots__))
 
 
 def is_scored(scoring: Scoring, sides: int) -> bool:
@@ -88,7 +92,8 @@ class OpponentScores:
         self._sides = np.zeros(num_envs, np.int64)
         self._next_opponents, self._next_sides = self.opponents.copy(), self._sides.copy()
         self._episodes: list[Indices] = []
-        self._finished: list[OpposedGames] = []
+        self._no_games = _no_games(max(len(sides) - 1, 1))
+        self._finished = [self._no_games]
 
     def begin(self, envs: Indices, opponents: Indices, sides: Indices) -> None:
         """Episodes start, before the Turn that reports the end of the previous ones.
@@ -117,7 +122,7 @@ class OpponentScores:
 
     def take(self, opponents: int) -> OpponentResults:
         """Return the results since the last call. opponents: the number of all opponents."""
-        games, waiting = _concatenated(self._finished), NO_GAMES
+        games, waiting = _concatenated(self._finished), self._no_games
         if self._scoring == "side":
             games, waiting = games.blocks()
         numbers = np.concatenate([NO_ROWS, *self._episodes])
@@ -135,5 +140,5 @@ class OpponentScores:
             [np.sort(self._returns[envs][:, members], axis=1).mean(axis=1) for members in self._members], axis=1
         )
         is_own = np.arange(len(self._members)) == sides[:, np.newaxis]
-        others = np.sort(of_sides[~is_own].reshape(len(envs), -1), axis=1)
-        return OpposedGames(self.opponents[envs], sides, of_sides[is_own], others.mean(axis=1))
+        others = of_sides[~is_own].reshape(len(envs), -1)
+        return OpposedGames(self.opponents[envs], sides, of_sides[is_own], others)

@@ -88,6 +88,8 @@ class _Dependents:
     """Schedules of the verdicts, which are deleted as a whole."""
     played: set[str] = field(default_factory=set)
     """Other schedules in which the version takes part. Their matches between others stay."""
+    portions: list[str] = field(default_factory=list)
+    """`canary` or `shadow`, or both."""
     reasons: list[str] = field(default_factory=list)
 
 
@@ -134,10 +136,10 @@ class RemovalRepository(Repository):
         ]
         return RemovalPlan(league, sizes, aliases, verdicts, matches, run_ids, tuple(reasons))
 
-    def remove_version(self, ref: CheckpointRef, *, force: bool = False) -> RemovalPlan:
-        """Remove a version. Its number is never reused. Returns what was removed.
+    def remove_version(self, ref: CheckpointRef, *, force: bool = False, actor: str = "remove") -> RemovalPlan:
+        """Remove a version. Its number is never reused, except if its league is removed. Returns what was removed.
 
-        force: also remove what depends on it.
+        force: also remove what depends on it. actor: who ends its canary or shadow.
 
         Raises:
             UnknownLeague: The league does not exist.
@@ -156,7 +158,7 @@ class RemovalRepository(Repository):
             _require_no_member(session, target.league, target.version)
             found = _dependents_of_version(session, target.league, target.version)
             _require_free(plan.target, found.reasons, force)
-            _delete_dependents(session, target.league, target.version, found)
+            _delete_dependents(session, target.league, target.version, found, actor)
         self._publisher.sweep(target.league)
         return plan
 
@@ -176,8 +178,8 @@ class RemovalRepository(Repository):
             _require_idle(session, league)
             _require_free(league, plan.reasons, force)
             row.archived_at = row.archived_at or datetime.now(UTC)
-            change_counter.count(session, "aliases")
-            change_counter.count(session, "traffic")
+            for subject in ("aliases", "traffic", "leagues"):
+                change_counter.count(session, subject)
             _delete_calls(session, league)
             for table in reversed(Base.metadata.sorted_tables):
                 if "league" in table.columns and table.name != VersionTable.__tablename__:
@@ -221,9 +223,10 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     setting = traffic.current_setting(session, league)
     portions = {"canary": setting.canary, "shadow": setting.shadow}
     names = {number, *found.aliases}
+    found.portions = [name for name, portion in portions.items() if portion and portion.version in names]
     found.reasons = [
         *(f"the alias {name} points to it" for name in found.aliases),
-        *(f"it is the {name}" for name, portion in portions.items() if portion and portion.version in names),
+        *(f"it is the {name}" for name in found.portions),
         *(f"it is a member of the mixture @{each}" for each in _mixtures_of(session, league, number)),
         *_counted(len(found.verdicts), "verdict", map(short_verdict, found.verdicts)),
         *_counted(matches, "recorded match", plural="recorded matches"),
@@ -235,11 +238,15 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     return found
 
 
-def _delete_dependents(session: Session, league: str, number: int, found: _Dependents) -> None:
+def _delete_dependents(session: Session, league: str, number: int, found: _Dependents, actor: str) -> None:
     """Delete what depends on a version, and abandon it. Children and runs keep their weights and lose their parent."""
+    change_counter.count(session, "aliases")
+    change_counter.count(session, "leagues")
+    if found.portions:
+        change_counter.count(session, "traffic")
+        traffic.end(session, league, found.portions, actor=actor, reason=f"{league}@{number} was removed")
     gone = set(session.scalars(select(AliasEventTable.id).filter_by(league=league, version=number)))
     session.execute(delete(IdempotentCallTable).where(IdempotentCallTable.event.in_(gone)))
-    change_counter.count(session, "aliases")
     session.execute(delete(AliasTable).filter_by(league=league, version=number))
     _relink(session, league, gone)
     session.execute(delete(AliasEventTable).where(AliasEventTable.id.in_(gone)))

@@ -20,6 +20,7 @@ from sqlalchemy.orm import Session
 from league.errors import InvalidReference
 from league.refs import CheckpointRef, parse_ref
 from league.registry import leagues, traffic, versions
+from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
 from league.registry.storage.manifest import MIXTURE
@@ -80,6 +81,8 @@ class RetentionRepository(Repository):
         with self._database.write() as session:
             leagues.lock(session, league)
             retired, untrained = _candidates(session, league, keep, before)
+            if retired:
+                change_counter.count(session, "leagues")
             for number in retired:
                 row = session.get_one(VersionTable, (league, number))
                 row.retired_at = row.retired_at or datetime.now(UTC)

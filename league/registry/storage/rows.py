@@ -178,7 +178,7 @@ class ChangeCounts(NamedTuple):
     traffic: int
     keys: int
     leagues: int
-    """Leagues that were registered, or whose versions select actions in another way since."""
+    """Leagues that were registered, or whose versions select actions in another way since, and removals of files."""
 
     @property
     def to_acknowledge(self) -> int:
@@ -207,6 +207,14 @@ class ServedState:
     aliases: Mapping[str, int] = field(default_factory=dict)
     event: int | None = None
     traffic: int | None = None
+
+
+class VersionState(NamedTuple):
+    """What a published version is now."""
+
+    sha256: str
+    """Digest of its manifest."""
+    is_retired: bool
 
 
 class AliasTarget(NamedTuple):

@@ -63,6 +63,9 @@ def test_versions_and_logs_are_removed_once(league: League, old: Registry, log: 
     assert current.exists()
     assert "retired" in league("versions", tictactoe.LEAGUE).out
     assert league("retire", "--keep=1", "--yes").out == "There is nothing to remove.\n"
+    result = league("export", f"{tictactoe.LEAGUE}@2")
+    assert result.code != 0
+    assert "tictactoe@2 was retired and its files were removed" in result.err
 
 
 @pytest.mark.usefixtures("old")

@@ -10,10 +10,13 @@ from evaluation.matches.tournament import evaluate
 from evaluation.playback.replay import GameSource, live_game, recorded_game
 from evaluation.playback.video import FrameComposer, show_window, write_video
 from league.config.league import LeagueConfig
+from league.environments import building
 from league.environments.building import interface
 from league.errors import ConfigError, EnvironmentMismatch, InvalidReference, NotFound, StorageError
+from league.interface import AgentInterface
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
+from league.spaces import Box, Discrete
 from tests.support.leagues import tictactoe
 
 SIMULTANEOUS = "tests.support.environments.simultaneous:meeting"
@@ -34,6 +37,15 @@ def register(registry: Registry, name: str, entry_point: str, **parts: Any) -> N
     league_interface = interface(config)
     registry.leagues.register(config, league_interface)
     tictactoe.publish(registry, tictactoe.linear(league_interface.of_policy("shared"), 1), name)
+
+
+def test_changed_spaces_are_named(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = registry.leagues.get("tictactoe")
+    other = AgentInterface(observation=Box(dtype="float32", shape=(3,), low=0, high=1), action=Discrete(n=9))
+    changed = row.interface.model_copy(update={"agents": dict.fromkeys(row.interface.agents, other)})
+    monkeypatch.setattr(building, "interface", lambda _: changed)
+    with pytest.raises(EnvironmentMismatch, match="the spaces or policies of tictactoe@2 differ from those of the env"):
+        live_game(["tictactoe@2"], registry)
 
 
 def read_video(path: Path) -> tuple[tuple[int, int], list[Image.Image], list[int]]:

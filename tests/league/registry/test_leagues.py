@@ -1,11 +1,10 @@
 import logging
-from pathlib import Path
 
 import pytest
 
 from league.config.league import LeagueConfig
-from league.environment_code import environment_code
-from league.errors import ConfigError, InterfaceChanged, LeagueArchived, UnknownLeague
+from league.errors import InterfaceChanged, LeagueArchived, UnknownLeague
+from league.interface import Interface
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
@@ -107,27 +106,27 @@ def test_the_action_selections_of_all_leagues_are_read(registry: Registry) -> No
     assert registry.leagues.action_selections() == {"another": "greedy", LEAGUE: "sampled"}
 
 
+def described(_: LeagueConfig) -> Interface:
+    return interface()
+
+
 def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     before = registry.leagues.get(LEAGUE)
-    assert registry.leagues.follow_code(LEAGUE) == before
+    assert registry.leagues.follow_code(LEAGUE, described) == before
     changed = config(revision="2").game()
     monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
-    after = registry.leagues.follow_code(LEAGUE)
+    after = registry.leagues.follow_code(LEAGUE, described)
     assert after.game_digest == config().game_digest() != before.game_digest
     assert after.config == before.config
 
 
-def test_code_that_cannot_be_imported_is_not_another_game(registry: Registry, tmp_path: Path) -> None:
-    module = tmp_path / "moved_game.py"
-    module.write_text("from pettingzoo.classic.tictactoe_v3 import env")
-    environment = {"entry_point": "moved_game:env"}
-    league = LeagueConfig.from_mapping({"league": LEAGUE, "environment": environment, "folder": str(tmp_path)})
-    registry.leagues.register(league, interface())
+def test_code_with_other_spaces_is_not_followed(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish(registry, "run/1")
     before = registry.leagues.get(LEAGUE)
-    module.unlink()
-    environment_code.cache_clear()
-    with pytest.raises(ConfigError, match=r"environment\.entry_point: cannot import 'moved_game'"):
-        registry.leagues.follow_code(LEAGUE)
+    changed = config(revision="2").game()
+    monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
+    with pytest.raises(InterfaceChanged):
+        registry.leagues.follow_code(LEAGUE, lambda config: interface(squares=10))
     assert registry.leagues.get(LEAGUE) == before
 
 

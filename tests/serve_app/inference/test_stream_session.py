@@ -13,6 +13,8 @@ from starlette.websockets import WebSocketDisconnect
 
 from league.errors import LeagueError, Overloaded
 from league.policies.onnx import OnnxPolicy
+from league.refs import CheckpointRef
+from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.settings import Storage
@@ -195,6 +197,20 @@ def test_a_following_stream_answers_with_the_current_version(client: TestClient,
             until(lambda version=version: answer_to(stream, observation=board)["version"] == version)
             actions, answered = binary(stream, encode_request(arrays([board]), 1))
             assert (answered, actions.tolist()) == (version, OnnxPolicy(expected[version]).act(batch).actions.tolist())
+
+
+def test_a_following_stream_reports_that_its_alias_was_removed(client: TestClient, registry: Registry) -> None:
+    registry.aliases.set("board", "beta", 3, expected=ANY, actor="test", reason="test")
+    with open_stream(client, query="?follow=beta") as stream, open_stream(client, query="?follow=champion") as other:
+        assert answer_to(stream, **BODY)["version"] == 3
+        until(lambda: "beta" in client.get("/v1/leagues/board").json()["replicas"][0]["aliases"])
+        registry.removal.remove_version(CheckpointRef("board", 3), force=True)
+        until(lambda: send(stream, BODY).get("code") == "unknown_alias")
+        assert answer_to(other, **BODY)["version"] == 1
+        registry.removal.remove_version(CheckpointRef("board", 1), force=True)
+        until(lambda: (error := send(other, BODY)).get("code") == "not_ready" and error["status"] == 503)
+        promote(registry, "board", 2)
+        until(lambda: send(other, BODY).get("version") == 2)
 
 
 def test_an_episode_keeps_its_version_in_a_following_stream(

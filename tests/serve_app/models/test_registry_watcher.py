@@ -5,7 +5,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -14,19 +14,22 @@ from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
 from league.errors import NotReady, StorageError
+from league.refs import CheckpointRef
 from league.registry.aliases import AliasRepository
 from league.registry.registry import Registry
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, clock
 from league.registry.storage.manifest import Manifest
-from league.registry.storage.rows import Acknowledgement, AliasTarget
+from league.registry.storage.rows import Acknowledgement, AliasTarget, Portion
 from league.registry.storage.tables import ReplicaTable
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.runtime.replica_process import this_process
 from tests.support.clients.actions import BOARD, act
 from tests.support.databases import on_both_databases
-from tests.support.leagues.served_leagues import promote
+from tests.support.leagues.served_leagues import BOARD as SPACES
+from tests.support.leagues.served_leagues import promote, publish, register
+from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.replicas import QUICK, local_client, replica
 from tests.support.waiting import until
 
@@ -64,6 +67,44 @@ def test_a_rollback_is_followed(client: TestClient, registry: Registry) -> None:
     registry.aliases.rollback("board", actor="test", reason="test")
     until(lambda: serves(registry, 1))
     assert act(client, observation=BOARD)["version"] == 1
+
+
+def test_a_version_of_a_league_that_was_removed_and_trained_again_is_served(
+    client: TestClient, registry: Registry
+) -> None:
+    """It has the number of an earlier one, which the replica has in memory."""
+    assert act(client, version=2, observation=BOARD)["sha256"] == registry.versions.get("board", 2).sha256
+    registry.removal.remove_league("board", force=True)
+    until(lambda: client.post("/v1/policies/board/action", json={"observation": BOARD}).status_code == 404)
+    register(registry, "board", {"shared": SPACES})
+    again = [publish(registry, "board", {"shared": masked_mlp(seed=seed)}, f"again/{seed}").sha256 for seed in (7, 8)]
+    promote(registry, "board", 1)
+    until(lambda: serves(registry, 1))
+    assert [act(client, version=version, observation=BOARD)["sha256"] for version in (1, 2)] == again
+    assert act(client, observation=BOARD)["sha256"] == again[0]
+
+
+def test_removed_and_retired_versions_in_memory_are_not_served(client: TestClient, registry: Registry) -> None:
+    def status(version: int) -> int:
+        return client.post(f"/v1/policies/board/action?version={version}", json={"observation": BOARD}).status_code
+
+    assert [status(version) for version in (1, 2, 3)] == [200, 200, 200]
+    registry.retention.retire("board", keep=1, before=datetime.now(UTC))
+    until(lambda: [status(version) for version in (1, 2, 3)] == [200, 410, 200])
+    registry.removal.remove_version(CheckpointRef("board", 3), force=True)
+    until(lambda: [status(version) for version in (1, 2, 3)] == [200, 410, 404])
+
+
+def test_the_canary_ends_when_its_version_is_removed(client: TestClient, registry: Registry) -> None:
+    def version() -> int:
+        reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers={"x-league-key": "p"})
+        return int(reply.json()["version"])
+
+    registry.traffic.set("board", canary=Portion(3, 1.0), actor="test", reason="test")
+    until(lambda: version() == 3)
+    registry.removal.remove_version(CheckpointRef("board", 3), force=True)
+    until(lambda: version() == 1)
+    until(lambda: (row := acknowledgement(registry)) and row.fault is None)
 
 
 @pytest.mark.usefixtures("client")

@@ -210,6 +210,21 @@ def test_the_prior_is_the_parents_score_in_the_league(registry: Registry, monkey
     assert opponents.score("tictactoe@2") == pytest.approx(0.5), "the parent itself"
 
 
+def test_a_run_from_a_version_counts_its_own_episodes(registry: Registry) -> None:
+    for number in range(2):
+        registries.publish(registry, f"run/{number}")
+    before = opponents_of(registry)
+    before.refresh()
+    before.add(metrics(100.0, v1=(40.0, 10.0)), 0)
+    after = opponents_of(registry)
+    after.set_state(before.get_state())
+    assert after.shares() == {"tictactoe@1": 0.4}, "the run itself continues"
+    after.refresh(parent=2)
+    assert (after.shares(), after.scores()) == ({}, {})
+    after.add(metrics(10.0, v2=(5.0, 5.0)), 0)
+    assert after.shares() == {"tictactoe@2": 0.5}
+
+
 def test_the_payoff_matrix_has_matches_and_training_games() -> None:
     blocks = [BlockResult("schedule", i, ("a", "b"), 2, (2.0, 0.0), None) for i in range(5)]
     found = payoff_matrix(("a", "b", "c"), blocks, {"c": {"b": (10.0, 10.0), "unknown": (5.0, 5.0)}})

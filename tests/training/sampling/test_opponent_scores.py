@@ -18,13 +18,13 @@ TWO_SIDES = np.eye(2, dtype=bool)
 def test_games_are_scored_as_in_matches(games: list[tuple[float, float]]) -> None:
     own, other = (np.array([game[i] for game in games]) for i in range(2))
     numbers = np.zeros(len(games), int)
-    found = OpposedGames(numbers, numbers, own, other).scores()
+    found = OpposedGames(numbers, numbers, own, other[:, np.newaxis]).scores()
     assert found.tolist() == [scores([game], "game")[0][0] for game in games]
 
 
 @given(st.tuples(RETURNS, RETURNS), st.tuples(RETURNS, RETURNS))
 def test_two_games_form_a_block_if_sides_differ(first: tuple[float, float], second: tuple[float, float]) -> None:
-    own, other = np.array([second[0], first[0]]), np.array([second[1], first[1]])
+    own, other = np.array([second[0], first[0]]), np.array([[second[1]], [first[1]]])
     block, waiting = OpposedGames(np.zeros(2, int), np.array([1, 0]), own, other).blocks()
     expected = scores([first, second], "side")
     assert len(waiting.own) == 0
@@ -99,12 +99,24 @@ def test_episodes_of_unscored_leagues_are_counted(scoring: Scoring, sides: int) 
 
 
 @pytest.mark.parametrize("side", [0, 1, 2])
-def test_the_other_sides_count_by_their_mean(side: int) -> None:
+def test_the_other_sides_are_compared_one_by_one(side: int) -> None:
     """Sides of 2, 1 and 1 agents; in side 0 the order of the agents' returns must not matter."""
     members = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
     collected = OpponentScores(members, "game", num_envs=1)
     collected.begin(np.arange(1), np.array([0]), np.array([side]))
     collected.add_turn(Turn())
     collected.add_turn(Turn(endings=[rows([0] * 4, [0, 1, 2, 3], [0.1, 0.3, 0.0, 0.5])], finished=np.array([0])))
-    expected = {0: 0.0, 1: 0.0, 2: 1.0}[side]  # 0.2 against 0.25, 0 against 0.35, 0.5 against 0.1
+    expected = {0: 0.5, 1: 0.0, 2: 1.0}[side]  # 0.2 against 0 and 0.5, 0 against 0.2 and 0.5, 0.5 against 0.2 and 0
     assert collected.take(1).scores.tolist() == [expected]
+
+
+@pytest.mark.parametrize("sides", [2, 3, 5])
+def test_equal_policies_score_a_half(sides: int) -> None:
+    """One side wins, each of them as often."""
+    collected = OpponentScores(np.eye(sides, dtype=bool), "game", num_envs=sides)
+    envs = np.arange(sides)
+    collected.begin(envs, np.zeros(sides, int), np.zeros(sides, int))
+    collected.add_turn(Turn())
+    collected.add_turn(Turn(endings=[rows(envs.tolist(), envs.tolist(), [1.0] * sides)], finished=envs))
+    found = collected.take(1)
+    assert (found.games.tolist(), found.scores.tolist()) == ([sides], [pytest.approx(sides / 2)])

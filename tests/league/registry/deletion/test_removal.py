@@ -8,6 +8,7 @@ from sqlalchemy import func, inspect, select, text
 
 from league.errors import Conflict, LeagueArchived, NothingToRollBack, UnknownLeague, UnknownVersion
 from league.refs import CheckpointRef
+from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint, StrengthRow
 from league.registry.storage.tables import Base
@@ -138,11 +139,24 @@ def test_force_removes_the_champion_and_its_alias(used: Registry) -> None:
     assert used.changes.counts().aliases == before.aliases + 1, "replicas follow"
     assert (plan.target, plan.aliases) == (f"{LEAGUE}@2", ("champion",))
     assert used.aliases.current(LEAGUE) == {}
-    with pytest.raises(NothingToRollBack):
+    with pytest.raises(NothingToRollBack, match="is not set, since the version that it named was removed"):
         used.aliases.rollback(LEAGUE, actor="me", reason="")
     used.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True)
     assert [row.number for row in used.versions.all(LEAGUE)] == [3]
     assert used.runs.get(LEAGUE, "run").parent is None
+
+
+def test_force_ends_the_canary_and_the_shadow_of_a_version(registry: Registry) -> None:
+    registered(registry, versions=3)
+    registry.aliases.set(LEAGUE, "beta", 3, expected=ANY, actor="me", reason="")
+    registry.traffic.set(LEAGUE, canary=Portion(2, 0.5), shadow=Portion("beta", 1.0), actor="me", reason="")
+    registry.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True, actor="ada")
+    now = registry.traffic.current(LEAGUE)
+    assert (now.canary, now.shadow) == (Portion(2, 0.5), None)
+    assert (now.actor, now.reason) == ("ada", f"{LEAGUE}@3 was removed")
+    registry.removal.remove_version(CheckpointRef(LEAGUE, 2), force=True)
+    now = registry.traffic.current(LEAGUE)
+    assert (now.canary, now.shadow) == (None, None)
 
 
 def test_canaries_and_candidates_of_a_nightly_run_are_in_use(registry: Registry) -> None:
@@ -178,7 +192,9 @@ def test_a_league_in_use_is_removed_by_force_only(used: Registry) -> None:
         used.removal.remove_league(LEAGUE)
     before = used.changes.counts()
     plan = used.removal.remove_league(LEAGUE, force=True)
-    assert used.changes.counts() == before._replace(aliases=before.aliases + 1, traffic=before.traffic + 1)
+    assert used.changes.counts() == before._replace(
+        aliases=before.aliases + 1, traffic=before.traffic + 1, leagues=before.leagues + 1
+    )
     assert (set(plan.versions), plan.matches, plan.runs) == ({1, 2, 3}, 2, ("run",))
     assert rows_of(used, LEAGUE) == {}
     assert rows_of(used, OTHER) == others

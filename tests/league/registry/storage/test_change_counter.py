@@ -54,9 +54,9 @@ CHANGES: list[tuple[Callable[[Registry], object], ChangeCounts]] = [
     (lambda registry: register(registry, {}), ChangeCounts(3, 1, 2, 4)),
     (
         lambda registry: registry.removal.remove_version(CheckpointRef(LEAGUE, 2), force=True),
-        ChangeCounts(4, 1, 2, 4),
+        ChangeCounts(4, 2, 2, 5),
     ),
-    (lambda registry: registry.removal.remove_league(LEAGUE, force=True), ChangeCounts(5, 2, 2, 4)),
+    (lambda registry: registry.removal.remove_league(LEAGUE, force=True), ChangeCounts(5, 3, 2, 6)),
 ]
 
 
