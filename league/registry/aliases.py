@@ -169,12 +169,10 @@ def _roll_back(
     _require(last, league, alias, expected)
     beneath = session.get(AliasEventTable, last.beneath) if last and last.beneath else None
     if beneath is None:
-        if last is not None:
-            was = f"has had no version before {league}@{last.version}, or none since another champion was removed"
-        elif session.scalar(select(AliasEventTable.id).filter_by(league=league, alias=alias).limit(1)):
-            was = "is not set, since the version that it named was removed: promote another one"
+        if last is None:
+            was = "is not set: promote a version"
         else:
-            was = "was never set"
+            was = f"has had no version before {league}@{last.version}, or none since another one was removed"
         raise NothingToRollBack(f"alias {alias} of league {league} {was}")
     event = AliasEventTable(
         kind="rollback",

@@ -157,7 +157,7 @@ def test_two_rollbacks_go_two_versions_back(registry: Registry) -> None:
 
 
 def test_rolling_back_requires_a_previous_version(registry: Registry) -> None:
-    with pytest.raises(NothingToRollBack, match="was never set"):
+    with pytest.raises(NothingToRollBack, match="is not set: promote a version"):
         registry.aliases.rollback(LEAGUE, actor="bob", reason="")
     promote(registry, 1, expected=None)
     with pytest.raises(NothingToRollBack, match="no version before tictactoe@1"):

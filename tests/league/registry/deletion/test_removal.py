@@ -139,7 +139,7 @@ def test_force_removes_the_champion_and_its_alias(used: Registry) -> None:
     assert used.changes.counts().aliases == before.aliases + 1, "replicas follow"
     assert (plan.target, plan.aliases) == (f"{LEAGUE}@2", ("champion",))
     assert used.aliases.current(LEAGUE) == {}
-    with pytest.raises(NothingToRollBack, match="is not set, since the version that it named was removed"):
+    with pytest.raises(NothingToRollBack, match="alias champion of league tictactoe is not set: promote"):
         used.aliases.rollback(LEAGUE, actor="me", reason="")
     used.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True)
     assert [row.number for row in used.versions.all(LEAGUE)] == [3]
