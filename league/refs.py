@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from league.errors import InvalidReference
 
-SLUG = re.compile(r"[a-z0-9_][a-z0-9_-]*")
+SLUG = re.compile(r"[a-z0-9_-]+")
 MAX_SLUG = 100
 """Characters. Ids of schedules and verdicts contain the league's name and must fit into 255 characters."""
 ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
@@ -43,11 +43,15 @@ def check_slug(kind: str, text: str) -> str:
     """Return `text` if it is a valid name of a league, policy, side or alias; raise InvalidReference otherwise."""
     if len(text) > MAX_SLUG:
         raise InvalidReference(f"{kind} {text[:32]!r}… has {len(text)} characters, expected at most {MAX_SLUG}")
-    if text.startswith("-"):
-        raise InvalidReference(f"{kind} {text!r} must not begin with '-', as the options of a command do")
     if not SLUG.fullmatch(text):
         raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'{_guess(text)}")
     return text
+
+
+def check_new(kind: str, text: str) -> None:
+    """Raise InvalidReference if a new name begins like an option of a command."""
+    if text.startswith("-"):
+        raise InvalidReference(f"{kind} {text!r} must not begin with '-'")
 
 
 def _guess(text: str) -> str:
@@ -78,6 +82,7 @@ def short_verdict(verdict: str) -> str:
 
 def check_alias(text: str) -> str:
     """Return `text` if it is a valid alias: a slug with at least one non-digit; raise InvalidReference otherwise."""
+    check_new("alias", text)
     if text.isdigit():
         raise InvalidReference(f"alias {text!r} must not be all digits: that is a version number")
     return check_slug("alias", text)

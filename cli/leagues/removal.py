@@ -1,6 +1,5 @@
 """`league remove`."""
 
-import getpass
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -49,7 +48,7 @@ def remove(
             _confirm(plan, yes)
         with registry.exclusive_lock(f"nightly-{league}"):
             if ref is not None:
-                plan = removal.remove_version(CheckpointRef.parse(plan.target), force=force, actor=getpass.getuser())
+                plan = removal.remove_version(CheckpointRef.parse(plan.target), force=force)
             else:
                 plan = removal.remove_league(league, force=force)
     if as_json:

@@ -172,7 +172,7 @@ def _roll_back(
         if last is None:
             was = "is not set: promote a version"
         else:
-            was = f"has had no version before {league}@{last.version}, or none since another one was removed"
+            was = f"has no version before {league}@{last.version} to return to"
         raise NothingToRollBack(f"alias {alias} of league {league} {was}")
     event = AliasEventTable(
         kind="rollback",

@@ -39,7 +39,7 @@ class ChangeRepository(Repository):
         self._replicas = ReplicaRepository(database)
 
     def counts(self) -> ChangeCounts:
-        """Return how often aliases, traffic settings, API keys and action selections have changed, by one cheap query.
+        """Return how often what replicas follow has changed, by one cheap query.
 
         What is read afterwards contains all these changes.
         """

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from league.conditions import ActionSelection, action_selection, default_selection, game_changes
 from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface, digest
+from league.refs import check_new
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert, upsert
 from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, require_active
@@ -32,7 +33,8 @@ class LeagueRepository(Repository):
         """Add a league or update its configuration. Warns if results exist and what decides them has changed: the game,
         or how versions select actions.
 
-        Raises LeagueArchived, or InterfaceChanged if published versions have another interface.
+        Raises LeagueArchived, InvalidReference for a new name that begins with `-`, or InterfaceChanged if published
+        versions have another interface.
         """
         values = {
             "config": config.model_dump(mode="json", by_alias=True),
@@ -44,6 +46,8 @@ class LeagueRepository(Repository):
         }
         first = {"slug": config.league, "last_version": 0, "registered_at": datetime.now(UTC)}
         with self._database.write() as session:
+            if session.get(LeagueTable, config.league) is None:
+                check_new("league", config.league)
             if insert(session, LeagueTable, [first | values]):
                 change_counter.count(session, "leagues")
                 return

@@ -240,8 +240,13 @@ class StreamSession:
         return ServedPolicy.of(self._model, version, version.policy(self._ref.policy))
 
     def _followed(self, alias: str) -> LoadedVersion:
-        """The version that an alias names. Raises NotReady or UnknownAlias if the alias was removed."""
+        """The version that an alias names.
+
+        Raises NotReady or UnknownAlias if the alias was removed, and NotReady if its version was replaced.
+        """
         league, slots = self._ref.league, self._dependencies.slots
+        if slots.was_dropped(league, alias):
+            raise NotReady(f"the version of {league}@{alias} was replaced: it is being loaded")
         if not slots.was_removed(league, alias):
             return slots.get(league, alias) or self._served.version
         if alias == CHAMPION:

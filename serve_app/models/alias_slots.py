@@ -37,6 +37,8 @@ class AliasSlots:
         self._wanted: dict[Alias, int] = {}
         self._known: set[Alias] = set()
         """All aliases since the start."""
+        self._dropped: set[Alias] = set()
+        """Aliases whose version was replaced by another one with the same number, which is being loaded."""
         self._faults: dict[Alias, str] = {}
         self._swaps: dict[Alias, _Swap] = {}
         self.swaps: Counter[str] = Counter()
@@ -49,6 +51,10 @@ class AliasSlots:
     def was_removed(self, league: str, alias: str) -> bool:
         """Whether an alias does not exist any more. One that was not read yet was not removed."""
         return (league, alias) in self._known and (league, alias) not in self._wanted
+
+    def was_dropped(self, league: str, alias: str) -> bool:
+        """Whether the version that an alias named was replaced by one with the same number that is not loaded yet."""
+        return (league, alias) in self._dropped
 
     def leagues(self) -> list[str]:
         """The leagues that have an alias."""
@@ -95,6 +101,7 @@ class AliasSlots:
             key = version.league, version.number
             if key in states and ((state := states[key]) is None or state.sha256 != version.sha256):
                 del self._slots[alias]
+                self._dropped.add(alias)
 
     def update(self, wanted: dict[Alias, int]) -> None:
         """Start to load the version that each alias names now, unless it is served. Each alias has its own load, which
@@ -102,6 +109,7 @@ class AliasSlots:
         """
         self._wanted = wanted
         self._known |= wanted.keys()
+        self._dropped &= wanted.keys()
         for gone in self._slots.keys() - wanted.keys():
             del self._slots[gone]
         for gone in self._faults.keys() - wanted.keys():
@@ -153,6 +161,7 @@ class AliasSlots:
         if self._slots.get(alias) is not version:
             self.swaps[league] += 1
         self._slots[alias] = version
+        self._dropped.discard(alias)
         self._faults.pop(alias, None)
         self._keep_loaded()
         logger.info("%s@%s is now version %d", league, name, number)

@@ -1,5 +1,5 @@
-"""Follows the registry's aliases, traffic settings, API keys and action selections, and acknowledges what this replica
-serves.
+"""Follows the registry's aliases, traffic settings, API keys, action selections and removals of versions, and
+acknowledges what this replica serves.
 
 One task on the event loop. It reads what has changed, as the change counter tells: after a notification of PostgreSQL,
 otherwise by polling.

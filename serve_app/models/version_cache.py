@@ -183,6 +183,8 @@ class VersionCache:
         self._of_aliases = asyncio.Semaphore(ALIAS_LOADS)
         self._of_requests = asyncio.Semaphore(REQUESTED_LOADS)
         self._corrupt: dict[VersionKey, tuple[float, ArtifactCorrupt]] = {}
+        self._drops = 0
+        """Number of calls of `drop_changed`."""
 
     def pin(self, pinned: set[VersionKey]) -> None:
         """Replace the versions that must stay in memory, whether loaded yet or not."""
@@ -201,6 +203,11 @@ class VersionCache:
             version = self._loaded.get(key)
             if version is not None and (state is None or state.is_retired or state.sha256 != version.sha256):
                 del self._loaded[key]
+        mixtures = [(key, version.members) for key, version in self._loaded.items() if version.members]
+        for key, members in mixtures:
+            if key not in self._pinned and any((each.league, each.number) not in self._loaded for each in members):
+                del self._loaded[key]
+        self._drops += 1
 
     def cached_keys(self) -> Set[VersionKey]:
         """The versions in memory, without marking them as used."""
@@ -265,7 +272,10 @@ class VersionCache:
         if (version := self.cached(*key)) is not None:
             return version
         try:
+            drops = self._drops
             version = await self._with_members(await in_daemon_thread(self._load, *key))
+            if drops != self._drops:  # it may have been read before it was removed and published again
+                version = await self._with_members(await in_daemon_thread(self._load, *key))
         except ArtifactCorrupt as error:
             self._corrupt[key] = (time.monotonic() + self._retry, error)
             raise

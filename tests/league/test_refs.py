@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from league.errors import InvalidReference
 from league.refs import CheckpointRef, PolicyRef, ScriptRef, check_alias, check_slug, parse_ref
 
-slugs = st.from_regex(r"[a-z0-9_][a-z0-9_-]{0,99}", fullmatch=True)
+slugs = st.from_regex(r"[a-z0-9_-]{1,100}", fullmatch=True)
 aliases = slugs.filter(lambda slug: not slug.isdigit())
 versions = st.integers(1, 2**31 - 1) | aliases
 
@@ -36,9 +36,6 @@ def test_a_model_name_survives_parsing_its_text(ref: PolicyRef) -> None:
         "a@99999999999999",
         "script:",
         "script:A",
-        "-a@1",
-        "a@-b",
-        "script:-a",
         "a/b@1",
         f"{'a' * 101}@1",
         f"a@{'b' * 101}",

@@ -49,6 +49,7 @@ class LeagueOpponents:
         self._priors: dict[str, float] = {}
         self._rows: dict[str, Scores] = {}
         self._unpublished: dict[str, Scores] = {}
+        self._inherited: Scores = {}
         self._payoff: NDArray[np.float64] = np.zeros((0, 0))
         self.reset(0)
 
@@ -126,14 +127,18 @@ class LeagueOpponents:
             if source in self._unpublished:
                 self._rows[ref] = self._unpublished.pop(source)
         self._rows = {ref: row for ref, row in self._rows.items() if ref in rows}
+        if parent is not None and checkpoint is None:
+            # What the run of the parent has found becomes the prior of this one.
+            self._inherited = self._scores
+            self._episodes, self._all_episodes, self._scores = {}, 0.0, {}
         if checkpoint is not None:
             self._unpublished[checkpoint] = dict(self._scores)
         self._payoff = payoff_matrix(self.candidates, results, self._rows)
         if parent is not None:
-            # The priors contain what the run of the parent has found.
-            self._episodes, self._all_episodes, self._scores = {}, 0.0, {}
-            known = tuple(dict.fromkeys((f"{self._league.league}@{parent}", *self.candidates)))
-            self._priors = dict(zip(known, payoff_matrix(known, results, self._rows)[0].tolist(), strict=True))
+            of_parent = f"{self._league.league}@{parent}"
+            known = tuple(dict.fromkeys((of_parent, *self.candidates)))
+            found = payoff_matrix(known, results, self._rows | {of_parent: self._inherited})
+            self._priors = dict(zip(known, found[0].tolist(), strict=True))
 
     def drop_removed(self) -> None:
         """Drop candidates whose files were removed since the checkpoint. Others stay, whatever was published since."""
@@ -153,6 +158,7 @@ class LeagueOpponents:
             "episodes": self._episodes,
             "all_episodes": self._all_episodes,
             "priors": self._priors,
+            "inherited": self._inherited,
             "rows": self._rows,
             "unpublished": self._unpublished,
             "payoff": self._payoff,
@@ -162,6 +168,7 @@ class LeagueOpponents:
         """Restore what `get_state` returned."""
         self.candidates, self._payoff = state["candidates"], state["payoff"]
         self._scores, self._priors = dict(state["scores"]), dict(state["priors"])
+        self._inherited = dict(state.get("inherited", {}))
         if "all_episodes" in state:
             self._episodes, self._all_episodes = dict(state["episodes"]), state["all_episodes"]
         else:

@@ -136,7 +136,7 @@ class RemovalRepository(Repository):
         ]
         return RemovalPlan(league, sizes, aliases, verdicts, matches, run_ids, tuple(reasons))
 
-    def remove_version(self, ref: CheckpointRef, *, force: bool = False, actor: str = "remove") -> RemovalPlan:
+    def remove_version(self, ref: CheckpointRef, *, force: bool = False, actor: str = "league remove") -> RemovalPlan:
         """Remove a version. Its number is never reused, except if its league is removed. Returns what was removed.
 
         force: also remove what depends on it. actor: who ends its canary or shadow.

@@ -81,11 +81,11 @@ class RetentionRepository(Repository):
         with self._database.write() as session:
             leagues.lock(session, league)
             retired, untrained = _candidates(session, league, keep, before)
-            if retired:
+            rows = [session.get_one(VersionTable, (league, number)) for number in sorted(retired)]
+            if new := [row for row in rows if row.retired_at is None]:
                 change_counter.count(session, "leagues")
-            for number in retired:
-                row = session.get_one(VersionTable, (league, number))
-                row.retired_at = row.retired_at or datetime.now(UTC)
+            for row in new:
+                row.retired_at = datetime.now(UTC)
         removal = self._removal(league, retired, untrained)
         for number in removal.versions:
             self._artifacts.discard(league, number)

@@ -178,7 +178,8 @@ class ChangeCounts(NamedTuple):
     traffic: int
     keys: int
     leagues: int
-    """Leagues that were registered, or whose versions select actions in another way since, and removals of files."""
+    """Leagues that were registered or have changed how versions select actions, and versions that were retired or
+    removed."""
 
     @property
     def to_acknowledge(self) -> int:

@@ -154,7 +154,7 @@ def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry:
         ({"anchors": [{"ref": "script:random", "margins": 3}]}, "did you mean 'margin'"),
         ({"margin": 0}, "gate.margin"),
         ({"model": "returns"}, "return_bound"),
-        ({"model": "returns", "return_bound": 2}, "margin must be smaller"),
+        ({"model": "returns", "return_bound": 2}, "margin, which is a return with model: returns, must be smaller"),
         ({"model": "returns", "return_bound": 200, "return0": 3, "return1": 2}, "return0 first"),
         ({"nights": 0}, "gate.nights"),
     ],

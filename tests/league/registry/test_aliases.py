@@ -160,7 +160,7 @@ def test_rolling_back_requires_a_previous_version(registry: Registry) -> None:
     with pytest.raises(NothingToRollBack, match="is not set: promote a version"):
         registry.aliases.rollback(LEAGUE, actor="bob", reason="")
     promote(registry, 1, expected=None)
-    with pytest.raises(NothingToRollBack, match="no version before tictactoe@1"):
+    with pytest.raises(NothingToRollBack, match="no version before tictactoe@1 to return to"):
         registry.aliases.rollback(LEAGUE, actor="bob", reason="")
 
 

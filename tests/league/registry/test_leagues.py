@@ -3,8 +3,9 @@ import logging
 import pytest
 
 from league.config.league import LeagueConfig
-from league.errors import InterfaceChanged, LeagueArchived, UnknownLeague
+from league.errors import InterfaceChanged, InvalidReference, LeagueArchived, UnknownLeague
 from league.interface import Interface
+from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
@@ -142,3 +143,11 @@ def test_nothing_is_registered_or_published_in_an_archived_league(registry: Regi
     assert registry.leagues.archive(LEAGUE, undo=True).archived_at is None
     registry.leagues.register(config(), interface())
     assert publish(registry, "run/2").number == 2
+
+
+def test_a_new_league_is_not_named_like_an_option(registry: Registry) -> None:
+    with pytest.raises(InvalidReference, match="league '-x' must not begin with '-'"):
+        registry.leagues.register(config("-x"), interface())
+    assert registry.leagues.names().keys() == {LEAGUE}
+    with pytest.raises(InvalidReference, match="alias '-x' must not begin with '-'"):
+        registry.aliases.set(LEAGUE, "-x", 1, expected=ANY, actor="test", reason="test")

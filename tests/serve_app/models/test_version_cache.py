@@ -8,6 +8,8 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from league.errors import ArtifactCorrupt, Overloaded, StorageError
+from league.registry.storage.mixture import Member, Mixture
+from league.registry.storage.rows import VersionState
 from serve_app.models.version_cache import MAX_REQUESTED, LoadedVersion, VersionCache
 
 pytestmark = pytest.mark.anyio
@@ -22,6 +24,7 @@ class Loader:
         self.gate.set()
         self.faults: dict[int, Exception] = {}
         self.slow: set[int] | None = None
+        self.sha256 = "0" * 64
 
     def __call__(self, league: str, number: int) -> LoadedVersion:
         if self.slow is None or number in self.slow:
@@ -29,7 +32,7 @@ class Loader:
         self.calls[number] += 1
         if number in self.faults:
             raise self.faults[number]
-        return LoadedVersion(league, number, "0" * 64, {})
+        return LoadedVersion(league, number, self.sha256, {})
 
 
 def cached(versions: VersionCache, numbers: range) -> list[int]:
@@ -64,6 +67,48 @@ async def test_pinned_versions_are_not_evicted() -> None:
     assert cached(versions, range(1, 6)) == [1, 2, 5]
     versions.pin({("board", 2)})
     assert cached(versions, range(1, 6)) == [2, 5]
+
+
+async def test_changed_versions_are_dropped() -> None:
+    loader = Loader()
+    versions = VersionCache(loader, capacity=5, retry=1)
+    for number in range(1, 5):
+        await versions.get("board", number)
+    same, other = VersionState(loader.sha256, is_retired=False), VersionState("1" * 64, is_retired=False)
+    retired = VersionState(loader.sha256, is_retired=True)
+    versions.drop_changed({("board", 1): same, ("board", 2): other, ("board", 3): retired, ("board", 4): None})
+    assert cached(versions, range(1, 5)) == [1]
+
+
+async def test_a_version_that_is_replaced_while_it_is_loaded_is_loaded_again() -> None:
+    started, gate = threading.Event(), threading.Event()
+    digests = iter(["0" * 64, "1" * 64])
+
+    def load(league: str, number: int) -> LoadedVersion:
+        version = LoadedVersion(league, number, next(digests), {})
+        started.set()
+        assert gate.wait(60)
+        return version
+
+    versions = VersionCache(load, capacity=1, retry=1)
+    loading = asyncio.create_task(versions.get("board", 1))
+    await asyncio.to_thread(started.wait)
+    versions.drop_changed({})
+    gate.set()
+    assert (await loading).sha256 == "1" * 64
+
+
+async def test_a_mixture_is_dropped_with_its_members() -> None:
+    members = tuple(Member(version=number, probability=0.5, sha256="0" * 64) for number in (1, 2))
+
+    def load(league: str, number: int) -> LoadedVersion:
+        mixture = Mixture(members=members) if number == 3 else None
+        return LoadedVersion(league, number, "0" * 64, {}, mixture)
+
+    versions = VersionCache(load, capacity=5, retry=1)
+    assert [member.number for member in (await versions.get("board", 3)).members] == [1, 2]
+    versions.drop_changed({("board", 2): VersionState("0" * 64, is_retired=True)})
+    assert cached(versions, range(1, 4)) == [1]
 
 
 async def test_a_corrupt_version_is_retried_after_an_interval() -> None:

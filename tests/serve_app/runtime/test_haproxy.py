@@ -90,12 +90,16 @@ def test_free_ports_are_free() -> None:
 
 
 def test_servers_that_start_at_the_same_time_do_not_draw_the_same_ports(directories: Path) -> None:
-    drawn: list[str] = []
+    claimed: list[int] = []
     with ExitStack() as servers:
         for _ in range(5):
             variables = haproxy.environment(servers.enter_context(haproxy.private_directory()))
-            drawn += [value for name, value in variables.items() if "PORT" in name and value.isdigit()]
-    assert len(drawn) == len(set(drawn)) == 5 * 6
+            ports = {name: int(value) for name, value in variables.items() if "PORT" in name and value.isdigit()}
+            first, _last = (ports.pop(f"RAY_SERVE_DIRECT_INGRESS_{end}_GRPC_PORT") for end in ("MIN", "MAX"))
+            own = range(first + haproxy.DISTANCE, first + haproxy.DISTANCE + haproxy.GRPC_PORTS.step)
+            assert len(ports) == len({*ports.values()} & {*own}) == 4
+            claimed.append(first)
+    assert len(set(claimed)) == 5
 
 
 def test_missing_free_ports_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -223,6 +223,14 @@ def test_a_run_from_a_version_counts_its_own_episodes(registry: Registry) -> Non
     assert (after.shares(), after.scores()) == ({}, {})
     after.add(metrics(10.0, v2=(5.0, 5.0)), 0)
     assert after.shares() == {"tictactoe@2": 0.5}
+    found, score = after.scores(), after.score("tictactoe@1")
+    assert score == pytest.approx((10 + PRIOR_GAMES / 2) / (40 + PRIOR_GAMES)), "the scores of the parent's run"
+    after.refresh(checkpoint="own/1", parent=2)
+    assert (after.shares(), after.scores()) == ({"tictactoe@2": 0.5}, found)
+    resumed = opponents_of(registry)
+    resumed.set_state(after.get_state())
+    resumed.refresh(checkpoint="own/2", parent=2)
+    assert (resumed.scores(), resumed.score("tictactoe@1")) == (found, score)
 
 
 def test_the_payoff_matrix_has_matches_and_training_games() -> None:
