@@ -35,10 +35,10 @@ class VersionRepository(Repository):
 
     def with_files(self, ref: CheckpointRef) -> VersionRow:
         """Return the version that a reference names now. Raises VersionRetired, and what `resolve` raises."""
-        with self._database.read() as session:
-            version = resolve(session, ref)
-            require_files(session, version.league, version.number)
-            return version
+        version = self.resolve(ref)
+        if version.retired_at is not None:
+            _retired(version.league, version.number)
+        return version
 
     def resolve(self, ref: CheckpointRef | str) -> VersionRow:
         """Return the version that a reference names now.
@@ -113,14 +113,14 @@ class VersionRepository(Repository):
 
     def fetch(self, league: str, number: int) -> Path:
         """Return a local directory with the verified files of a version. Raises ArtifactCorrupt or VersionRetired."""
-        return self._artifacts.verify(league, number, self._with_files(league, number).sha256)
+        return self._artifacts.verify(league, number, self.with_files(CheckpointRef(league, number)).sha256)
 
     def copy(self, league: str, number: int, folder: str, target: Path) -> Path:
         """Copy a folder of a version to the new directory `target`, and return it.
 
         Raises ArtifactCorrupt, or VersionRetired if the version or this folder was removed.
         """
-        manifest = self._artifacts.verify_names(league, number, self._with_files(league, number).sha256)
+        manifest = self._artifacts.verify_names(league, number, self.with_files(CheckpointRef(league, number)).sha256)
         if not self._artifacts.has_folder(league, number, folder):
             raise VersionRetired(f"{league}@{number} has no {folder} state any more: `league retire` removed it")
         self._artifacts.copy(manifest, folder, target)
@@ -139,12 +139,6 @@ class VersionRepository(Repository):
             version = resolve(session, ref)
             _write_note(session, version.league, version.number, text, actor)
             return _get(session, version.league, version.number)
-
-    def _with_files(self, league: str, number: int) -> VersionRow:
-        version = self.get(league, number)
-        if version.retired_at is not None:
-            _retired(league, number)
-        return version
 
 
 def resolve(session: Session, ref: CheckpointRef) -> VersionRow:

@@ -14,15 +14,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from league.errors import (
-    InvalidInput,
-    InvalidState,
-    LeagueError,
-    NotReady,
-    RateLimited,
-    Unauthenticated,
-    UnknownAlias,
-)
+from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, Unauthenticated
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from serve_app.access.access_control import AccessControl
@@ -228,7 +220,7 @@ class StreamSession:
         """The version that answers now, if no recurrent state depends on it. is_anew: whether episodes start."""
         if self._follows is None:
             return self._served
-        version = self._followed(self._follows)
+        version = self._dependencies.slots.follow(self._ref.league, self._follows) or self._served.version
         if self._follows == CHAMPION and self._dependencies.traffic.canaries:
             version = self._dependencies.traffic.route(version, self._headers)
         # An episode stays with the member of a mixture that it began with.
@@ -238,20 +230,6 @@ class StreamSession:
         if version is self._served.version:
             return self._served
         return ServedPolicy.of(self._model, version, version.policy(self._ref.policy))
-
-    def _followed(self, alias: str) -> LoadedVersion:
-        """The version that an alias names.
-
-        Raises NotReady or UnknownAlias if the alias was removed, and NotReady if its version was replaced.
-        """
-        league, slots = self._ref.league, self._dependencies.slots
-        if slots.was_dropped(league, alias):
-            raise NotReady(f"the version of {league}@{alias} was replaced: it is being loaded")
-        if not slots.was_removed(league, alias):
-            return slots.get(league, alias) or self._served.version
-        if alias == CHAMPION:
-            raise NotReady(f"league {league} has no champion: promote a version first")
-        raise UnknownAlias(f"league {league} has no alias {alias!r}")
 
     def _mirror(
         self, served: ServedPolicy, observations: Arrays, state: Arrays | None, actions: NDArray | None

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from league.errors import LeagueError
+from league.errors import LeagueError, NotReady, UnknownAlias
 from league.refs import CHAMPION
 from league.registry.storage.rows import VersionState
 from serve_app.models.version_cache import LoadedVersion, VersionCache, VersionKey
@@ -35,10 +35,8 @@ class AliasSlots:
         self._versions = versions
         self._slots: dict[Alias, LoadedVersion] = {}
         self._wanted: dict[Alias, int] = {}
-        self._known: set[Alias] = set()
-        """All aliases since the start."""
-        self._dropped: set[Alias] = set()
-        """Aliases whose version was replaced by another one with the same number, which is being loaded."""
+        self._answered: set[Alias] = set()
+        """Aliases that have answered since the start."""
         self._faults: dict[Alias, str] = {}
         self._swaps: dict[Alias, _Swap] = {}
         self.swaps: Counter[str] = Counter()
@@ -48,13 +46,20 @@ class AliasSlots:
         """The version that answers for an alias."""
         return self._slots.get((league, alias))
 
-    def was_removed(self, league: str, alias: str) -> bool:
-        """Whether an alias does not exist any more. One that was not read yet was not removed."""
-        return (league, alias) in self._known and (league, alias) not in self._wanted
+    def follow(self, league: str, alias: str) -> LoadedVersion | None:
+        """The version that answers for an alias; None if the alias is new, and was not read or loaded yet.
 
-    def was_dropped(self, league: str, alias: str) -> bool:
-        """Whether the version that an alias named was replaced by one with the same number that is not loaded yet."""
-        return (league, alias) in self._dropped
+        Raises NotReady or UnknownAlias if the alias was removed, and NotReady if its version was replaced by another
+        one with the same number, which is being loaded.
+        """
+        version = self.get(league, alias)
+        if version is not None or (league, alias) not in self._answered:
+            return version
+        if (league, alias) in self._wanted:
+            raise NotReady(f"the version of {league}@{alias} was replaced: it is being loaded")
+        if alias == CHAMPION:
+            raise NotReady(f"league {league} has no champion: promote a version first")
+        raise UnknownAlias(f"league {league} has no alias {alias!r}")
 
     def leagues(self) -> list[str]:
         """The leagues that have an alias."""
@@ -101,15 +106,12 @@ class AliasSlots:
             key = version.league, version.number
             if key in states and ((state := states[key]) is None or state.sha256 != version.sha256):
                 del self._slots[alias]
-                self._dropped.add(alias)
 
     def update(self, wanted: dict[Alias, int]) -> None:
         """Start to load the version that each alias names now, unless it is served. Each alias has its own load, which
         a later update replaces if the alias names another version by then.
         """
         self._wanted = wanted
-        self._known |= wanted.keys()
-        self._dropped &= wanted.keys()
         for gone in self._slots.keys() - wanted.keys():
             del self._slots[gone]
         for gone in self._faults.keys() - wanted.keys():
@@ -161,7 +163,7 @@ class AliasSlots:
         if self._slots.get(alias) is not version:
             self.swaps[league] += 1
         self._slots[alias] = version
-        self._dropped.discard(alias)
+        self._answered.add(alias)
         self._faults.pop(alias, None)
         self._keep_loaded()
         logger.info("%s@%s is now version %d", league, name, number)

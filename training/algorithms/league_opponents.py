@@ -137,7 +137,7 @@ class LeagueOpponents:
         if parent is not None:
             of_parent = f"{self._league.league}@{parent}"
             known = tuple(dict.fromkeys((of_parent, *self.candidates)))
-            found = payoff_matrix(known, results, self._rows | {of_parent: self._inherited})
+            found = payoff_matrix(known, results, {of_parent: self._inherited} | self._rows)
             self._priors = dict(zip(known, found[0].tolist(), strict=True))
 
     def drop_removed(self) -> None:
