@@ -34,6 +34,7 @@ ORDER = (
     "faults",
     "fuzz",
     "hostile",
+    "attacks",
     "fresh_machine",
     "strength",
     "decisive_positions",

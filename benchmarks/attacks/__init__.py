@@ -1,1 +1,1 @@
-"""Callers and failures that a server must withstand; see benchmarks/hostile.py."""
+"""Callers and failures that a server must withstand: `python -m benchmarks attacks` and benchmarks/hostile.py."""
