@@ -3,6 +3,7 @@
 Its `metadata` may contain:
 
     board           a grid of actions in rows, as the picture shows it; None where no action is: [[0, 1], [2, None]]
+    board_area      where the grid is: left, top, right and bottom as shares of the picture's width and height
     action_keys     key, as `KeyboardEvent.key` names it → action: {"ArrowUp": 0, "q": 4}
     agent_colors    agent → a colour name or #rrggbb: {"player_0": "red"}
 
@@ -27,16 +28,19 @@ from league.errors import EnvironmentMismatch
 KNOWN: Mapping[str, Mapping[str, Any]] = {
     "connect_four_v3": {
         "board": [[0, 1, 2, 3, 4, 5, 6]],
+        "board_area": (4 / 99, 4 / 86, 95 / 99, 82 / 86),
         "agent_colors": {"player_0": "#d63c4c", "player_1": "#5d6579"},
     },
     "tictactoe_v3": {
         "board": [[0, 3, 6], [1, 4, 7], [2, 5, 8]],
+        "board_area": (0.02, 0.02, 0.99, 0.97),
         "agent_colors": {"player_1": "#6183e7", "player_2": "#f53a3a"},
     },
 }
 """Declarations for environments of PettingZoo, by `metadata["name"]`."""
 
 Board = tuple[tuple[int | None, ...], ...]
+Area = tuple[float, float, float, float]
 
 
 class Declarations(BaseModel):
@@ -45,6 +49,7 @@ class Declarations(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     board: Board | None = None
+    board_area: Area = (0, 0, 1, 1)
     action_keys: dict[str, int] = Field(default={})
     agent_colors: dict[str, str] = Field(default={})
 
@@ -54,6 +59,14 @@ class Declarations(BaseModel):
         if board is not None and (not board or not board[0] or len({len(row) for row in board}) > 1):
             raise ValueError("expected rows of equal length, such as [[0, 1], [2, 3]]")
         return board
+
+    @field_validator("board_area")
+    @classmethod
+    def _is_in_the_picture(cls, area: Area) -> Area:
+        left, top, right, bottom = area
+        if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+            raise ValueError("expected left < right and top < bottom between 0 and 1, such as [0.1, 0.1, 0.9, 0.9]")
+        return area
 
     @field_validator("agent_colors")
     @classmethod

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evaluation.matches.policy_calls import PolicyFault, action_fault
 from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.action_names import action_names, direction_keys
-from evaluation.playback.environment_hooks import Board, Declarations, EnvironmentHooks
+from evaluation.playback.environment_hooks import Area, Board, Declarations, EnvironmentHooks
 from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of
 from evaluation.playback.single_game import GameStep, Move, play_game, policy_output
 from evaluation.playback.video import data_uri
@@ -67,8 +67,8 @@ class Playability(Document):
 
     why: reason if nothing can be played, else None. opponents: mixtures with an alias, the newest versions that can
     play, newest first, then scripts. draws: whether the environment renders images. board: rows of actions over the
-    picture, if the environment declares them. reveals: whether the pictures show what the environment hides from the
-    agent.
+    picture, if the environment declares them. board_area: left, top, right and bottom of this grid, as shares of the
+    picture. reveals: whether the pictures show what the environment hides from the agent.
     """
 
     league: str
@@ -78,6 +78,7 @@ class Playability(Document):
     opponents: tuple[str, ...]
     draws: bool
     board: Board | None
+    board_area: Area
     reveals: bool
 
 
@@ -102,6 +103,7 @@ def playability(config: LeagueConfig, registry: Registry, interface: Interface, 
         opponents=(*mixtures, *versions[:MOST_OPPONENTS], *scripts),
         draws=hooks.draws,
         board=hooks.declared.board,
+        board_area=hooks.declared.board_area,
         reveals=hooks.draws and not hooks.has_views and interface.hidden_information and len(interface.agents) > 1,
     )
 

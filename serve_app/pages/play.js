@@ -88,8 +88,8 @@ function Game({ league, playable, game }) {
   return html`<div class="player">
     <div class="screen">
       <p class="turn" role="status">${statusOf(state, busy, error, agent)}</p>
-      ${state && html`<${Board} state=${state} board=${playable.board} names=${names} act=${act} isTurn=${isTurn} />`}
-      ${state && seat && !state.over && html`<${Actions} seat=${seat} hasBoard=${!!(playable.board && state.picture)} legal=${state.legal} act=${act} isTurn=${isTurn} />`}
+      ${state && html`<${Board} state=${state} playable=${playable} names=${names} act=${act} isTurn=${isTurn}>
+        ${seat && !state.over && html`<${Actions} seat=${seat} board=${state.picture && playable.board} legal=${state.legal} act=${act} isTurn=${isTurn} />`}<//>`}
       ${playable.reveals && html`<p class="notice">The picture shows everything, also what is hidden from ${agent}: this environment does not render the view of one agent.</p>`}
       ${error && html`<${ErrorNotice} error=${error} retry=${() => setAttempt(attempt + 1)} />`}
     </div>
@@ -122,12 +122,16 @@ function outcomeOf({ score }) {
   return score > 0.5 ? "You won." : score < 0.5 ? "You lost." : "Draw.";
 }
 
-/** The picture; if the environment declares a board, its cells can be clicked. */
-function Board({ state, board, names, act, isTurn }) {
-  return html`<${Picture} src=${state.picture} alt="Game after: ${describe(state.steps.at(-1), names)}">
-    ${board && state.picture && !state.over && html`<div class="cells" style=${{ "--columns": board[0].length }} aria-hidden="true">${board.flat().map((action) => action == null ? html`<span></span>` : html`
-      <button type="button" tabindex="-1" disabled=${!isTurn || !state.legal.includes(action)} onClick=${() => act(action)} data-action=${action}></button>`)}</div>`}
-  <//>`;
+/** The picture; if the environment declares a board, its cells can be clicked. The children have the width of the board. */
+function Board({ state, playable: { board, board_area: area }, names, act, isTurn, children }) {
+  const [left, top, right, bottom] = area.map((share) => 100 * share);
+  const edges = { "--left": `${left}%`, "--top": `${top}%`, "--right": `${100 - right}%`, "--bottom": `${100 - bottom}%`, "--columns": board?.[0].length };
+  return html`<div class="board" style=${edges}>
+    <${Picture} src=${state.picture} alt="Game after: ${describe(state.steps.at(-1), names)}">
+      ${board && state.picture && !state.over && html`<div class="cells" aria-hidden="true">${board.flat().map((action) => action == null ? html`<span></span>` : html`
+        <button type="button" tabindex="-1" disabled=${!isTurn || !state.legal.includes(action)} onClick=${() => act(action)} data-action=${action}></button>`)}</div>`}
+    <//>${children}
+  </div>`;
 }
 
 /** A sample of an agent's color in the pictures. */
@@ -141,18 +145,27 @@ function OtherAgents({ agents, own }) {
 }
 
 /** One button per action; digit keys select the first ten, and other keys as the server lists them. Illegal actions are disabled. */
-function Actions({ seat, hasBoard, legal, act, isTurn }) {
+function Actions({ seat, board, legal, act, isTurn }) {
   const all = Array.from({ length: seat.actions }, (_, index) => seat.start + index);
+  const columns = board && actionOfColumns(board);
+  const isAligned = columns?.length === all.length && all.every((action) => columns.includes(action));
   const isNamed = Object.keys(seat.names).length > 0;
   useKeys((key) => {
     const action = seat.keys[key] ?? seat.keys[key.toLowerCase()] ?? (/^\d$/.test(key) ? Number(key) : null);
     if (action != null) act(action);
     return action != null; // the page must not scroll while it is not the person's turn
   });
-  return html`<div class="actions-grid ${isNamed ? "named" : `x${all.length <= 10 ? all.length : "many"}`}" role="group" aria-label="Your actions">${all.map((action) => html`
+  const layout = isAligned ? "aligned" : isNamed ? "named" : `x${all.length <= 10 ? all.length : "many"}`;
+  return html`<div class="actions-grid ${layout}" role="group" aria-label="Your actions">${(isAligned ? columns : all).map((action) => html`
     <button type="button" key=${action} aria-disabled=${!isTurn || !legal.includes(action)} class=${legal.includes(action) ? "" : "illegal"} onClick=${() => act(action)}>
       ${actionName(seat.names, action)}</button>`)}</div>
-    <p class="muted small keys">${ways(seat, all, hasBoard)}</p>`;
+    <p class="muted small keys">${ways(seat, all, !!board)}</p>`;
+}
+
+/** The action of each column of a board, or null if a column has several. */
+function actionOfColumns(board) {
+  const columns = board[0].map((_, index) => [...new Set(board.map((row) => row[index]).filter((action) => action != null))]);
+  return columns.every((actions) => actions.length === 1) ? columns.flat() : null;
 }
 
 /** How actions can be selected, as a sentence. */

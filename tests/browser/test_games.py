@@ -3,6 +3,7 @@
 import re
 from base64 import b64decode
 from io import BytesIO
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -141,6 +142,36 @@ def test_a_game_of_connect_four_is_played_by_clicks(
     assert f"actions={'%2C'.join(map(str, actions))}" in page.url
     page.get_by_role("button", name="Undo move").click()
     expect(turn).to_have_text(TURN)
+
+
+ACTION_AT = "([x, y]) => document.elementFromPoint(x, y).closest('[data-action]')?.dataset.action"
+
+
+@pytest.mark.parametrize("width", [1440, 768, 390])
+def test_a_click_in_a_hole_of_connect_four_takes_its_column(tab: Tab, width: int) -> None:
+    tab.page.set_viewport_size({"width": width, "height": 900})
+    page = open_game(tab, CONNECT_FOUR, "player_0")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    picture = page.locator(".picture img").bounding_box()
+    assert picture is not None
+    scale = picture["width"] / 99  # holes are 13 of 99 units apart, and the first is at (10.5, 10.5)
+    for row, column in product(range(6), range(7)):
+        x, y = picture["x"] + scale * (10.5 + 13 * column), picture["y"] + scale * (10.5 + 13 * row)
+        for right, down in product((-20, 0, 20), repeat=2):
+            assert page.evaluate(ACTION_AT, [x + right, y + down]) == str(column)
+        button = page.get_by_role("button", name=str(column), exact=True).bounding_box()
+        assert button is not None
+        assert button["x"] + button["width"] / 2 == pytest.approx(x, abs=2)
+    page.mouse.click(picture["x"] + scale * 10.5 + 20, picture["y"] + scale * (10.5 + 13 * 5))
+    expect(page.locator(".move-log")).to_contain_text("player_0 plays 0")
+
+
+def test_a_click_on_the_frame_of_the_board_is_no_move(tab: Tab) -> None:
+    page = open_game(tab, CONNECT_FOUR, "player_0")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    picture = page.locator(".picture img").bounding_box()
+    assert picture is not None
+    assert page.evaluate(ACTION_AT, [picture["x"] + 4, picture["y"] + picture["height"] / 2]) is None
 
 
 def test_a_game_against_the_champion_is_played_by_keys_with_probabilities(tab: Tab) -> None:

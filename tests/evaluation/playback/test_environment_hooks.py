@@ -1,8 +1,12 @@
+from contextlib import closing
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from pettingzoo.classic import connect_four_v3
 
-from evaluation.playback.environment_hooks import environment_hooks
+from evaluation.playback.environment_hooks import KNOWN, environment_hooks
 from league.config.environment import EnvironmentConfig
 from league.errors import EnvironmentMismatch
 
@@ -41,6 +45,10 @@ def test_an_environment_without_pictures_has_no_views() -> None:
         ({"board": [[0, 1], [2]]}, "board: .*rows of equal length"),
         ({"board": []}, "board: .*rows of equal length"),
         ({"board": [["a"]]}, r"board\[0\]\[0\]: .*integer"),
+        ({"board_area": [0, 0, 1]}, r"board_area\[3\]: .*required"),
+        ({"board_area": [0.5, 0, 0.5, 1]}, "board_area: .*left < right"),
+        ({"board_area": [0, 0, 640, 480]}, "board_area: .*between 0 and 1"),
+        ({"board_area": [float("nan"), 0, 1, 1]}, "board_area: .*between 0 and 1"),
         ({"action_keys": {"w": "up"}}, "action_keys.w: .*integer"),
         ({"agent_colors": {"player_1": "url(x)"}}, "agent_colors: .*player_1: 'url\\(x\\)' is neither"),
     ],
@@ -54,3 +62,28 @@ def test_malformed_declarations_are_reported_with_their_key(declared: dict[str, 
 def test_declarations_of_an_instance_are_used() -> None:
     config = EnvironmentConfig(entry_point=f"{DECLARING}:Malformed", kwargs={"board": [[3]]})
     assert environment_hooks(config).declared.board == ((3,),)
+
+
+def test_a_board_without_an_area_covers_the_picture() -> None:
+    declared = environment_hooks(EnvironmentConfig(entry_point=f"{DECLARING}:Declaring")).declared
+    assert declared.board_area == (0, 0, 1, 1)
+
+
+def test_cells_of_connect_four_are_around_its_holes() -> None:
+    """The holes are the white parts of the picture of an empty board."""
+    with closing(connect_four_v3.env(render_mode="rgb_array")) as env:
+        env.reset()
+        holes = env.render().min(axis=2) == 255
+    left, top, right, bottom = KNOWN["connect_four_v3"]["board_area"]
+    height, width = holes.shape
+    for centres, (low, high), cells in (
+        (centres_of(holes.any(axis=0)) / width, (left, right), 7),
+        (centres_of(holes.any(axis=1)) / height, (top, bottom), 6),
+    ):
+        assert centres == pytest.approx(low + (np.arange(cells) + 0.5) * (high - low) / cells, abs=0.002)
+
+
+def centres_of(inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The centres of the runs of True, in pixels."""
+    edges = np.flatnonzero(np.diff(np.pad(inside, 1).astype(int)))
+    return (edges[::2] + edges[1::2]) / 2

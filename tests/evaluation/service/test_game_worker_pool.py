@@ -132,6 +132,7 @@ def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
         "opponents": ["tictactoe@1", "script:random", "script:one_ply"],
         "draws": True,
         "board": [[0, 3, 6], [1, 4, 7], [2, 5, 8]],
+        "board_area": [0.02, 0.02, 0.99, 0.97],
         "reveals": False,
     }
 
