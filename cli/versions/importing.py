@@ -17,7 +17,7 @@ def import_model(
         Path,
         typer.Argument(
             metavar="SOURCE",
-            help="ONNX file or torch.export program (.pt2) for all policies, or a directory with one POLICY.onnx each.",
+            help="ONNX file or torch.export program (.pt2) for all policies, or a directory with a file for each.",
         ),
     ],
     mapping: Annotated[
@@ -30,7 +30,8 @@ def import_model(
         typer.Option(metavar="NAME=MODULE", help="With --rllib: the module of a policy. Default: the same name."),
     ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Allow --rllib and --sb3 to run code that is contained in SOURCE.")
+        bool,
+        typer.Option("--trust", help="Allow code in SOURCE to run. Every format except ONNX requires it."),
     ] = False,
     note: Annotated[str, typer.Option(metavar="TEXT", help="Note of the version.")] = "",
 ) -> None:
@@ -45,13 +46,8 @@ def import_model(
     registry = open_registry()
     interface = registry.leagues.get(check_slug("league", league)).interface
     modules = dict(_pair(each) for each in policy or ())
-    if (rllib or sb3) and not trust:
-        option = "--rllib" if rllib else "--sb3"
-        raise InvalidInput(f"{option} unpickles {source}, which runs code from it: add --trust if you trust its author")
-    if rllib or sb3:
-        say(f"Unpickling {source}")
     kind: SourceKind | None = "rllib" if rllib else "sb3" if sb3 else None
-    sources, digest = open_sources(source, interface, kind=kind, mapping=mapping, modules=modules)
+    sources, digest = open_sources(source, interface, kind=kind, mapping=mapping, modules=modules, trust=trust)
     version = publish(league, sources, digest=digest, registry=registry)
     if note:
         registry.versions.set_note(CheckpointRef.parse(version.ref), note, actor="import")

@@ -80,7 +80,7 @@ class LeagueConfig(Part):
             document = yaml.load(Path(path).read_text(encoding="utf-8"), UniqueKeyLoader)
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
         return cls.from_mapping(_with_folder(document, Path(path)), source=str(path))
 

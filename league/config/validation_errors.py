@@ -35,8 +35,8 @@ TYPES = {
 BASIC_TYPES = ("str", "int", "float", "bool")
 
 
-def describe_yaml_error(error: yaml.YAMLError | UnicodeDecodeError) -> str:
-    """Return why a file is not YAML, and the line."""
+def describe_yaml_error(error: Exception) -> str:
+    """Return why a file is not YAML, and the line. PyYAML also raises ValueError and RecursionError."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None and error.problem:
         return f"line {error.problem_mark.line + 1}: not valid YAML: {error.problem}"
     return f"not a YAML file: {one_line(error)}"

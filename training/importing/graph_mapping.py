@@ -70,7 +70,7 @@ class GraphMapping(BaseModel):
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except ValidationError as error:
             raise ConfigError(f"{path}: {describe_validation_error(cls, error)}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
 
 

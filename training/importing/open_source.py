@@ -5,11 +5,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from league.errors import ConfigError, InvalidInput
+from league.errors import ConfigError, InvalidInput, LeagueError, one_line
 from league.interface import AgentInterface, Interface
 from training.importing.source import Source, onnx_source
 
 SourceKind = Literal["rllib", "sb3"]
+SUFFIXES: dict[SourceKind | None, tuple[str, ...]] = {None: (".onnx", ".pt2"), "sb3": (".zip",), "rllib": ()}
+"""Option → suffixes of the policies' files in a directory; a checkpoint is one directory for all policies."""
+NAMES = {
+    "onnx": "an ONNX model",
+    "torch.export": "a torch.export program",
+    "sb3": "a file of Stable-Baselines3",
+    "rllib": "a checkpoint of RLlib",
+}
 
 
 def open_sources(
@@ -19,15 +27,17 @@ def open_sources(
     kind: SourceKind | None = None,
     mapping: Path | None = None,
     modules: Mapping[str, str] | None = None,
+    trust: bool = False,
 ) -> tuple[dict[str, Source], str]:
     """Open the models for all policies of a league.
 
     Args:
         path: A file for all policies, or a directory with one named after each policy. With RLlib, a checkpoint.
         interface: Interface of the league.
-        kind: Format of `path` if it contains pickles; else its suffix decides.
+        kind: Format of `path`; by default its suffix decides.
         mapping: File with a GraphMapping, for ONNX files and programs.
         modules: With RLlib: policy id → module id, where they differ.
+        trust: Whether code in `path` may run: reading any format except ONNX can run code.
 
     Returns:
         Policy id → model, and a digest of the source's content.
@@ -35,6 +45,7 @@ def open_sources(
     Raises:
         ConfigError: A file is missing, or its format is unknown.
         EnvironmentMismatch: A model does not fit the league.
+        InvalidInput: A format that can run code is not trusted. Nothing of it was read.
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such file or directory")
@@ -42,28 +53,48 @@ def open_sources(
         raise InvalidInput("--policy: only checkpoints of RLlib contain several modules; it requires --rllib")
     if unknown := [policy for policy in modules or () if policy not in interface.policy_ids]:
         raise InvalidInput(f"--policy {unknown[0]}: expected one of {', '.join(interface.policy_ids)}")
+    files = {policy: _file(path, policy, SUFFIXES[kind]) for policy in interface.policy_ids}
+    formats = {policy: kind or _format(file) for policy, file in files.items()}
+    for policy, file in files.items():
+        if formats[policy] != "onnx" and not trust:
+            name = NAMES[formats[policy]]
+            raise InvalidInput(f"{file}: reading {name} runs code from it: add --trust if you trust its author")
     digest = _digest(path, mapping, modules)
     sources = {}
-    for policy in interface.policy_ids:
-        spaces = interface.of_policy(policy)
-        origin: dict[str, Any] = {"format": kind or "", "file": path.name, "sha256": digest}
-        if kind == "rllib":
-            from training.importing.rllib_source import rllib_source
-
-            module = (modules or {}).get(policy, policy)
-            sources[policy] = rllib_source(path, module, spaces, origin | {"module": module})
-        elif kind == "sb3":
-            from training.importing.sb3_source import sb3_source
-
-            sources[policy] = sb3_source(_file(path, policy, (".zip",)), spaces, origin)
-        else:
-            sources[policy] = _graph_or_program(_file(path, policy, (".onnx", ".pt2")), mapping, spaces, origin)
+    for policy, file in files.items():
+        origin: dict[str, Any] = {"format": formats[policy], "file": path.name, "sha256": digest}
+        module = (modules or {}).get(policy, policy)
+        try:
+            sources[policy] = _read(file, formats[policy], module, mapping, interface.of_policy(policy), origin)
+        except LeagueError:
+            raise
+        except Exception as error:  # the libraries that read a damaged file raise many kinds
+            name = NAMES[formats[policy]]
+            raise ConfigError(f"{file}: {name} that is damaged: {one_line(error, with_type=True)[:300]}") from error
     return sources, digest
+
+
+def _read(
+    file: Path, file_format: str, module: str, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]
+) -> Source:
+    if file_format == "rllib":
+        from training.importing.rllib_source import rllib_source
+
+        return rllib_source(file, module, spaces, origin | {"module": module})
+    if file_format == "sb3":
+        from training.importing.sb3_source import sb3_source
+
+        return sb3_source(file, spaces, origin)
+    if file_format == "torch.export":
+        from training.importing.torch_source import torch_source
+
+        return torch_source(file, mapping, spaces, origin)
+    return onnx_source(file, mapping, spaces, origin)
 
 
 def _file(path: Path, policy: str, suffixes: Sequence[str]) -> Path:
     """Return the file of a policy: `path`, or the one named after the policy in the directory `path`."""
-    if not path.is_dir():
+    if not suffixes or not path.is_dir():
         return path
     candidates = [path / f"{policy}{suffix}" for suffix in suffixes]
     for file in candidates:
@@ -72,14 +103,11 @@ def _file(path: Path, policy: str, suffixes: Sequence[str]) -> Path:
     raise ConfigError(f"{path}: no file {' or '.join(file.name for file in candidates)}")
 
 
-def _graph_or_program(file: Path, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
-    if file.suffix == ".pt2":
-        from training.importing.torch_source import torch_source
-
-        return torch_source(file, mapping, spaces, origin | {"format": "torch.export"})
-    if file.suffix == ".onnx":
-        return onnx_source(file, mapping, spaces, origin | {"format": "onnx"})
-    raise ConfigError(f"{file}: expected a directory, .onnx or .pt2, or the option --rllib or --sb3")
+def _format(file: Path) -> str:
+    formats = {".onnx": "onnx", ".pt2": "torch.export"}
+    if file.suffix not in formats:
+        raise ConfigError(f"{file}: expected a directory, .onnx or .pt2, or the option --rllib or --sb3")
+    return formats[file.suffix]
 
 
 def _digest(path: Path, *choices: object) -> str:

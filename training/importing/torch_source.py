@@ -73,6 +73,8 @@ def converted(module: nn.Module, examples: Examples, output: str, source: str) -
 def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
     """Read a program that `torch.export.save` wrote, with a dynamic batch size and one output.
 
+    This unpickles parts of the file and evaluates expressions in it.
+
     Args:
         path: The file.
         mapping: File with a GraphMapping; by default it is inferred.

@@ -40,12 +40,15 @@ def test_an_exported_version_can_be_imported(league: League, registry: Registry,
     load("tictactoe@4", registry=registry)
 
 
-@pytest.mark.parametrize("option", ["--rllib", "--sb3"])
-def test_unpickling_requires_trust(league: League, registry: Registry, tmp_path: Path, option: str) -> None:
-    result = league("import", "tictactoe", str(tmp_path), option)
+@pytest.mark.parametrize("options", [["--rllib"], ["--sb3"], []])
+def test_formats_that_run_code_require_trust(
+    league: League, registry: Registry, tmp_path: Path, options: list[str]
+) -> None:
+    for name in ("shared.zip", "shared.pt2"):
+        (tmp_path / name).write_bytes(b"anything")
+    result = league("import", "tictactoe", str(tmp_path), *options)
     assert result.code == 2
-    assert "unpickles" in result.err
-    assert "--trust" in result.err
+    assert "runs code from it: add --trust if you trust its author" in result.err
 
 
 def test_a_missing_file_is_named(league: League, registry: Registry) -> None:

@@ -1,5 +1,7 @@
 """Models of PyTorch: `torch.export` programs, modules of RLlib, and files of Stable-Baselines3."""
 
+import zipfile
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,14 +14,14 @@ from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPP
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from torch import nn
 
-from league.errors import ConfigError, EnvironmentMismatch
+from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, LeagueError
 from league.interface import AgentInterface, Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import excused
 from league.spaces import DictSpace
 from league.spaces.conversion import from_gymnasium
 from training.importing.adapted_graph import adapt
-from training.importing.open_source import open_sources
+from training.importing.open_source import SourceKind, open_sources
 from training.importing.source import Source, known_logits
 
 ROWS = 300
@@ -45,12 +47,16 @@ def assert_equal_actions(source: Source, action: gymnasium.Space[Any]) -> None:
     assert len(np.unique(expected, axis=0)) > 1
 
 
-def test_a_program(tmp_path: Path) -> None:
+def save_program(path: Path, network: nn.Module | None = None) -> None:
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 5))
+    network = network or nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 5))
     program = torch.export.export(network, (torch.zeros(2, 4),), dynamic_shapes=({0: torch.export.Dim("batch")},))
-    torch.export.save(program, tmp_path / "program.pt2")
-    sources, _ = open_sources(tmp_path / "program.pt2", interface(FIVE))
+    torch.export.save(program, path)
+
+
+def test_a_program(tmp_path: Path) -> None:
+    save_program(tmp_path / "program.pt2")
+    sources, _ = open_sources(tmp_path / "program.pt2", interface(FIVE), trust=True)
     assert_equal_actions(sources["shared"], FIVE)
 
 
@@ -64,20 +70,102 @@ def test_a_directory_has_a_file_for_each_policy(tmp_path: Path) -> None:
     for policy, outputs in (("chooser", 5), ("driver", 4)):
         if policy == "driver":
             with pytest.raises(ConfigError, match=r"no file driver\.onnx or driver\.pt2"):
-                open_sources(tmp_path, two)
-        network = nn.Linear(4, outputs)
-        program = torch.export.export(network, (torch.zeros(2, 4),), dynamic_shapes=({0: torch.export.Dim("batch")},))
-        torch.export.save(program, tmp_path / f"{policy}.pt2")
-    sources, _ = open_sources(tmp_path, two)
+                open_sources(tmp_path, two, trust=True)
+        save_program(tmp_path / f"{policy}.pt2", nn.Linear(4, outputs))
+    sources, _ = open_sources(tmp_path, two, trust=True)
     assert_equal_actions(sources["chooser"], FIVE)
     assert_equal_actions(sources["driver"], STEERED)
+
+
+def attack(path: Path, marker: Path) -> None:
+    """Write a program that creates `marker` when it is read: torch evaluates the sizes of its tensors by SymPy."""
+    save_program(path)
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    code = f"__import__('pathlib').Path('{marker}').touch() or Symbol("
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content.replace(b"Symbol(", code.encode()))
+
+
+def test_code_in_a_program_runs_only_if_it_is_trusted(tmp_path: Path) -> None:
+    marker, path = tmp_path / "marker", tmp_path / "models" / "shared.pt2"
+    path.parent.mkdir()
+    attack(path, marker)
+    for source in (path, path.parent):
+        with pytest.raises(
+            InvalidInput, match=r"shared.pt2: reading a torch.export program runs code from it: add --t"
+        ):
+            open_sources(source, interface(FIVE))
+    path.with_suffix(".onnx").write_bytes(path.read_bytes())
+    for source in (path.with_suffix(".onnx"), path.parent):
+        with pytest.raises(ConfigError, match=r"shared.onnx: not an ONNX model"):
+            open_sources(source, interface(FIVE))
+    assert not marker.exists()
+    open_sources(path, interface(FIVE), trust=True)
+    assert marker.exists()
+
+
+@pytest.mark.parametrize("kind", ["rllib", "sb3"])
+def test_pickles_are_not_read_without_trust(tmp_path: Path, kind: SourceKind) -> None:
+    (tmp_path / "shared.zip").write_bytes(b"anything")
+    with pytest.raises(InvalidInput, match="runs code from it: add --trust"):
+        open_sources(tmp_path, interface(FIVE), kind=kind)
+
+
+def damages(content: bytes) -> Iterator[bytes]:
+    """Variants of a file: cut off, with zeros or noise in it, and with bytes in the wrong order."""
+    rng = np.random.default_rng(0)
+    for position in np.linspace(0, len(content) - 1, 12).astype(int):
+        yield content[:position]
+        yield content[:position] + bytes(16) + content[position + 16 :]
+        yield content[:position] + rng.bytes(16) + content[position + 16 :]
+        yield content[position:] + content[:position]
+
+
+def refusal(source: Path, **options: Any) -> str | None:
+    """The message for a damaged file; None if it can be read. Another exception would be a traceback."""
+    try:
+        open_sources(source, interface(FIVE), **options)
+    except LeagueError as error:
+        return str(error)
+    return None
+
+
+def test_a_damaged_program_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "program.pt2"
+    save_program(path)
+    messages = []
+    for content in list(damages(path.read_bytes())):
+        path.write_bytes(content)
+        messages.append(refusal(path, trust=True))
+    refusals = [message for message in messages if message is not None]
+    assert len(refusals) > 12
+    assert all(message.startswith(str(path)) and "\n" not in message for message in refusals)
+
+
+def test_a_damaged_checkpoint_is_named_in_one_line(tmp_path: Path) -> None:
+    module = DefaultPPOTorchRLModule(
+        observation_space=SEEN, action_space=FIVE, model_config=asdict(DefaultModelConfig()), inference_only=True
+    )
+    module.save_to_path(tmp_path / MODULES / "shared")
+    messages = []
+    for file in sorted((tmp_path / MODULES / "shared").iterdir()):
+        content = file.read_bytes()
+        for damaged in (content[: len(content) // 2], b"", content[::-1]):
+            file.write_bytes(damaged)
+            messages.append(refusal(tmp_path, kind="rllib", trust=True))
+        file.write_bytes(content)
+    refusals = [message for message in messages if message is not None]
+    assert len(refusals) > 4
+    assert all(str(tmp_path) in message and "\n" not in message for message in refusals)
 
 
 def test_a_program_with_a_fixed_batch_size_is_refused(tmp_path: Path) -> None:
     program = torch.export.export(nn.Linear(4, 5), (torch.zeros(2, 4),))
     torch.export.save(program, tmp_path / "program.pt2")
     with pytest.raises(EnvironmentMismatch, match="fixed batch size of 2"):
-        open_sources(tmp_path / "program.pt2", interface(FIVE))
+        open_sources(tmp_path / "program.pt2", interface(FIVE), trust=True)
 
 
 @pytest.mark.parametrize("action", [FIVE, STEERED])
@@ -87,15 +175,15 @@ def test_a_module_of_rllib(tmp_path: Path, action: gymnasium.Space[Any]) -> None
         observation_space=SEEN, action_space=action, model_config=asdict(DefaultModelConfig()), inference_only=True
     )
     module.save_to_path(tmp_path / MODULES / "spreader")
-    sources, _ = open_sources(tmp_path, interface(action), kind="rllib", modules={"shared": "spreader"})
+    sources, _ = open_sources(tmp_path, interface(action), kind="rllib", modules={"shared": "spreader"}, trust=True)
     assert_equal_actions(sources["shared"], action)
     with pytest.raises(ConfigError, match="no module 'shared'; known: spreader; use --policy"):
-        open_sources(tmp_path, interface(action), kind="rllib")
+        open_sources(tmp_path, interface(action), kind="rllib", trust=True)
 
 
 def test_a_directory_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="learner_group/learner/rl_module is missing"):
-        open_sources(tmp_path, interface(FIVE), kind="rllib")
+        open_sources(tmp_path, interface(FIVE), kind="rllib", trust=True)
 
 
 class SpacesOnly(gymnasium.Env[Any, Any]):
@@ -115,7 +203,7 @@ def test_a_file_of_stable_baselines(tmp_path: Path, algorithm: str, action: gymn
     torch.manual_seed(0)
     options = {"buffer_size": 10} if algorithm in ("DQN", "SAC", "TD3") else {}
     getattr(library, algorithm)("MlpPolicy", SpacesOnly(action), **options).save(tmp_path / "model.zip")
-    sources, _ = open_sources(tmp_path / "model.zip", interface(action), kind="sb3")
+    sources, _ = open_sources(tmp_path / "model.zip", interface(action), kind="sb3", trust=True)
     assert_equal_actions(sources["shared"], action)
 
 
@@ -123,4 +211,4 @@ def test_other_files_are_not_of_stable_baselines(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
     (tmp_path / "model.zip").write_bytes(b"text")
     with pytest.raises(ConfigError, match=r"model.zip: not a file of Stable-Baselines3"):
-        open_sources(tmp_path / "model.zip", interface(FIVE), kind="sb3")
+        open_sources(tmp_path / "model.zip", interface(FIVE), kind="sb3", trust=True)
