@@ -27,7 +27,7 @@ class ServeSettings(BaseModel):
     """Larger request bodies are refused with 413, and larger messages close their stream with 1009. A replica may hold
     `max_in_flight` bodies at once, and HAProxy retries a request on another replica only if it fits into
     RAY_SERVE_HAPROXY_TUNE_BUFSIZE."""
-    max_incomplete: int = Field(default=64 * 2**20, ge=1024)
+    max_incomplete: int = Field(default=32 * 2**20, ge=1024)
     """Bytes of incomplete messages of all streams of a replica; a stream that exceeds them is closed with 1013."""
     max_in_flight: int = Field(default=256, ge=1)
     """Inference requests in flight per replica; further ones are refused with 429."""

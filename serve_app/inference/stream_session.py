@@ -134,6 +134,10 @@ class StreamSession:
             self._dependencies.metrics.count_error(self._path, str(INTERNAL_ERROR["code"]))
             return _text(INTERNAL_ERROR)
 
+    def admit_frame(self) -> float:
+        """Count a control frame or a fragment. Returns 0, or the number of seconds until it may be handled."""
+        return self._dependencies.access.admit_frame(self._key)
+
     def closing_message(self) -> StreamMessage | None:
         """What a client needs to continue on another replica: the recurrent state, if any."""
         if self._state is None:
@@ -259,6 +263,8 @@ def error_message(error: LeagueError, retry: float) -> StreamMessage:
     if document["status"] in (429, 503):
         wait = error.wait if isinstance(error, RateLimited) else 1.0 if document["status"] == 429 else retry
         document["retry_after"] = max(1, ceil(wait))
+        if document["status"] == 429:
+            return _text(document)._replace(pause=wait)
     return _text(document)
 
 

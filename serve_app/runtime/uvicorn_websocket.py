@@ -5,6 +5,9 @@ cut from the received data; single-frame messages go directly to the message han
 control frames, fragments, protocol errors) goes to uvicorn's protocol, which uses the websockets library. Compression
 is disabled: it would cost more than the rest. While a message is being answered or the client does not read, nothing is
 read from the connection either, which gives backpressure.
+
+Every frame counts: a turn of the event loop handles a limited number of frames of all connections together, and frames
+that are no messages are admitted by the handler. A connection whose frame is refused is not read for a while.
 """
 
 import asyncio
@@ -33,9 +36,14 @@ DATA_FRAMES = (TEXT, BINARY)
 MASKED = 0x80
 """Bit of the second byte; the other bits are the length, or 126 or 127 if it follows in 16 or 64 bits."""
 LENGTH_16, LENGTH_64 = struct.Struct(">H"), struct.Struct(">Q")
+CLOSE, PONG, CONTINUATION = 0x8, 0xA, 0x80
+"""Operation codes, and the first byte of the last frame of a fragmented message."""
 SWITCHING = 101
-MAX_MESSAGES_PER_TURN = 16
-"""Messages of one connection that are answered before other connections get a turn."""
+MAX_FRAMES_PER_TURN = 32
+"""Frames of all connections that a turn of the event loop handles; the first of each connection is always handled."""
+SHORTEST_PAUSE, LONGEST_PAUSE = 0.1, 1.0
+"""Bounds of the seconds in which a connection is not read after a refusal. Shorter ones would cost as much as the
+frames that they prevent; longer ones would delay answers to the pings of this server."""
 CLOSE_TIMEOUT = 2.0
 """Seconds for a client to answer a close frame and read earlier messages."""
 SERVICE_RESTART = 1012
@@ -43,7 +51,7 @@ TRY_AGAIN_LATER = 1013
 TOO_BIG = 1009
 MAX_FRAGMENTS = 1024
 """Frames of a fragmented message: empty ones would take memory without being counted as bytes."""
-SMALL = 64 * 1024
+SMALL = 4 * 1024
 """Bytes that a connection may hold in any case."""
 
 
@@ -52,6 +60,8 @@ class StreamMessage(NamedTuple):
 
     data: bytes
     is_text: bool
+    pause: float = 0.0
+    """Seconds for which the client is asked to send nothing more, because its message was refused."""
 
 
 class CloseStream(Exception):
@@ -69,16 +79,31 @@ class MessageHandler(Protocol):
     async def answer(self, data: bytes, is_text: bool) -> StreamMessage:
         """The answer to a message. Raises CloseStream."""
 
+    def admit_frame(self) -> float:
+        """Count a control frame or a fragment. Returns 0, or the number of seconds until it may be handled."""
+
     def closing_message(self) -> StreamMessage | None:
         """The last message before the server closes the connection, or None."""
 
 
 @dataclass(slots=True)
-class IncompleteMessages:
-    """Received bytes of messages that are not complete or not answered yet, of all connections of this process."""
+class SharedLimits:
+    """What all connections of this process share."""
 
-    limit: int
-    held: int = 0
+    max_incomplete: int
+    incomplete: int = 0
+    """Received bytes of messages that are not complete or not answered yet."""
+    frames: int = 0
+    """Frames that this turn of the event loop has handled."""
+
+    def count_frame(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Count a frame of this turn."""
+        if not self.frames:
+            loop.call_soon(self._end_turn)
+        self.frames += 1
+
+    def _end_turn(self) -> None:
+        self.frames = 0
 
 
 def install(max_size: int, max_incomplete: int) -> None:
@@ -86,7 +111,7 @@ def install(max_size: int, max_incomplete: int) -> None:
 
     max_size: maximum size of a message in bytes. max_incomplete: of all incomplete messages together.
     """
-    auto.AutoWebSocketsProtocol = partial(StreamWebSocketProtocol, max_size, IncompleteMessages(max_incomplete))
+    auto.AutoWebSocketsProtocol = partial(StreamWebSocketProtocol, max_size, SharedLimits(max_incomplete))
 
 
 class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
@@ -95,7 +120,7 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
     def __init__(
         self,
         max_size: int,
-        incomplete: IncompleteMessages,
+        shared: SharedLimits,
         config: Config,
         server_state: ServerState,
         app_state: dict[str, Any],
@@ -104,14 +129,14 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         config.ws_max_size, config.ws_per_message_deflate = max_size, False
         super().__init__(config, server_state, app_state, _loop)
         self._max_size = max_size
-        self._incomplete = incomplete
+        self._shared = shared
         self._held = 0
-        """The part of `incomplete` that this connection holds."""
+        """The part of `shared.incomplete` that this connection holds."""
         self._stream: MessageHandler | None = None
         self._pending = bytearray()
         """Received data that was not processed yet: a partial frame, or messages that wait."""
         self._is_busy = False
-        """Whether a message is being answered, or other connections have their turn."""
+        """Whether a message is being answered, other connections have their turn, or the client must pause."""
         self._writes: list[bytes] = []
 
     def set_handler(self, stream: MessageHandler) -> None:
@@ -229,7 +254,7 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
 
     def _work(self, arrived: bytes | bytearray) -> None:
         """Answer the complete messages in `arrived`, and keep the rest."""
-        at, messages = 0, 0
+        at, is_first = 0, True
         while not self._is_held and (head := _parse_head(arrived, at)) is not None:
             size, length = head
             end = at + size + length
@@ -237,9 +262,11 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 end = len(arrived)  # the header is enough for the library to refuse it
             elif end > len(arrived):
                 break
-            if messages == MAX_MESSAGES_PER_TURN:
+            if not is_first and self._shared.frames >= MAX_FRAMES_PER_TURN:
                 self._yield_turn()
                 break
+            self._shared.count_frame(self.loop)
+            is_first = False
             if (
                 arrived[at] in DATA_FRAMES
                 and arrived[at + 1] & MASKED
@@ -250,7 +277,9 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 self._handle_message(
                     apply_mask(bytes(arrived[start:end]), arrived[start - 4 : start]), arrived[at] == TEXT
                 )
-                messages += 1
+            elif wait := self._wait_for(arrived, at, at + size, end):
+                self._pause(wait)
+                break
             else:
                 self._flush()
                 super().data_received(bytes(arrived[at:end]))
@@ -266,6 +295,18 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         """Whether a new message may begin: no fragmented message is open, and the connection is not closing."""
         return self.conn.current_size is None and self.conn.state is State.OPEN
 
+    def _wait_for(self, arrived: bytes | bytearray, at: int, payload: int, end: int) -> float:
+        """Seconds until a frame that is no complete message may be handled. payload: where its payload begins."""
+        assert self._stream is not None
+        first = arrived[at]
+        if first & 0xF == CLOSE or first == CONTINUATION:  # the handler counts the message that is complete now
+            return 0.0
+        if first & 0xF == PONG and arrived[at + 1] & MASKED and self.pending_ping_payload is not None:
+            pong = apply_mask(bytes(arrived[payload:end]), bytes(arrived[payload - 4 : payload]))
+            if pong == self.pending_ping_payload:
+                return 0.0
+        return self._stream.admit_frame()
+
     def _handle_message(self, data: bytes, is_text: bool) -> None:
         """Answer a message, synchronously if the handler does not suspend."""
         assert self._stream is not None
@@ -274,6 +315,8 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
             waits_for = steps.send(None)
         except StopIteration as done:
             self._queue_frame(done.value)
+            if done.value.pause:
+                self._pause(done.value.pause)
         except CloseStream as end:
             self.end(end.code, end.reason)
         else:
@@ -285,17 +328,28 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
 
     async def _finish(self, steps: Generator[Any, Any, StreamMessage], waits_for: Any) -> None:
         try:
-            self._queue_frame(await resume(steps, waits_for))
+            self._queue_frame(answer := await resume(steps, waits_for))
         except CloseStream as end:
             self.end(end.code, end.reason)
-        self._resume_after_turn()
+        else:
+            if answer.pause:
+                self._flush()
+                self._pause(answer.pause)
+                return
+        self._go_on()
 
     def _yield_turn(self) -> None:
         self._is_busy = True
         self.transport.pause_reading()
-        self.loop.call_soon(self._resume_after_turn)
+        self.loop.call_soon(self._go_on)
 
-    def _resume_after_turn(self) -> None:
+    def _pause(self, seconds: float) -> None:
+        """Read nothing from the client for a while: it has sent more than it may."""
+        self._is_busy = True
+        self.transport.pause_reading()
+        self.loop.call_later(min(max(seconds, SHORTEST_PAUSE), LONGEST_PAUSE), self._go_on)
+
+    def _go_on(self) -> None:
         self._is_busy = False
         self._resume()
 
@@ -304,9 +358,9 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         held = len(self._pending) + sum(map(len, self.frames))
         if held == self._held:
             return
-        self._incomplete.held += held - self._held
+        self._shared.incomplete += held - self._held
         self._held = held
-        if held > SMALL and self._incomplete.held > self._incomplete.limit:
+        if held > SMALL and self._shared.incomplete > self._shared.max_incomplete:
             self.frames = []
             self._pending.clear()
             self.end(TRY_AGAIN_LATER, "incomplete messages take too much memory in this replica")
@@ -354,7 +408,7 @@ def _parse_head(data: bytes | bytearray, at: int) -> tuple[int, int] | None:
 
 def _encode_frame(message: StreamMessage) -> bytes:
     """A message as one unmasked frame."""
-    data, is_text = message
+    data, is_text, _ = message
     opcode, length = TEXT if is_text else BINARY, len(data)
     if length < 126:
         return bytes((opcode, length)) + data

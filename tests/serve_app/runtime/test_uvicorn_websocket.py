@@ -1,8 +1,10 @@
 """Streams on a real socket: complete and fragmented messages, several at once, and how a connection ends."""
 
+import asyncio
 import json
 import socket
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
@@ -15,6 +17,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.access import access_control
+from serve_app.access.api_keys import ApiKey
 from serve_app.inference.stream_codec import RESPONSE, encode_request
 from serve_app.runtime import uvicorn_websocket
 from tests.support.clients.actions import BOARD, boards
@@ -129,7 +133,7 @@ def test_pings_are_answered_between_fragments(listener: Listening) -> None:
 class RawClient:
     """A client that sends arbitrary bytes at any time."""
 
-    def __init__(self, listener: Listening, model: str = "board") -> None:
+    def __init__(self, listener: Listening, model: str = "board", token: str = "none") -> None:
         host, port = listener.url.removeprefix("http://").split(":")
         self.socket = socket.socket()
         for buffer in (socket.SO_RCVBUF, socket.SO_SNDBUF):
@@ -139,7 +143,8 @@ class RawClient:
         self.socket.connect((host, int(port)))
         self.socket.sendall(
             f"GET /v1/policies/{model}/stream HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            f"X-Api-Key: {token}\r\n\r\n".encode()
         )
         self.file = self.socket.makefile("rb")
         assert b" 101 " in self.file.readline()
@@ -189,6 +194,104 @@ def frame(payload: bytes, first: int = 0x81, mask: bytes = b"\1\2\3\4") -> bytes
     else:
         length = b"\xff" + struct.pack(">Q", size)
     return bytes([first]) + length + mask + bytes(byte ^ mask[at % 4] for at, byte in enumerate(payload))
+
+
+PING = frame(b"", 0x89)
+PONG = (0x8A, b"")
+
+
+def nothing_follows(raw: RawClient, listener: Listening, token: str) -> bool:
+    """Whether a client gets nothing while the server answers another one several times."""
+    with open_stream(listener, additional_headers={"x-api-key": token}) as stream:
+        for _ in range(5):
+            assert answer_to(stream, BODY)["version"] == 1
+    raw.socket.setblocking(False)
+    try:
+        return raw.file.read(1) is None
+    finally:
+        raw.socket.settimeout(DEADLINE)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [PING * 1000, frame(b"", 0x8A) * 1000 + PING, frame(b"{", 0x01) + PING, b"\x81\x02{}"],
+    ids=["pings", "pongs", "fragments", "unmasked"],
+)
+def test_frames_that_are_no_messages_wait_for_the_rate_of_the_key(registry: Registry, sent: bytes) -> None:
+    _, slow = registry.keys.create("slow", ["act"], rate=0.001)
+    _, other = registry.keys.create("other", ["act"])
+    with listening(registry.storage) as listener:
+        raw = RawClient(listener, token=slow)  # the handshake is the request that the rate permits
+        raw.socket.sendall(sent)
+        assert nothing_follows(raw, listener, other)
+        raw.socket.close()
+
+
+def test_answers_to_pings_of_the_server_are_free(registry: Registry) -> None:
+    _, slow = registry.keys.create("slow", ["act"], rate=0.001)
+    with listening(registry.storage, ws_ping_interval=0.05, ws_ping_timeout=DEADLINE) as listener:
+        raw = RawClient(listener, token=slow)
+        for _ in range(3):  # the next ping follows only an answer
+            first, payload = raw.frame()
+            assert first == 0x89
+            raw.socket.sendall(frame(payload, 0x8A))
+        raw.socket.sendall(frame(b"\x03\xe8", 0x88))
+        while (received := raw.frame())[0] == 0x89:
+            pass
+        assert received == (0x88, b"\x03\xe8"), "a client may always close"
+
+
+def test_a_client_whose_messages_are_refused_is_not_read_for_a_while(registry: Registry) -> None:
+    _, slow = registry.keys.create("slow", ["act"], rate=0.001)
+    _, other = registry.keys.create("other", ["act"])
+    with listening(registry.storage) as listener:
+        raw = RawClient(listener, token=slow)
+        raw.socket.sendall(frame(b"{}") * 500)
+        assert b"rate_limited" in raw.frame()[1]
+        assert nothing_follows(raw, listener, other)
+        raw.socket.close()
+
+
+def test_frames_of_all_connections_share_the_turn(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many pings wait, a turn of the event loop handles few of them."""
+    per_turn: Counter[int] = Counter()
+    turn = 0
+    with listening(storage) as listener:
+        access, admit = listener.server.access, listener.server.access.admit_frame
+
+        def count(key: ApiKey | None) -> float:
+            nonlocal turn
+            if not per_turn:
+                count_turn()
+            per_turn[turn] += 1
+            return admit(key)
+
+        def count_turn() -> None:
+            nonlocal turn
+            turn += 1
+            asyncio.get_running_loop().call_soon(count_turn)
+
+        monkeypatch.setattr(access, "admit_frame", count)
+        clients = [RawClient(listener) for _ in range(3)]
+        for raw in clients:
+            raw.socket.sendall(PING * 500)
+        for raw in clients:
+            assert [raw.answer() for _ in range(500)] == [PONG] * 500
+            raw.socket.close()
+        assert max(per_turn.values()) <= uvicorn_websocket.MAX_FRAMES_PER_TURN + len(clients)
+
+
+def test_frames_without_a_key_share_a_rate(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access_control, "FRAMES", 10)
+    with listening(storage) as listener:
+        raw = RawClient(listener)
+        raw.socket.sendall(PING * 1000)
+        assert raw.answer() == PONG
+        with open_stream(listener) as stream:
+            assert answer_to(stream, BODY)["version"] == 1
+        raw.socket.setblocking(False)
+        assert len(raw.file.read(2000) or b"") < 1000
+        raw.socket.close()
 
 
 def test_a_message_of_too_many_fragments_closes_the_stream(listener: Listening) -> None:
