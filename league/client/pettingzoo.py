@@ -105,7 +105,9 @@ class _Actors:
         probabilities: bool,
     ) -> None:
         if missing := [agent for agent in agents if agent not in players]:
-            raise InvalidInput(f"no player for {', '.join(missing)}: specify one for each of {', '.join(agents)}")
+            raise InvalidInput(
+                f"no player for {', '.join(map(str, missing))}: specify one for each of {', '.join(map(str, agents))}"
+            )
         self._client = client
         self._players = players
         self._indices = {agent: index for index, agent in enumerate(agents)}

@@ -69,7 +69,8 @@ class _Adapter:
     def render(self, agent: str | None) -> Any:
         if agent is None:
             return self._env.render()
-        return getattr(self._env, "unwrapped", self._env).render_for(agent)
+        agent_id = getattr(self._env, "agent_ids", {}).get(agent, agent)
+        return getattr(self._env, "unwrapped", self._env).render_for(agent_id)
 
     def close(self) -> None:
         self._env.close()

@@ -23,6 +23,7 @@ from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
 from league.entry_points import import_entry_point, import_module, missing
+from league.environments.apis import NAMES, RLlibEnv, api_of, with_api
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrapping import wrapped
@@ -77,11 +78,10 @@ CHECKING_WRAPPERS = (OrderEnforcingWrapper, AssertOutOfBoundsWrapper, TerminateI
 """Removed, because they halve the speed of small games. Lockstep keeps the order and checks masks."""
 AMENDMENTS = (with_drawing, with_whole_reset, with_reseeding, with_one_copy)
 """Corrections and optimisations of some PettingZoo environments."""
-NAMES = {"aec": "a PettingZoo AECEnv", "parallel": "a PettingZoo ParallelEnv", "rllib": "an RLlib MultiAgentEnv"}
 
 
 def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
-    """Build an environment: a PettingZoo AECEnv or ParallelEnv, or an RLlib MultiAgentEnv.
+    """Build an environment: a PettingZoo AECEnv or ParallelEnv, or an `RLlibEnv`. Its agents are strings.
 
     Raises ConfigError if it cannot be imported, constructed or wrapped.
     """
@@ -98,13 +98,13 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
         if _refuses_arguments(constructor, kwargs, error):
             raise ConfigError(f"environment.kwargs: {config.entry_point} does not accept them: {error}") from error
         raise ConfigError(f"environment.entry_point: {config.entry_point} cannot be created{cause(error)}") from error
-    found = _api(env)
+    found = api_of(env, config.api)
     if found is None or config.api not in (None, found):
         expected = NAMES[config.api] if config.api else "an environment of PettingZoo (AEC or Parallel) or RLlib"
         raise ConfigError(
             f"environment.entry_point: {config.entry_point} returned a {type(env).__name__}, expected {expected}"
         )
-    env = _without_checks(env)
+    env = with_api(_without_checks(env), found)
     for amend in AMENDMENTS:
         env = amend(env)
     if config.wrappers and found == "rllib":
@@ -139,29 +139,18 @@ def _spaces(env: Any, agent: str, entry_point: str) -> AgentInterface:
 
 def observation_space(env: Any, agent: str) -> gymnasium.Space[Any]:
     """Return the observation space of an agent, for any API."""
-    if isinstance(env, AECEnv | ParallelEnv):
-        return env.observation_space(agent)
-    return _rllib_space(env, "observation_space", agent)
+    space: gymnasium.Space[Any] = _with_spaces(env).observation_space(agent)
+    return space
 
 
 def action_space(env: Any, agent: str) -> gymnasium.Space[Any]:
     """Return the action space of an agent, for any API."""
-    return (
-        env.action_space(agent) if isinstance(env, AECEnv | ParallelEnv) else _rllib_space(env, "action_space", agent)
-    )
+    space: gymnasium.Space[Any] = _with_spaces(env).action_space(agent)
+    return space
 
 
-def _rllib_space(env: Any, name: str, agent: str) -> gymnasium.Space[Any]:
-    """A MultiAgentEnv has a dictionary of spaces, a Dict space by agent, or one common space."""
-    spaces = getattr(env, f"{name}s", None)
-    if spaces and agent in spaces:
-        return spaces[agent]
-    space = getattr(env, name, None)
-    if isinstance(space, gymnasium.spaces.Dict) and agent in space.spaces:
-        return space.spaces[agent]
-    if not spaces and isinstance(space, gymnasium.Space):
-        return space
-    raise EnvironmentMismatch(f"{type(env).__name__} has no {name} for agent {agent!r}: expected one in `{name}s`")
+def _with_spaces(env: Any) -> Any:
+    return env if isinstance(env, AECEnv | ParallelEnv | RLlibEnv) else RLlibEnv(env)
 
 
 def interface(config: LeagueConfig) -> Interface:
@@ -175,8 +164,6 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
     names = list(getattr(env, "possible_agents", None) or ())
     if not names:
         raise EnvironmentMismatch(f"{config.environment.entry_point} has no possible_agents, which are required")
-    if not all(isinstance(name, str) for name in names):
-        raise EnvironmentMismatch(f"{config.environment.entry_point} has agents {names}: expected strings")
     agents = {agent: _spaces(env, agent, config.environment.entry_point) for agent in names}
     divided = config.policies
     if divided is None:
@@ -212,15 +199,6 @@ def _constructor(config: EnvironmentConfig) -> Any:
         expected = "a PettingZoo module with it, or package.module:function"
         raise ConfigError(f"environment.entry_point: {module_name!r} has no {name!r}: expected {expected}")
     return getattr(module, name)
-
-
-def _api(env: Any) -> str | None:
-    if isinstance(env, AECEnv):
-        return "aec"
-    if isinstance(env, ParallelEnv):
-        return "parallel"
-    is_rllib = all(hasattr(env, name) for name in ("reset", "step", "possible_agents"))
-    return "rllib" if is_rllib else None
 
 
 def _without_checks(env: Any) -> Any:

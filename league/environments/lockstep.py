@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
 from league.environments.building import action_space, build, observation_space
-from league.environments.crash_limit import CrashLimit
 from league.environments.stepping import (
     Batch,
     BatchedEnvironment,
+    CrashLimit,
     Indices,
     NextEpisodes,
     States,

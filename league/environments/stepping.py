@@ -1,10 +1,11 @@
-"""Interface of batched environments, which step many environments per call, and validation of actions.
+"""Interface of batched environments, which step many environments per call; validation of actions; limit of crashes.
 
 A step returns one batch per group with the observations of all agents that must act, across all environments. Groups
 are numbers that callers define: policies in training, policies of contestants in matches. In a turn-based game the rows
 of an agent are its own turns, and rewards are summed since the agent's previous row.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -14,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.vector.vector_env import AgentRows
-from league.errors import IllegalAction
+from league.errors import IllegalAction, one_line
 from league.spaces import ACTION_MASK, Box, Discrete, MultiBinary, MultiDiscrete, Space
+
+logger = logging.getLogger(__name__)
 
 Indices = NDArray[np.int64]
 
@@ -263,3 +266,33 @@ def allows_nothing(mask: NDArray, space: Space) -> NDArray:
 def _bound(bound: Any, infinite: float) -> NDArray:
     values = np.array(bound, dtype=np.float64)
     return np.where(np.isnan(values), infinite, values)
+
+
+class CrashLimit:
+    """Counts the consecutive crashes of each environment."""
+
+    def __init__(self, num_envs: int, most: int) -> None:
+        """most: number of consecutive crashes after which an environment is recreated; the next one is raised."""
+        self._most = most
+        self._consecutive = np.zeros(num_envs, np.int64)
+
+    def count(self, env: int, seed: int, error: Exception) -> None:
+        """Count a crash in the episode with that seed, and log it.
+
+        Raises `error` if it is one too many, with a note that names the seed.
+        """
+        self._consecutive[env] += 1
+        if self._consecutive[env] > self._most:
+            error.add_note(f"in the episode with seed {seed}")
+            raise error
+        logger.warning(
+            "The environment raised in the episode with seed %d and is recreated (%d of %d consecutive times): %s",
+            seed,
+            self._consecutive[env],
+            self._most,
+            one_line(error, with_type=True),
+        )
+
+    def finish(self, envs: Indices) -> None:
+        """Start counting anew: these environments have finished an episode."""
+        self._consecutive[envs] = 0

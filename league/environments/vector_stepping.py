@@ -11,9 +11,17 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build, observation_space
-from league.environments.crash_limit import CrashLimit
 from league.environments.episode_replay import EpisodeActions, StepActions
-from league.environments.stepping import Batch, Indices, NextEpisodes, States, Turn, check_actions, no_envs
+from league.environments.stepping import (
+    Batch,
+    CrashLimit,
+    Indices,
+    NextEpisodes,
+    States,
+    Turn,
+    check_actions,
+    no_envs,
+)
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, one_line
 from league.spaces import inputs

@@ -1,18 +1,14 @@
 from typing import Any
 
 import pytest
-from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.building import (
-    action_space,
     build,
-    describe,
     describe_policies,
     interface,
-    observation_space,
 )
 from league.errors import ConfigError, EnvironmentMismatch
 
@@ -164,35 +160,6 @@ def test_supersuit_does_not_wrap_rllib_environments() -> None:
     config = EnvironmentConfig(entry_point="examples.traffic:crossing", wrappers=["flatten_v0"])
     with pytest.raises(ConfigError, match=r"flatten_v0 \(number 1\).*RLlib"):
         build(config)
-
-
-class SharedSpace:
-    """RLlib's older API, without a dictionary of spaces."""
-
-    possible_agents = ("agent_0", "agent_1")
-
-    def __init__(self, space: Any) -> None:
-        self.observation_space = self.action_space = space
-        self.observation_spaces = self.action_spaces = None
-
-    def reset(self) -> None: ...
-
-    def step(self) -> None: ...
-
-
-def test_rllib_spaces_are_found_in_each_form() -> None:
-    one, other = spaces.Discrete(3), spaces.Discrete(4)
-    assert observation_space(SharedSpace(one), "agent_1") == one
-    assert action_space(SharedSpace(spaces.Dict(agent_0=one, agent_1=other)), "agent_1") == other
-    with pytest.raises(EnvironmentMismatch, match="no action_space for agent 'agent_1'"):
-        action_space(SharedSpace(None), "agent_1")
-
-
-def test_agents_without_string_names_are_rejected() -> None:
-    env = SharedSpace(spaces.Discrete(3))
-    env.possible_agents = (0, 1)  # type: ignore[assignment]
-    with pytest.raises(EnvironmentMismatch, match="expected strings"):
-        describe(env, league())
 
 
 ENTRY_POINTS_WITH_KINDS = {
