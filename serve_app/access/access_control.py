@@ -25,6 +25,7 @@ from serve_app.access.permissions import RequiredPermission
 from serve_app.access.request_body import BODY_READ
 from serve_app.access.request_origin import ORIGIN_HEADERS, reject_cross_site, reject_foreign_host
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.runtime.haproxy_script import KEY_ACCEPTED
 from serve_app.runtime.serve_bypass import is_event_stream
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
@@ -35,6 +36,8 @@ DEADLINE = "league.deadline"
 """Scope entry of an HTTP request: when its timeout ends, as a time of `time.monotonic`."""
 BEARER = b"bearer "
 HEADERS = ORIGIN_HEADERS | {b"authorization", b"x-api-key", b"x-request-timeout-ms"}
+NO_SNIFFING = (b"x-content-type-options", b"nosniff")
+"""Header of every response: browsers must not guess another type than the declared one."""
 DENIAL = "websocket.http.response"
 """ASGI extension that sends an HTTP response when a WebSocket handshake is refused."""
 POLICY_VIOLATION = 1008
@@ -87,7 +90,7 @@ class AccessControl:
         if self.is_local_only:
             reject_foreign_host(scope["headers"])
         if headers.is_browser:
-            reject_cross_site(method, scope["headers"])
+            reject_cross_site(scope["type"], method, scope["headers"])
         return self.admit(permissions.for_request(scope["type"], method, _path(scope)), headers.token)
 
     def admit_message(self, key: ApiKey | None, size: int) -> None:
@@ -203,6 +206,7 @@ class AccessControlMiddleware:
             key = self._access.admit_request(scope, shown)
             if key is not None:
                 scope[KEY] = key
+                response.add_header(KEY_ACCEPTED.encode(), b"1")
                 if self._log is not None:
                     scope[LOG_ENTRY]["key"] = key.name
             if kind != "http" or is_event_stream(_path(scope)):
@@ -214,10 +218,10 @@ class AccessControlMiddleware:
         except LeagueError as error:
             if response.has_started:
                 raise
-            await self._refuse(error, scope, receive, send)
+            await self._refuse(error, scope, receive, response.send)
         except TimeLimitExceeded:
             if not response.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
-                await self._refuse(_timeout_error(scope, timeout), scope, receive, send)
+                await self._refuse(_timeout_error(scope, timeout), scope, receive, response.send)
 
     async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
@@ -227,17 +231,24 @@ class AccessControlMiddleware:
 
 
 class ResponseTracker:
-    """Records whether a response has started; after that no error response can be sent."""
+    """Adds headers to a response, and records whether it has started; after that no error response can be sent."""
 
-    __slots__ = ("_send", "has_started")
+    __slots__ = ("_headers", "_send", "has_started")
 
     def __init__(self, send: Send) -> None:
         self._send = send
+        self._headers = [NO_SNIFFING]
         self.has_started = False
+
+    def add_header(self, name: bytes, value: bytes) -> None:
+        """Add a header to the response, which has not started."""
+        self._headers.append((name, value))
 
     def send(self, message: Message) -> Awaitable[None]:
         """ASGI `send`."""
-        self.has_started = True
+        if not self.has_started:
+            self.has_started = True
+            message["headers"] = [*message.get("headers", ()), *self._headers]
         return self._send(message)
 
 

@@ -137,7 +137,8 @@ class ErrorHandlers:
         """Handle a bug. The traceback goes to the log, not to the client."""
         logger.error("a request failed", exc_info=error)
         self._count(request.scope["path"], "internal_error")
-        return error_response(request.scope["path"], 500, "internal_error", "internal server error; see the server log")
+        message, headers = "internal server error; see the server log", {"x-content-type-options": "nosniff"}
+        return error_response(request.scope["path"], 500, "internal_error", message, headers)
 
 
 def error_response(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:

@@ -17,15 +17,20 @@ from serve_app.access.errors import CrossSiteRequest, UntrustedHost
 ORIGIN_HEADERS = frozenset((b"sec-fetch-site", b"origin"))
 """Headers in which a browser states the origin of a request."""
 SAFE_METHODS = ("GET", "HEAD")
+"""Methods whose responses browsers hide from pages of other origins. They do not hide a WebSocket, whose handshake is a
+GET."""
 SAME_ORIGIN = (b"same-origin", b"none")
 """Values of `Sec-Fetch-Site` for a page of this server, and for a bookmark or a typed address."""
 MAX_AUTHORITY = 262
 """Length of the longest host name (RFC 1035) with a port."""
 
 
-def reject_cross_site(method: str, headers: Iterable[tuple[bytes, bytes]]) -> None:
-    """Raise CrossSiteRequest if a page of another origin sent a request that is not GET or HEAD."""
-    if method in SAFE_METHODS:
+def reject_cross_site(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]]) -> None:
+    """Raise CrossSiteRequest if a page of another origin sent a request that is not GET or HEAD, or opens a WebSocket.
+
+    kind: The ASGI scope type.
+    """
+    if kind == "http" and method in SAFE_METHODS:
         return
     values = dict(headers)
     site, origin = values.get(b"sec-fetch-site"), values.get(b"origin")

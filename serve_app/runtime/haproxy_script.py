@@ -7,6 +7,10 @@ HAProxy with the last configuration that had routes, unknown to Ray. The next HA
 the port. An HAProxy without routes does not listen for requests, because it would respond to all of them with 404.
 While the server starts, serve_app.runtime.starting_page responds in place of a stand-in, until a replica is known.
 
+Idle and silent connections must not take the place of others. An address has a share of the connections, which is
+larger after a replica has accepted an API key from it. While many connections are open, each of them is closed after
+its response unless its key was accepted.
+
 A restarted controller waits at most ten seconds for its replicas to report, then it announces the application without
 them. The replicas run, so HAProxy keeps those that it knows until the controller names some. Its health checks
 find those that do not.
@@ -35,6 +39,26 @@ separately: a node that is gone is noticed sooner than a replica that is busy.""
 RESERVED_DESCRIPTORS = 200
 """File descriptors of HAProxy for listeners, threads and health checks. Each connection needs 2.5: two sockets, and a
 pipe for a quarter of the connections (`maxpipes`)."""
+KEY_ACCEPTED = "x-league-key-accepted"
+"""Header by which a replica tells HAProxy that it has accepted the API key of a request. HAProxy removes it."""
+LIMITS = """
+    tcp-request connection track-sc0 src,ipmask(32,64) table http_frontend
+    tcp-request connection reject if { sc0_conn_cur gt SHARE } { sc0_get_gpt0 eq 0 } !{ src 127.0.0.0/8 ::1 }
+    tcp-request connection reject if { sc0_conn_cur gt MOST }"""
+"""Lines of each frontend; SHARE and MOST are a quarter and three quarters of the connections. In IPv6 a client has all
+addresses of a network of 64 bits. Programs of this machine may be reverse proxies, or share a server without keys."""
+HTTP = f"""
+    option http-buffer-request
+    stick-table type ipv6 size 64k expire 10m store conn_cur,gpt0{LIMITS}
+    http-response set-var(sess.has_key) bool(true) if {{ res.hdr({KEY_ACCEPTED}) -m found }}
+    http-response sc-set-gpt0(0) 1 if {{ res.hdr({KEY_ACCEPTED}) -m found }}
+    http-response del-header {KEY_ACCEPTED}
+    acl may_stay var(sess.has_key) -m bool
+    acl may_stay status 101
+    http-after-response set-header connection close if {{ fe_conn gt SHARE }} !may_stay
+    http-after-response set-header x-content-type-options nosniff"""
+"""Lines of the HTTP frontend. A request is forwarded once its body has arrived or fills the buffer, so that slow
+clients occupy no replica."""
 RAY_PORTS = {"STATS": "8404", "METRICS": "9101"}
 """HAProxy's own ports, unless Ray's environment variables change them."""
 ERRORS = {
@@ -47,19 +71,22 @@ SCRIPT = """#!/bin/sh
 here='{here}'
 
 amend() {{  # Ray's configuration
+    connections=$(sed -n 's/^ *maxconn \\([0-9]*\\)$/\\1/p' "$1")
+    descriptors=$(ulimit -Hn)
+    if [ "$descriptors" != unlimited ]; then
+        most=$(( (descriptors - {reserved}) * 2 / 5 ))
+        [ "${{connections:-0}}" -gt "$most" ] && connections=$most
+    fi
+    : "${{connections:=2000}}"
     sed -i \\
         -e 's/^\\( *bind \\)[*]\\{{0,1\\}}:\\({stats}\\|{metrics}\\)$/\\1127.0.0.1:\\2/' \\
-        -e 's/^defaults$/&{timeouts}/' \\
+        -e "s/^\\( *maxconn \\)[0-9]*\\$/\\1$connections/" \\
+        -e 's|^defaults$|&{timeouts}|' \\
         -e 's|^\\( *\\)errorfile \\([0-9]*\\) .*$|\\1errorfile \\2 {here}/error.\\2|' \\
-        -e 's/^frontend http_frontend$/&\\n    option http-buffer-request/' \\
+        -e 's|^frontend http_frontend$|&{http}|' \\
+        -e 's|^frontend grpc_frontend$|&{grpc}|' \\
+        -e "s/MOST/$((connections * 3 / 4))/g; s/SHARE/$((connections / 4))/g" \\
         "$1"
-    descriptors=$(ulimit -Hn)
-    [ "$descriptors" = unlimited ] && return
-    most=$(( (descriptors - {reserved}) * 2 / 5 ))
-    connections=$(sed -n 's/^ *maxconn \\([0-9]*\\)$/\\1/p' "$1")
-    if [ "${{connections:-0}}" -gt "$most" ]; then
-        sed -i "s/^\\( *maxconn \\)$connections\\$/\\1$most/" "$1"
-    fi
 }}
 
 without_control() {{  # a configuration without the ports and sockets by which Ray knows its HAProxy
@@ -133,8 +160,8 @@ exec '{haproxy}' "$@"
 """
 """Restricts the statistics to this machine. Limits the number of connections to those for which there are file
 descriptors: HAProxy does not start otherwise. Limits the time to send a request, and sets the idle timeout of
-WebSockets, to which the request timeouts would apply otherwise. A request is forwarded once its body has arrived or
-fills the buffer, so that slow clients occupy no replica. HAProxy's own errors are those of the API, with their code."""
+WebSockets, to which the request timeouts would apply otherwise. HAProxy's own errors are those of the API, with their
+code."""
 
 
 def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
@@ -144,11 +171,18 @@ def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
         haproxy=binary,
         stats=stats,
         metrics=metrics,
-        timeouts="".join(f"\\n    timeout {name} {seconds}s" for name, seconds in TIMEOUTS.items()),
+        timeouts=_lines("".join(f"\n    timeout {name} {seconds}s" for name, seconds in TIMEOUTS.items())),
+        http=_lines(HTTP),
+        grpc=_lines(LIMITS),
         reserved=RESERVED_DESCRIPTORS,
         stopped=STOPPED,
         stand_in=STAND_IN,
     )
+
+
+def _lines(text: str) -> str:
+    """Lines as the replacement of a sed command."""
+    return text.replace("\n", "\\n")
 
 
 def find_haproxy() -> str | None:
@@ -186,7 +220,8 @@ def error_response(status: int) -> str:
     """HAProxy's own response, in the formats of both protocols: the body of /v2 has `error`, others have `code`."""
     reason, code, message = ERRORS[status]
     body = json.dumps({"code": code, "message": message, "error": message})
-    headers = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\nRetry-After: 1\r\n"
+    headers = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\nX-Content-Type-Options: nosniff\r\n"
+    headers += "Retry-After: 1\r\n"
     return f"HTTP/1.1 {status} {reason}\r\n{headers}\r\n{body}"
 
 

@@ -25,6 +25,7 @@ CONFIGURATION = """defaults
     timeout http-request 10s
 frontend http_frontend
     bind {host}:{port}
+    http-after-response set-header x-content-type-options nosniff
     acl is_page path /
     acl is_page hdr(accept) -m sub text/html
     http-request return status 503 content-type text/html hdr Retry-After 1 file {page} if is_page

@@ -1,20 +1,26 @@
-"""uvicorn's HTTP protocol with batched accepts, responses sent as one write, notification of shutdown, and the length
-of the accept queue.
+"""uvicorn's HTTP protocol with batched accepts, responses sent as one write, notification of shutdown, the length
+of the accept queue, and limits for idle connections.
 
 uvloop accepts one connection per turn of the event loop, and a turn handles the requests of all open connections. If
 many clients connect at once with slow requests, the last one would wait for a long time. Therefore each new
 connection accepts all others that wait.
+
+HAProxy limits the connections of its clients. Clients that connect to the port of a replica have a limit per address,
+and must send a request soon. While many connections are open, each of them is closed after its response.
 
 A server that stops finishes requests in progress. Event streams are notified so that they end.
 """
 
 import asyncio
 import os
+import resource
 import socket
 import stat
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, cast
 from weakref import WeakKeyDictionary
@@ -26,6 +32,11 @@ from uvicorn.server import ServerState
 
 from serve_app.runtime.joined_writes import JoinedWrites
 
+OF_ONE_ADDRESS, CROWDED = 1 / 8, 1 / 4
+"""Shares of the file descriptors of this process: connections of one address of another machine, and open connections
+from which on each is closed after its response."""
+FIRST_REQUEST = 10.0
+"""Seconds in which the head of the first request must arrive."""
 TCP_INFO_BYTES = 28
 UNACKED = slice(24, 28)
 """Offset of `tcpi_unacked` in struct tcp_info (linux/tcp.h): for a listening socket, the length of its accept queue."""
@@ -85,6 +96,27 @@ def _listens(number: int, port: int) -> bool:
 
 _queues: "WeakKeyDictionary[ServerState, AcceptQueue]" = WeakKeyDictionary()
 """Accept queue of each server of this process."""
+_addresses: "WeakKeyDictionary[ServerState, Counter[str]]" = WeakKeyDictionary()
+"""Open connections of each address of another machine, for each server of this process."""
+
+
+def _descriptors(share: float) -> float:
+    """A share of the file descriptors that this process may have."""
+    descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return float("inf") if descriptors == resource.RLIM_INFINITY else share * descriptors
+
+
+@lru_cache(maxsize=64)
+def _is_loopback(address: str) -> bool:
+    return ip_address(address).is_loopback
+
+
+NO_HTTP = b'{"code": "malformed_request", "message": "the request is not valid HTTP"}'
+MALFORMED = (
+    b"HTTP/1.1 400 Bad Request\r\ncontent-type: application/json\r\nx-content-type-options: nosniff\r\n"
+    b"connection: close\r\ncontent-length: %d\r\n\r\n%b" % (len(NO_HTTP), NO_HTTP)
+)
+"""The response to bytes that are not HTTP."""
 
 
 def install(when_stopping: Callable[[], None]) -> None:
@@ -108,6 +140,10 @@ class HttpProtocol(HttpToolsProtocol):
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
         self._when_stopping = when_stopping
+        self._address = ""
+        """The address of a client on another machine, as long as its connection counts."""
+        self._first_request: asyncio.TimerHandle | None = None
+        self._crowd = _descriptors(CROWDED)
 
     def shutdown(self) -> None:
         """Finish the request in progress."""
@@ -119,6 +155,10 @@ class HttpProtocol(HttpToolsProtocol):
         super().connection_made(cast(asyncio.Transport, transport))
         self._joined = JoinedWrites(self.transport, self.loop.call_soon)
         self.transport = cast(asyncio.Transport, self._joined)
+        if not self._is_admitted():
+            self._joined.transport.abort()
+            return
+        self._first_request = self.loop.call_later(FIRST_REQUEST, self.transport.close)
         if self.server is None or self.server[1] is None:
             return
         queue = _queues.get(self.server_state)
@@ -129,6 +169,27 @@ class HttpProtocol(HttpToolsProtocol):
             self.server_state.tasks.add(begun)  # type: ignore[arg-type]
             begun.add_done_callback(self.server_state.tasks.discard)
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count the connection no longer."""
+        super().connection_lost(exc)
+        self._release()
+
+    def on_headers_complete(self) -> None:
+        """Start the request."""
+        super().on_headers_complete()
+        if not self.cycle:  # an upgrade
+            return
+        if self._first_request is not None:
+            self._first_request.cancel()
+            self._first_request = None
+        if len(self.connections) > self._crowd:
+            self.cycle.keep_alive = False
+
+    def send_400_response(self, _: str) -> None:
+        """Answer bytes that are not HTTP."""
+        self.transport.write(MALFORMED)
+        self.transport.close()
+
     def on_response_complete(self) -> None:
         """Send the response."""
         self._joined.flush()
@@ -138,7 +199,30 @@ class HttpProtocol(HttpToolsProtocol):
         """Hand over the connection."""
         self._joined.flush()
         self.transport = self._joined.transport
+        self._release()
         super().handle_websocket_upgrade()
+
+    def _is_admitted(self) -> bool:
+        """Count the connection. Returns whether its address may have as many."""
+        if self.client is None or _is_loopback(self.client[0]):
+            return True
+        open_connections = _addresses.setdefault(self.server_state, Counter())
+        if open_connections[self.client[0]] >= _descriptors(OF_ONE_ADDRESS):
+            return False
+        self._address = self.client[0]
+        open_connections[self._address] += 1
+        return True
+
+    def _release(self) -> None:
+        if self._first_request is not None:
+            self._first_request.cancel()
+            self._first_request = None
+        if self._address:
+            open_connections = _addresses[self.server_state]
+            open_connections[self._address] -= 1
+            if not open_connections[self._address]:
+                del open_connections[self._address]
+            self._address = ""
 
     def _another(self) -> "HttpProtocol":
         return HttpProtocol(self._when_stopping, self.config, self.server_state, self.app_state, self.loop)

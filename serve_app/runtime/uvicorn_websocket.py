@@ -27,6 +27,7 @@ from websockets.protocol import State
 from websockets.speedups import apply_mask
 
 from serve_app.runtime.timeouts import resume
+from serve_app.runtime.uvicorn_http import MALFORMED
 
 STREAM_PROTOCOL = "league.direct"
 """Name of the ASGI extension with the protocol of this connection, which takes a message handler."""
@@ -152,7 +153,11 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Answer complete messages."""
-        if not self.handshake_initiated or not self._is_open_or_pending:
+        if not self.handshake_initiated:
+            super().data_received(data)
+            if self.conn.handshake_exc is not None and not self.handshake_initiated:
+                self._refuse_handshake()
+        elif not self._is_open_or_pending:
             super().data_received(data)
         elif self._pending or self._is_held:
             self._pending += data
@@ -163,6 +168,12 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         else:
             self._work(data)
         self._count_incomplete()
+
+    def _refuse_handshake(self) -> None:
+        """Answer a request that the library does not accept, such as one with a body, and close."""
+        self.handshake_initiated = self.handshake_complete = self.close_sent = True
+        self.transport.write(MALFORMED)
+        self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Release what the connection holds."""

@@ -19,6 +19,7 @@ from league.settings import Storage
 from serve_app.access.load_shedding import Backlog
 from serve_app.app import Replica
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.runtime.haproxy_script import KEY_ACCEPTED
 from serve_app.settings import ServeSettings
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import everything
@@ -80,6 +81,33 @@ def test_a_key_is_described_to_its_owner(client: TestClient, registry: Registry)
     until(lambda: client.get("/v1/key").json() == {"key": None, "is_needed": True})
     assert client.get("/v1/key", headers=bearer(token)).json() == {"key": description, "is_needed": True}
     assert_rejected(client.get("/v1/key", headers=bearer("plk_none")), 401, "unauthenticated", "unknown")
+
+
+def test_haproxy_is_told_that_a_key_was_accepted(registry: Registry) -> None:
+    _, token = registry.keys.create("bot", ["act"], rate=0.001)
+    with serving_replica(registry) as client:
+        assert KEY_ACCEPTED not in client.get("/docs", headers=bearer(token)).headers, "it needs no key"
+        assert KEY_ACCEPTED not in client.get("/v1/leagues", headers=bearer(token)).headers, "another scope"
+        assert client.post(ACTION, json=BODY, headers=bearer(token)).headers[KEY_ACCEPTED] == "1"
+        refused = client.post(ACTION, json=BODY, headers=bearer(token))
+        assert (refused.status_code, KEY_ACCEPTED in refused.headers) == (429, False)
+        assert KEY_ACCEPTED not in client.post(ACTION, json=BODY, headers=bearer("x" * 47)).headers
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/openapi.json", "/v1/leagues", "/v1/nothing", "/v2", "/metrics", "/?"])
+def test_browsers_do_not_guess_the_type_of_a_response(read_only_client: TestClient, path: str) -> None:
+    for method in ("GET", "POST", "HEAD"):
+        response = read_only_client.request(method, path)
+        assert response.headers.get_list("x-content-type-options") == ["nosniff"], (method, response.status_code)
+
+
+def test_an_error_of_ours_has_the_headers_of_a_response(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = Replica(Registry.open(storage), QUICK, "replica-1")
+    monkeypatch.setattr(server.models, "query", None)
+    application = server.application()
+    with TestClient(application, base_url=LOCALHOST, raise_server_exceptions=False) as client:
+        response = client.get("/v1/leagues")
+    assert (response.status_code, response.headers["x-content-type-options"]) == (500, "nosniff")
 
 
 def test_health_routes_need_no_key(registry: Registry) -> None:

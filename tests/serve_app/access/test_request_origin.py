@@ -47,16 +47,17 @@ def encoded(headers: dict[str, str]) -> list[tuple[bytes, bytes]]:
 
 @pytest.mark.parametrize("headers", SAME_SITE, ids=str)
 def test_our_pages_and_programs_are_accepted(headers: dict[str, str]) -> None:
-    reject_cross_site("POST", encoded(headers))
+    for kind, method in (("http", "POST"), ("websocket", "GET")):
+        reject_cross_site(kind, method, encoded(headers))
 
 
 @pytest.mark.parametrize("headers", CROSS_SITE, ids=str)
 def test_other_pages_can_only_read(headers: dict[str, str]) -> None:
-    for method in ("POST", "DELETE", "PUT", "OPTIONS"):
+    for kind, method in (*(("http", method) for method in ("POST", "DELETE", "PUT", "OPTIONS")), ("websocket", "GET")):
         with pytest.raises(CrossSiteRequest):
-            reject_cross_site(method, encoded(headers))
+            reject_cross_site(kind, method, encoded(headers))
     for method in ("GET", "HEAD"):
-        reject_cross_site(method, encoded(headers))
+        reject_cross_site("http", method, encoded(headers))
 
 
 @pytest.mark.parametrize("path", [ACTION, "/v1/leagues/board/rollback", "/v1/leagues/board/evaluations", "/docs"])

@@ -6,13 +6,15 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import httpx
 import pytest
+from starlette.types import Receive, Scope, Send
 
 from serve_app.runtime import haproxy, haproxy_script
+from tests.support.servers.http_protocol import serving
 from tests.support.waiting import until
 
 COMMAND = str(Path(sys.executable).with_name(haproxy_script.COMMAND))
@@ -197,3 +199,71 @@ def test_a_replica_that_ends_before_it_responds_is_reported(tmp_path: Path) -> N
         found = refused(tmp_path, "/v1/leagues", replica.getsockname()[1])
         replica.shutdown(socket.SHUT_RDWR)
     assert found == {"status": "502", "code": "replica_lost"}
+
+
+CONNECTIONS = 40
+"""`maxconn` of HAProxy, which is lower than for what descriptors suffice."""
+
+
+@contextmanager
+def crowded_proxy(directory: Path) -> Iterator[tuple[str, int]]:
+    """The address of an HAProxy for few connections. Its replica accepts the key of requests for /key."""
+
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        headers = [(b"content-length", b"0")]
+        if scope["path"] == "/key":
+            headers.append((haproxy_script.KEY_ACCEPTED.encode(), b"1"))
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body"})
+
+    (port,) = haproxy.free_ports(1, "127.0.0.1")
+    with serving(answer, "uvloop") as replica:
+        text = f"global\n    maxconn {CONNECTIONS}\n"
+        text += PROXY.format(directory=directory, port=port, replica=replica[1])
+        (directory / "haproxy.cfg").write_text(text)
+        command = [COMMAND, "-db", "-f", str(directory / "haproxy.cfg")]
+        with subprocess.Popen(command, env=NODE, stderr=subprocess.DEVNULL) as process:
+            try:
+                until(lambda: not haproxy.is_free("127.0.0.1", port))
+                yield "127.0.0.1", port
+            finally:
+                (directory / haproxy_script.STOPPED).touch()
+                process.kill()
+
+
+def head_of_response(client: socket.socket, path: str) -> bytes:
+    client.settimeout(20)
+    client.sendall(f"GET {path} HTTP/1.1\r\nhost: here\r\n\r\n".encode())
+    return client.recv(4096)
+
+
+def test_idle_connections_do_not_shut_out_others(tmp_path: Path) -> None:
+    """While many are open, each is closed after its response, unless a replica has accepted its key."""
+    with crowded_proxy(tmp_path) as address, ExitStack() as until_closed:
+
+        def connect() -> socket.socket:
+            return until_closed.enter_context(socket.create_connection(address))
+
+        with_key = [connect() for _ in range(3)]
+        for client in with_key:
+            reply = head_of_response(client, "/key")
+            assert haproxy_script.KEY_ACCEPTED.encode() not in reply
+            assert b"x-content-type-options: nosniff" in reply
+        closed = 0
+        for _ in range(2 * CONNECTIONS):
+            reply = head_of_response(connect(), "/")
+            assert reply.startswith(b"HTTP/1.1 200 ")
+            closed += b"connection: close" in reply
+        assert closed == 2 * CONNECTIONS + len(with_key) - CONNECTIONS // 4
+        for client in with_key:
+            assert b"connection: close" not in head_of_response(client, "/")
+
+
+def test_an_address_has_a_share_of_the_connections(tmp_path: Path) -> None:
+    """A client of which nothing arrives does not shut out another one. All addresses 127.… are loopback."""
+    with crowded_proxy(tmp_path) as address, ExitStack() as until_closed:
+        for _ in range(2 * CONNECTIONS):
+            with suppress(ConnectionResetError):  # one too many
+                until_closed.enter_context(socket.create_connection(address, source_address=("127.0.0.2", 0)))
+        with socket.create_connection(address) as client:
+            assert head_of_response(client, "/").startswith(b"HTTP/1.1 200 ")

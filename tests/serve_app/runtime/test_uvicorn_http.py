@@ -1,14 +1,18 @@
-"""Concurrent clients are accepted at once, however long the event loop was busy."""
+"""Concurrent clients are accepted at once, however long the event loop was busy, and idle ones have limits."""
 
 import asyncio
+import resource
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 from starlette.types import Receive, Scope, Send
 
+from serve_app.runtime import uvicorn_http
 from tests.support.servers.http_protocol import serving
+from tests.support.waiting import until
 
 CLIENTS = 40
 REQUEST = b"GET / HTTP/1.1\r\nhost: here\r\nconnection: close\r\n\r\n"
@@ -84,3 +88,63 @@ def test_a_stopping_server_accepts_no_connections() -> None:
     run_server("uvloop", run_client)
     with socket.socket() as probe:
         assert probe.connect_ex(addresses[0]) != 0
+
+
+def answered(connection: socket.socket) -> bytes:
+    """The head of a response."""
+    connection.settimeout(20)
+    reply = b""
+    while b"\r\n\r\n" not in reply and (data := connection.recv(4096)):
+        reply += data
+    return reply
+
+
+KEEP_ALIVE = b"GET / HTTP/1.1\r\nhost: here\r\n\r\n"
+
+
+def test_a_connection_stays_open_unless_many_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(TurnCounting(), "uvloop") as address:
+        with socket.create_connection(address) as client:
+            for _ in range(2):
+                client.sendall(KEEP_ALIVE)
+                assert b"connection: close" not in answered(client)
+        monkeypatch.setattr(uvicorn_http, "CROWDED", 0)
+        with socket.create_connection(address) as client:
+            client.sendall(KEEP_ALIVE)
+            assert b"connection: close" in answered(client)
+            assert client.recv(1) == b""
+
+
+def test_a_connection_without_a_request_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uvicorn_http, "FIRST_REQUEST", 0.05)
+    with serving(TurnCounting(), "uvloop") as address:
+        for sent in (b"", KEEP_ALIVE[:-2]):
+            with socket.create_connection(address) as client:
+                client.sendall(sent)
+                client.settimeout(20)
+                assert client.recv(1) == b""
+
+
+def test_an_address_of_another_machine_has_a_part_of_the_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    monkeypatch.setattr(uvicorn_http, "OF_ONE_ADDRESS", 3 / descriptors)
+    monkeypatch.setattr(uvicorn_http, "_is_loopback", lambda _: False)
+    with serving(TurnCounting(), "uvloop") as address:
+        for _ in range(2):  # closed connections do not count
+            clients = []
+            for number in range(5):
+                clients.append(socket.create_connection(address))
+                with suppress(ConnectionError):
+                    clients[-1].sendall(KEEP_ALIVE)
+                    assert (answered(clients[-1]) != b"") == (number < 3)
+            for client in clients:
+                client.close()
+            until(lambda: not any(uvicorn_http._addresses.values()))
+
+
+def test_what_is_not_http_gets_an_error_of_the_api() -> None:
+    with serving(TurnCounting(), "uvloop") as address, socket.create_connection(address) as client:
+        client.sendall(b"\x16\x03\x01\x02\r\n\r\n")
+        reply = answered(client)
+    assert reply.startswith(b"HTTP/1.1 400 ")
+    assert b"x-content-type-options: nosniff" in reply

@@ -102,6 +102,30 @@ def test_a_rejected_stream_has_an_error_response(listener: Listening, query: str
     assert json.loads(response.body or b"")["code"] in (code, "invalid_reference")
 
 
+@pytest.mark.parametrize(
+    "extra",
+    ["Content-Length: 2\r\n\r\n{}", "Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n", f"X: {'x' * 10_000}\r\n\r\n"],
+    ids=["body", "chunked", "large header"],
+)
+def test_a_handshake_that_is_no_websocket_is_answered(listener: Listening, extra: str) -> None:
+    host, port = listener.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=DEADLINE) as client:
+        client.sendall(
+            f"GET /v1/policies/board/stream HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+            f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n{extra}".encode()
+        )
+        assert client.makefile("rb").read().startswith(b"HTTP/1.1 400 ")
+
+
+def test_a_page_of_another_origin_opens_no_stream(listener: Listening) -> None:
+    with pytest.raises(InvalidStatus) as refused, open_stream(listener, origin="https://evil.example"):
+        pass
+    assert refused.value.response.status_code == 403
+    assert json.loads(refused.value.response.body or b"")["code"] == "cross_site"
+    with open_stream(listener, origin=listener.url) as stream:
+        assert answer_to(stream, BODY)["version"] == 1
+
+
 def test_a_fragmented_message_is_one_message(listener: Listening) -> None:
     parts = [BODY[at : at + 100] for at in range(0, len(BODY), 100)]
     with open_stream(listener) as stream:
