@@ -1,5 +1,7 @@
 // JSON requests to the server, with retries and the API key that the user entered. The key is kept in sessionStorage only.
 
+import { heard } from "./connection.js";
+
 const MAX_ATTEMPTS = 4;
 const NOT_READY_TIMEOUT = 60000; // milliseconds; `not_ready` is retried until the evaluation service has finished
 const MAX_RETRY_DELAY = 5000;
@@ -86,10 +88,16 @@ async function send(path, options, apiKey) {
   } finally {
     clearTimeout(timer);
   }
+  heard(response.status);
   if (response.ok) return response;
   const retryAfter = 1000 * Number(response.headers.get("retry-after")) || null;
   const body = await response.json().catch(() => ({}));
   throw new ApiError(response.status, body.code ?? "http_error", body.message ?? `The server returned status ${response.status}.`, retryAfter);
+}
+
+/** Throw ApiError if the server rejects a key. */
+export async function checkKey(text) {
+  await send("/v1/key", { headers: { accept: "application/json" } }, text);
 }
 
 export function pause(milliseconds, signal) {

@@ -1,10 +1,13 @@
 // The application: header, current page, and the API key dialog.
 
 import { html, render, useEffect, useRef, useState } from "./vendor/preact-htm.js";
-import { key, onKeyNeeded } from "./api.js";
+import { checkKey, key, onKeyNeeded } from "./api.js";
+import { useLostSince } from "./connection.js";
+import { useData } from "./data.js";
 import { League } from "./league.js";
 import { Leagues } from "./leagues.js";
 import { Dialog, Form, Notifications, sentence } from "./components.js";
+import { clock } from "./format.js";
 import { followLinks, matchRoute, useAddress } from "./router.js";
 
 const THEMES = ["system", "light", "dark"];
@@ -36,9 +39,8 @@ function App() {
       <a class="brand" href="/"><img src="/pages/logo.svg" alt="" width="24" height="24" /><span>Policy League</span></a>
       <nav aria-label="Documentation"><a href="/docs">API</a></nav>
       <${Theme} />
-      <button type="button" class="quiet" onClick=${() => setPrompt({ message: "", done: () => {}, reloads: true })}>
-        ${key.get() ? "API key ✓" : "API key"}<span class="visually-hidden">${key.get() ? ", entered" : ", not entered"}</span>
-      </button>
+      <${KeyButton} isPrompting=${!!prompt} onClick=${() => setPrompt({ message: "", done: () => {}, reloads: true })} />
+      <${ServerNotice} />
     </header>
     <main id="main" tabindex="-1" ref=${main} key=${generation}>
       ${isLeagues ? html`<${Leagues} />` : html`<${League} path=${path} />`}
@@ -47,9 +49,24 @@ function App() {
     ${prompt && html`<${KeyDialog} message=${prompt.message} close=${close} />`}`;
 }
 
+function ServerNotice() {
+  const lostSince = useLostSince();
+  return lostSince && html`<p class="lost" role="alert"><strong>The server is not responding.</strong> Last response: ${clock(lostSince)}. This page may be out of date.</p>`;
+}
+
+/** Shows whether the server accepts the entered key. It is checked again after each prompt. */
+function KeyButton({ isPrompting, onClick }) {
+  const entered = key.get();
+  const { data, error } = useData(entered ? "/v1/key" : null, `${entered} ${isPrompting}`);
+  const [sign, state] = !entered ? ["", "not entered"] : error?.status === 401 ? [" ✗", "not valid"] : data ? [" ✓", "valid"] : ["", "entered"];
+  return html`<button type="button" class="quiet" onClick=${onClick}>API key${sign}<span class="visually-hidden">, ${state}</span></button>`;
+}
+
 function KeyDialog({ message, close }) {
   const submit = async (fields) => {
-    key.set(fields.get("key").trim());
+    const text = fields.get("key").trim();
+    await checkKey(text);
+    key.set(text);
     close(true);
   };
   return html`<${Dialog} title="API key" onClose=${() => close(false)}>

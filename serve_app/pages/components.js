@@ -13,9 +13,9 @@ export function useTitle(name, ...parts) {
   useEffect(() => { if (title) document.title = title; }, [title]);
 }
 
-/** Show the children once data is loaded; before that a loading message, or the error. */
+/** Show the children once data is loaded; before that a loading message, or the error. The header shows that old data stays because the server is lost. */
 export function Await({ result, message = "Loading …", children }) {
-  if (result.data ?? result.items) return html`${result.error && html`<${ErrorNotice} error=${result.error} retry=${result.retry} stale />`}${children}`;
+  if (result.data ?? result.items) return html`${result.error && result.error.code !== "network" && html`<${ErrorNotice} error=${result.error} retry=${result.retry} stale />`}${children}`;
   if (result.error) return html`<${ErrorNotice} error=${result.error} retry=${result.retry} />`;
   return html`<p class="loading muted" role="status">${message}</p>`;
 }

@@ -2,15 +2,19 @@
 
 import { createContext, useCallback, useContext, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { ApiError, isTemporary, key, query, request } from "./api.js";
+import { onBack } from "./connection.js";
 import { follow } from "./events.js";
 
 const PAGE = 50;
 const MAX_LIMIT = 100;
 const RETRY_DELAY = 10000; // milliseconds until a failed load is retried without user action
 
-/** {data, error, retry}. Nothing is loaded while `path` is null. When `token` changes, the old data stays until the new data arrives. */
-export function useData(path, token = "") {
-  return useLoaded(path, token, (signal) => request(path, { signal }));
+/**
+ * {data, error, retry}. Nothing is loaded while `path` is null. When `token` changes, the old data stays until the new data arrives.
+ * `every`: milliseconds after which the data is loaded again, while the page is visible.
+ */
+export function useData(path, token = "", every = null) {
+  return useLoaded(path, token, (signal) => request(path, { signal }), every);
 }
 
 /** {items, more, error, retry} of a list with cursor pagination. `more()` loads the next page; it is null on the last page. */
@@ -53,7 +57,7 @@ export function useOffsetList(path, name, token = "") {
   return { items: data?.items ?? null, page: data?.page ?? null, more, error, retry };
 }
 
-function useLoaded(path, token, load) {
+function useLoaded(path, token, load, every = null) {
   const [state, setState] = useState({ path: null, data: null, error: null });
   const [attempt, setAttempt] = useState(0);
   useEffect(() => {
@@ -67,9 +71,15 @@ function useLoaded(path, token, load) {
   }, [path, token, attempt]);
   const retry = useCallback(() => setAttempt((previous) => previous + 1), []);
   useEffect(() => {
-    const timer = state.error instanceof ApiError && isTemporary(state.error, true) && setTimeout(retry, RETRY_DELAY);
-    return () => clearTimeout(timer);
-  }, [state.error]);
+    const isFailed = state.error instanceof ApiError && isTemporary(state.error, true);
+    const delay = isFailed ? RETRY_DELAY : state.error ? null : every;
+    if (!delay) return undefined;
+    let timer = null;
+    const wait = () => { timer = setTimeout(() => (document.hidden ? wait() : retry()), delay); };
+    wait();
+    const ignore = onBack(() => isFailed && retry());
+    return () => { clearTimeout(timer); ignore(); };
+  }, [state]);
   return state.path === path ? { ...state, retry } : { data: null, error: null, retry };
 }
 

@@ -1,6 +1,7 @@
 // Server-sent events, read with `fetch` because `EventSource` cannot send an API key.
 
 import { ApiError, pause, request } from "./api.js";
+import { heard, onBack } from "./connection.js";
 
 const IDLE_TIMEOUT = 10000; // milliseconds; the server sends a comment every two seconds
 const MAX_RECONNECT_DELAY = 15000;
@@ -32,10 +33,18 @@ export function follow(path, onEvent, { isLast = () => false } = {}) {
         document.removeEventListener("visibilitychange", disconnect);
         closed.signal.removeEventListener("abort", disconnect);
       }
-      await pause(Math.min(MAX_RECONNECT_DELAY, 500 * 2 ** failures), closed.signal).catch(() => {});
+      await reconnectDelay(failures, closed.signal);
     }
   })().catch(() => {}); // closed while waiting
   return () => closed.abort();
+}
+
+/** Wait longer after each failure, at most until the server responds again. */
+async function reconnectDelay(failures, signal) {
+  let ignore;
+  const isBack = new Promise((resolve) => { ignore = onBack(resolve); });
+  await Promise.race([pause(Math.min(MAX_RECONNECT_DELAY, 500 * 2 ** failures), signal).catch(() => {}), isBack]);
+  ignore();
 }
 
 /** The events of a stream, as pairs of name and parsed data. Aborts the connection if nothing arrives for IDLE_TIMEOUT. */
@@ -46,6 +55,7 @@ async function* messages(body, connection) {
     const timer = setTimeout(() => connection.abort(), IDLE_TIMEOUT);
     const { value, done } = await reader.read().finally(() => clearTimeout(timer));
     if (done) return;
+    heard();
     const blocks = (rest + value).replaceAll("\r\n", "\n").split("\n\n");
     rest = blocks.pop();
     for (const block of blocks) {

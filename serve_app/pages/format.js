@@ -58,6 +58,10 @@ export const shortVerdict = (verdict) => verdict.split("-verdict-").at(-1).slice
 const medium = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", year: "numeric", hour: "2-digit", minute: "2-digit" });
 const full = new Intl.DateTimeFormat("en-GB", { dateStyle: "full", timeStyle: "long" });
 
+const time = new Intl.DateTimeFormat("en-GB", { timeStyle: "medium" });
+
+/** `14:03:12`. */
+export const clock = (at) => time.format(new Date(at));
 export const dateTime = (iso) => medium.format(new Date(iso));
 export const fullDateTime = (iso) => full.format(new Date(iso));
 

@@ -22,15 +22,15 @@ export function Leaderboard({ league, about }) {
       </ul></nav>`}
     </div>
     <${EarlierResults} league=${league} summary=${about.summary} game=${game} />
-    <${Await} result=${rows}>${rows.items && html`<${Rows} league=${league} rows=${rows.items} champion=${about.champion} computedAt=${rows.page.computed_at} />`}<//>
+    <${Await} result=${rows}>${rows.items && html`<${Rows} league=${league} rows=${rows.items} champion=${about.champion} isComputed=${!!rows.page.computed_at && about.up_to_date} />`}<//>
     <${ShowMore} list=${rows} />
     ${rows.items?.length > 0 && html`<p class="muted small">${plural(rows.page.total, "contestant")}. Ratings are Elo above <code>script:random</code>, with 95 % intervals.</p>`}
   </section>`;
 }
 
-function Rows({ league, rows, champion, computedAt }) {
+function Rows({ league, rows, champion, isComputed }) {
   if (!rows.length) {
-    return html`<${EmptyState}>${computedAt
+    return html`<${EmptyState}>${isComputed
       ? html`No games yet. <a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to rate the versions.`
       : "The leaderboard has not been computed yet. The evaluation service computes it a few seconds after new games."}<//>`;
   }

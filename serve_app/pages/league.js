@@ -35,6 +35,7 @@ const TABS = [
   ["Play", "play", Play],
 ];
 
+const REFRESH_INTERVAL = 5000;
 const LEAGUE = "/leagues/:league";
 const ROUTES = [
   ...TABS.map(([name, path, page]) => [`${LEAGUE}/${path}`, { tab: path, page, name, isCompact: page === Play }]),
@@ -61,7 +62,7 @@ function NotFound({ path }) {
 
 function KnownLeague({ league, route, parameters }) {
   const [state, setState] = useState({});
-  const about = useData(apiPath(league), JSON.stringify([state.aliases, state.computed_at, state.traffic, state.serving]));
+  const about = useData(apiPath(league), JSON.stringify([state.aliases, state.computed_at, state.traffic, state.serving]), REFRESH_INTERVAL);
   useEvents(about.data && apiPath(league, "events"), (name, data) => name === "league" && setState(data));
   useTitle(route.name, league);
   if (about.error?.status === 404 || about.error?.status === 400) {

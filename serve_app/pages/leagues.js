@@ -2,14 +2,14 @@
 
 import { html } from "./vendor/preact-htm.js";
 import { Await, Badge, EmptyState, leaguePath, Outcome, Time, useTitle } from "./components.js";
-import { useData, useTicks } from "./data.js";
+import { useData } from "./data.js";
 import { count, plural, rate, shortRef } from "./format.js";
 
 const REFRESH_INTERVAL = 5000;
 
 export function Leagues() {
   useTitle("Leagues");
-  const leagues = useData("/v1/leagues", useTicks(REFRESH_INTERVAL));
+  const leagues = useData("/v1/leagues", "", REFRESH_INTERVAL);
   return html`<div class="title"><h1>Leagues</h1></div>
     <${Await} result=${leagues}>${leagues.data && html`<${List} leagues=${leagues.data.leagues} />`}<//>`;
 }

@@ -26,7 +26,9 @@ export function Payoff({ league, about }) {
     <${EarlierResults} league=${league} summary=${about.summary} game=${game} page="payoff" />
     <${Await} result=${payoff}>${payoff.data && (table
       ? html`<${Heatmap} league=${league} payoff=${table} scores=${table.by_side?.[side] ?? table.score} champion=${about.champion} />`
-      : html`<${EmptyState}>No games yet. <a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to compare the versions.<//>`)}<//>
+      : html`<${EmptyState}>${about.up_to_date
+          ? html`No games yet. <a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to compare the versions.`
+          : "The payoff matrix has not been computed yet. The evaluation service computes it a few seconds after new games."}<//>`)}<//>
   </section>`;
 }
 

@@ -2,14 +2,14 @@
 
 import { html } from "./vendor/preact-htm.js";
 import { apiPath } from "./api.js";
-import { useChangeToken, useData, useTicks } from "./data.js";
+import { useChangeToken, useData } from "./data.js";
 import { Await, EmptyState, Properties, Ref, Table, Time } from "./components.js";
 import { count, number, percent } from "./format.js";
 
 const REFRESH_INTERVAL = 5000;
 
 export function Traffic({ league, about }) {
-  const traffic = useData(apiPath(league, "traffic"), `${useChangeToken("traffic", "aliases")} ${useTicks(REFRESH_INTERVAL)}`);
+  const traffic = useData(apiPath(league, "traffic"), useChangeToken("traffic", "aliases"), REFRESH_INTERVAL);
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Traffic</h2></div>
     <${Await} result=${traffic}>${traffic.data && html`<${Setting} traffic=${traffic.data} /><${Requests} league=${league} versions=${traffic.data.all.versions} champion=${about.champion} />

@@ -1,15 +1,17 @@
 """Changes by users and live updates: promotions, evaluations, notes, API keys."""
 
 import re
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, Route, expect
 
 from league.refs import CheckpointRef
 from tests.support.clients.browsers import Served, Tab
-from tests.support.leagues.browser_leagues import EMPTY, RUN, record
+from tests.support.leagues.browser_leagues import CONNECT_FOUR, EMPTY, NAMED, RUN, record
 from tests.support.leagues.reported_league import HOSTILE
 from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.servers.proxies import proxy
 
 pytestmark = pytest.mark.slow  # a browser and a server take all cores
 
@@ -290,6 +292,86 @@ def test_a_page_recovers_with_the_server_without_user_action(tab: Tab) -> None:
     expect_champion(page, 3)
     expect(page.get_by_role("alert")).to_have_count(0)
     tab.errors = [each for each in tab.errors if "net::ERR_FAILED" not in each]
+
+
+LIVE_PAGES = ("/", L, f"{L}/runs/{RUN}", f"/leagues/{CONNECT_FOUR}/play")
+
+
+def test_each_open_page_says_that_the_server_is_not_responding(tab: Tab, served: Served, tmp_path: Path) -> None:
+    with proxy(tmp_path, served.url) as server:
+        pages = [tab.page, *(tab.page.context.new_page() for _ in LIVE_PAGES[1:])]
+        for page, path in zip(pages, LIVE_PAGES, strict=True):
+            page.goto(server.url + path)
+            expect(page.locator("main")).to_contain_text(re.compile("Games|Start game"))
+        expect_champion(pages[1], 3)
+
+        def expect_notices(number: int) -> None:
+            for page in pages:
+                expect(page.get_by_role("alert")).to_have_count(number)
+                expect(page.get_by_role("banner").get_by_text("The server is not responding")).to_have_count(number)
+
+        expect_notices(0)
+        server.freeze()
+        expect_notices(1)
+        server.thaw()
+        expect_notices(0)
+        server.stop()
+        expect_notices(1)
+        served.registry.aliases.set(LEAGUE, "champion", 2, expected=3, actor="cli", reason="nobody is watching")
+        server.start()
+        expect_notices(0)
+        expect_champion(pages[1], 2)
+    served.registry.aliases.rollback(LEAGUE, actor="cli", reason="as it was")
+    tab.errors = [each for each in tab.errors if "net::ERR_" not in each]
+
+
+def test_an_invalid_key_is_rejected(tab: Tab, served: Served) -> None:
+    page = tab.open(L)
+    button = page.get_by_role("button", name=re.compile("^API key"))
+    button.click()
+    enter_key(page, "plk_wrong")
+    dialog = page.get_by_role("dialog", name=KEY_DIALOG)
+    expect(dialog.get_by_role("alert")).to_contain_text("The API key is unknown, revoked or expired")
+    enter_key(page, served.keys["reader"])
+    expect(button).to_have_accessible_name(re.compile("✓.*, valid"))
+    page.evaluate("sessionStorage.setItem('key', 'plk_revoked')")
+    page.reload()
+    page.get_by_role("button", name="Cancel").click()
+    expect(button).to_have_accessible_name(re.compile("✗.*, not valid"))
+    tab.ignore(401)
+
+
+def test_results_that_are_being_computed_are_not_called_missing(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{NAMED}")
+    expect(page.get_by_text("No games yet")).to_be_visible()
+
+    def change(route: Route) -> None:
+        reply = route.fetch()
+        route.fulfill(response=reply, json=reply.json() | {"up_to_date": False})
+
+    tab.page.route(re.compile(f"/v1/leagues/{NAMED}$"), change)
+    expect(page.get_by_text("updating", exact=True)).to_be_visible()  # without a reload
+    expect(page.get_by_text("The leaderboard has not been computed yet")).to_be_visible()
+    page.get_by_role("link", name="Payoff matrix").click()
+    expect(page.get_by_text("The payoff matrix has not been computed yet")).to_be_visible()
+
+
+def test_the_word_updating_is_not_broken(tab: Tab) -> None:
+    """At every width, as a line of its own if it does not fit."""
+
+    def change(route: Route) -> None:
+        reply = route.fetch()
+        route.fulfill(response=reply, json=reply.json() | {"up_to_date": False})
+
+    tab.page.route(re.compile(f"/v1{L}$"), change)
+    page = tab.open(L)
+    word = page.get_by_text("updating", exact=True)
+    expect(word).to_be_visible()
+    for width in range(320, 1500, 20):
+        page.set_viewport_size({"width": width, "height": 800})
+        box = word.bounding_box()
+        assert box is not None
+        assert box["height"] < 30, f"two lines at {width} pixels"
 
 
 def test_a_request_without_a_response_is_repeated(tab: Tab) -> None:
