@@ -74,9 +74,10 @@ class AccessControl:
 
         Raises Unauthenticated, Forbidden, RateLimited or Overloaded.
         """
-        key = None
-        if need.scope is not None and (need.is_change or self.requires_key):
-            key = self._authorize(need, token)
+        key = self._identify(need, token)
+        if key is not None:
+            _check_league(key, need)
+            _take_token(key)
         if need.scope == "act":
             self.backlog.admit()
         return key
@@ -145,23 +146,34 @@ class AccessControl:
             return False
         return True
 
-    def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str, model: str, size: int) -> None:
-        """Accept an RPC of GRPCInferenceService with a message of `size` bytes. Raises the errors of `admit`."""
-        key = self.admit(permissions.for_rpc(rpc, model), _read_headers(headers_of(metadata)).token)
-        if size > LARGE_BODY:
-            self.admit_body(key, size)
+    def admit_rpc(self, metadata: Iterable[tuple[str, Any]] | None, rpc: str) -> ApiKey | None:
+        """Accept an RPC of GRPCInferenceService before its message is read, and return its key.
 
-    def _authorize(self, need: RequiredPermission, token: bytes | None) -> ApiKey:
+        Raises Unauthenticated, Forbidden, RateLimited or Overloaded.
+        """
+        need = permissions.for_rpc(rpc, "")
+        key = self._identify(need, _read_headers(headers_of(metadata)).token)
+        if key is not None:
+            _take_token(key)
+        if need.scope == "act":
+            self.backlog.admit()
+        return key
+
+    def check_model(self, key: ApiKey | None, rpc: str, model: str) -> None:
+        """Check that the key of an accepted RPC permits a model. Raises Forbidden."""
+        if key is not None:
+            _check_league(key, permissions.for_rpc(rpc, model))
+
+    def _identify(self, need: RequiredPermission, token: bytes | None) -> ApiKey | None:
+        """The key that a permission requires, None if it requires none. Raises Unauthenticated or Forbidden."""
+        if need.scope is None or not (need.is_change or self.requires_key):
+            return None
         key = None if token is None else self._api_keys.find(token)
         if key is None:
             raise Unauthenticated(self._why_not(need, token))
         if need.scope not in key.scopes:
             allowed = ", ".join(sorted(key.scopes))
             raise Forbidden(f"this request requires the scope {need.scope}; the key {key.name} has {allowed}")
-        if key.leagues is not None and need.league not in key.leagues and (need.league or need.is_of_all):
-            allowed, what = ", ".join(sorted(key.leagues)), "all leagues" if need.is_of_all else "another league"
-            raise Forbidden(f"this request concerns {what}; the key {key.name} is restricted to {allowed}")
-        _take_token(key)
         return key
 
     def _why_not(self, need: RequiredPermission, token: bytes | None) -> str:
@@ -250,6 +262,13 @@ class ResponseTracker:
             self.has_started = True
             message["headers"] = [*message.get("headers", ()), *self._headers]
         return self._send(message)
+
+
+def _check_league(key: ApiKey, need: RequiredPermission) -> None:
+    """Raise Forbidden if a key is restricted to other leagues."""
+    if key.leagues is not None and need.league not in key.leagues and (need.league or need.is_of_all):
+        allowed, what = ", ".join(sorted(key.leagues)), "all leagues" if need.is_of_all else "another league"
+        raise Forbidden(f"this request concerns {what}; the key {key.name} is restricted to {allowed}")
 
 
 def _take_token(key: ApiKey) -> None:

@@ -10,10 +10,10 @@ its service answers, bypassing Ray Serve's request path. In Ray Serve's fallback
 from typing import Any, Protocol
 
 import grpc
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import Message
 
 from league.errors import LeagueError, NotReady
-from serve_app.access.errors import MalformedBody, status_of
+from serve_app.access.errors import status_of
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.runtime.ray_serve import add_rpc_service, logger
 
@@ -23,6 +23,7 @@ CODES = {
     401: grpc.StatusCode.UNAUTHENTICATED,
     403: grpc.StatusCode.PERMISSION_DENIED,
     404: grpc.StatusCode.NOT_FOUND,
+    408: grpc.StatusCode.DEADLINE_EXCEEDED,
     409: grpc.StatusCode.FAILED_PRECONDITION,
     413: grpc.StatusCode.RESOURCE_EXHAUSTED,
     415: grpc.StatusCode.INVALID_ARGUMENT,
@@ -38,8 +39,8 @@ MAX_MESSAGE_LENGTH = 1024
 class RpcService(Protocol):
     """Answers the calls of a process."""
 
-    async def call(self, rpc: str, request: Message, context: grpc.aio.ServicerContext) -> Message:
-        """Answer a call. Raises LeagueError."""
+    async def call(self, rpc: str, request_type: type[Message], context: grpc.aio.ServicerContext) -> Message:
+        """Read the message of a call from `context`, and answer it. Raises LeagueError."""
 
 
 _service: RpcService | None = None
@@ -58,20 +59,16 @@ def add_service(_: Any, server: grpc.aio.Server) -> None:
     add_rpc_service(server, SERVICE, handlers)
 
 
-def _handler(rpc: str, request_type: Any) -> grpc.RpcMethodHandler:
-    def parse(body: bytes) -> Message | None:
-        try:
-            return request_type.FromString(body)
-        except DecodeError:  # gRPC would report an internal error
-            return None
+def _handler(rpc: str, request_type: type[Message]) -> grpc.RpcMethodHandler:
+    """The handler of a unary call. It is registered as one that receives a stream, which is the same on the wire: gRPC
+    would read and parse the message of a unary call before it asks anybody.
+    """
 
-    async def answer(request: Message | None, context: grpc.aio.ServicerContext) -> Message | None:
+    async def answer(_: Any, context: grpc.aio.ServicerContext) -> Message | None:
         try:
-            if request is None:
-                raise MalformedBody(f"the message is not a valid {request_type.DESCRIPTOR.name}")
             if _service is None:
                 raise NotReady("this process has no replica")
-            return await _service.call(rpc, request, context)
+            return await _service.call(rpc, request_type, context)
         except LeagueError as error:
             code, message = CODES.get(status_of(error), grpc.StatusCode.INTERNAL), error.public_message
         except Exception as error:
@@ -83,7 +80,7 @@ def _handler(rpc: str, request_type: Any) -> grpc.RpcMethodHandler:
         context.set_details(message[:MAX_MESSAGE_LENGTH])
         return None  # no response is sent with an error
 
-    return grpc.unary_unary_rpc_method_handler(answer, parse, _serialize)
+    return grpc.stream_unary_rpc_method_handler(answer, response_serializer=_serialize)
 
 
 def _serialize(message: Message) -> bytes:

@@ -8,19 +8,23 @@ from urllib.parse import unquote
 
 import grpc
 from google.protobuf.json_format import ParseDict
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from league.errors import ArtifactCorrupt, BodyTooLarge, InvalidInput, LeagueError, NotFound, NotReady, StorageError
 from serve_app.access.access_control import AccessControl, headers_of
+from serve_app.access.errors import BodyTooSlow
 from serve_app.access.request_body import MAX_CHANGE_BODY
+from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.catalogue import ModelCatalogue
+from serve_app.inference_protocol.field_count import check_fields, malformed
 from serve_app.inference_protocol.inference import Inference, InferRequest, InferResponse
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
-from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
+from serve_app.inference_protocol.tensors import Data, RequestTensor, Signature, datatype_of, to_bytes
 from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.models.traffic_split import Headers
+from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
 
 CONTENTS = {
@@ -37,6 +41,21 @@ CONTENTS = {
     "FP64": "fp64_contents",
 }
 """Field with the elements of a datatype if they are not sent as bytes. FP16 has none."""
+
+
+FEW_TENSORS = 64
+"""Requests with more are compared with the policy's signature before they are read."""
+
+
+def check_counts(request: messages.ModelInferRequest, signature: Signature) -> None:
+    """Raise InvalidInput if a request has more tensors than a policy."""
+    for what, names, most in (
+        ("inputs", request.inputs, signature.inputs),
+        ("raw_input_contents", request.raw_input_contents, signature.inputs),
+        ("outputs", request.outputs, signature.outputs),
+    ):
+        if len(names) > len(most):
+            raise InvalidInput(f"the request has {len(names)} {what}, expected at most {len(most)}")
 
 
 def read_request(request: messages.ModelInferRequest, size: int) -> InferRequest:
@@ -106,6 +125,8 @@ def is_local_peer(peer: str, machine: str) -> bool:
 
 
 INFER = "ModelInfer"
+EMPTY = ("ServerLive", "ServerReady", "ServerMetadata")
+"""RPCs whose messages have no fields; they are not read."""
 
 
 class InferenceService:
@@ -139,25 +160,43 @@ class InferenceService:
             "RepositoryIndex": self._repository_index,
         }
 
-    async def call(self, rpc: str, request: Message, context: grpc.aio.ServicerContext) -> Message:
-        """Answer a call. Raises LeagueError."""
+    async def call(self, rpc: str, request_type: type[Message], context: grpc.aio.ServicerContext) -> Message:
+        """Answer a call. Raises LeagueError.
+
+        The caller is known before its message is read, and the message is small before it is parsed.
+        """
         if self._settings.grpc_local_only and not is_local_peer(context.peer(), self._machine):
             raise NotReady("replicas accept gRPC from their own machine only: call the server's port")
-        size, limit = request.ByteSize(), self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY
-        # Names in a message that is too large are not even read.
-        is_too_large = size > limit
-        model = "" if is_too_large else getattr(request, "model_name", "") or getattr(request, "name", "")
-        metadata = context.invocation_metadata()
+        metadata, model = context.invocation_metadata(), ""
         try:
-            self._access.admit_rpc(metadata, rpc, model, size)
-            if is_too_large:
-                raise BodyTooLarge(f"the message is larger than {limit} bytes")
-            if rpc == INFER:
-                return await self._model_infer(request, size, headers_of(metadata))
-            return await self.rpcs[rpc](request)
+            key = self._access.admit_rpc(metadata, rpc)
+            if rpc in EMPTY:
+                return await self.rpcs[rpc](request_type())
+            with self._inference.admitted():
+                body = await self._read(context, self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY)
+                if len(body) > LARGE_BODY:
+                    self._access.admit_body(key, len(body))
+                request: Any = parse(body, request_type)
+                model = request.model_name if rpc == INFER else getattr(request, "name", "")
+                self._access.check_model(key, rpc, model)
+                if rpc == INFER:
+                    return await self._model_infer(request, len(body), headers_of(metadata))
+                return await self.rpcs[rpc](request)
         except LeagueError as error:
             self._count(f"/v2/models/{model}", error.code)
             raise
+
+    async def _read(self, context: grpc.aio.ServicerContext, limit: int) -> bytes:
+        """Read the message of a call. Raises BodyTooSlow or BodyTooLarge."""
+        try:
+            body = await run_within(self._settings.timeout, context.read())
+        except TimeLimitExceeded:
+            raise BodyTooSlow(f"the message did not arrive within {self._settings.timeout:g} s") from None
+        if not isinstance(body, bytes):  # the call has no message, or one above the limit of the server
+            body = b""
+        if len(body) > limit:
+            raise BodyTooLarge(f"the message is larger than {limit} bytes")
+        return body
 
     async def _server_live(self, _: Message) -> Message:
         return messages.ServerLiveResponse(live=True)
@@ -192,8 +231,19 @@ class InferenceService:
         return _message({"models": models}, messages.RepositoryIndexResponse())
 
     async def _model_infer(self, request: messages.ModelInferRequest, size: int, headers: Headers) -> Message:
-        with self._inference.admitted():
-            return await self._inference.infer(read_request(request, size), write_response, headers)
+        if max(len(request.inputs), len(request.outputs), len(request.raw_input_contents)) > FEW_TENSORS:
+            served = await self._inference.find(request.model_name, request.model_version, headers)
+            check_counts(request, served.signature)
+        return await self._inference.infer(read_request(request, size), write_response, headers)
+
+
+def parse(body: bytes, request_type: type[Message]) -> Message:
+    """Parse a message. Raises BodyTooLarge or MalformedBody."""
+    check_fields(body, request_type.DESCRIPTOR)
+    try:
+        return request_type.FromString(body)
+    except DecodeError:
+        raise malformed(request_type.DESCRIPTOR) from None
 
 
 def _message(document: Document, empty: Message) -> Message:

@@ -90,6 +90,8 @@ def _leaf(dtype: str, shape: tuple[int | None, ...]) -> Leaf:
 
 NUMBERS = {int, float}
 BOOLEANS = {bool}
+ELEMENTS = 8192
+"""Elements that are converted at once."""
 
 
 class RequestTensor(NamedTuple):
@@ -149,7 +151,8 @@ def _array(tensor: RequestTensor, port: TensorSpec, max_batch: int) -> NDArray:
         raise BodyTooLarge(f"{port.name} has {shape[0]} rows, expected at most {max_batch}")
     if isinstance(tensor.data, bytes | memoryview):
         return check(port.name, _from_buffer(tensor.data, shape, port), port.leaf)
-    return check(port.name, _from_list(tensor.data, shape, port), port.leaf)
+    read = _from_list if isinstance(tensor.data, list) else _from_field
+    return check(port.name, read(tensor.data, shape, port), port.leaf)
 
 
 def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorSpec) -> NDArray:
@@ -163,10 +166,26 @@ def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorS
     return array.reshape(shape)
 
 
+def _from_field(data: Sequence[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:
+    """The elements of a field of a gRPC message, whose type is that of the datatype.
+
+    They are converted in parts: the interpreter serves nobody else while it converts one.
+    """
+    if len(data) != (size := prod(shape)):
+        raise _wrong_size(port, len(data), size, shape)
+    array = np.empty(size, port.leaf.dtype)
+    try:
+        for begin in range(0, size, ELEMENTS):
+            array[begin : begin + ELEMENTS] = data[begin : begin + ELEMENTS]
+    except OverflowError:
+        raise _out_of_range(port) from None
+    return array.reshape(shape)
+
+
 def _from_list(data: Sequence[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:
     if len(data) > (size := prod(shape)):
-        raise ObservationError(f"{port.name} has {len(data)} elements, expected {size} for {_list(shape)}")
-    flat = data if isinstance(data, list) else list(data)
+        raise _wrong_size(port, len(data), size, shape)
+    flat = data
     kinds = set(map(type, flat))
     while kinds == {list}:
         flat = list(chain.from_iterable(flat))
@@ -176,14 +195,22 @@ def _from_list(data: Sequence[Any], shape: tuple[int, ...], port: TensorSpec) ->
     if not kinds <= expected:
         raise ObservationError(f"{port.name} contains values other than {port.datatype}, or lists of unequal depth")
     if len(flat) != size:
-        raise ObservationError(f"{port.name} has {len(flat)} elements, expected {size} for {_list(shape)}")
+        raise _wrong_size(port, len(flat), size, shape)
     dtype = np.dtype(port.leaf.dtype)
     try:
         with np.errstate(over="ignore"):  # overflow becomes infinity, which is refused
             array = np.array(flat, None if float in kinds and dtype.kind in "iu" else dtype)
     except OverflowError:
-        raise ObservationError(f"{port.name} contains a number out of range for {port.datatype}") from None
+        raise _out_of_range(port) from None
     return array.reshape(shape)
+
+
+def _wrong_size(port: TensorSpec, elements: int, expected: int, shape: tuple[int, ...]) -> ObservationError:
+    return ObservationError(f"{port.name} has {elements} elements, expected {expected} for {_list(shape)}")
+
+
+def _out_of_range(port: TensorSpec) -> ObservationError:
+    return ObservationError(f"{port.name} contains a number out of range for {port.datatype}")
 
 
 def _list(sizes: Sequence[Any]) -> str:

@@ -2,6 +2,7 @@
 
 import gc
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
@@ -13,13 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.app import Replica
 from serve_app.inference_protocol import grpc_handlers
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.grpc_service import CONTENTS
 from tests.support.clients.protocol_observations import observations, policy_of
 from tests.support.leagues.protocol_leagues import DTYPES
-from tests.support.servers.protocol_servers import InProcess
+from tests.support.servers.protocol_servers import SETTINGS, InProcess, Listening
 
 Call = Callable[[str, Any], Any]
 Input = messages.ModelInferRequest.InferInputTensor
@@ -134,6 +137,42 @@ def test_raw_contents_are_for_all_inputs_or_for_none(call: Call) -> None:
 def test_a_large_message_is_rejected(call: Call, replica: InProcess) -> None:
     request = messages.ModelInferRequest(model_name="vector", raw_input_contents=[bytes(600 * 1024)])
     assert "larger than 524288 bytes" in error_of(call, request)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [(b"\x2a\0", "inputs"), (b"\x32\0", "outputs"), (b"\x3a\0", "raw_input_contents")],
+)
+def test_more_tensors_than_those_of_the_policy_are_rejected(call: Call, part: bytes, message: str) -> None:
+    request = messages.ModelInferRequest(model_name="vector").SerializeToString()
+    assert f"the request has 5000 {message}, expected at most" in error_of(call, request + 5000 * part)
+    assert "more than 10000 fields" in error_of(call, request + 200_000 * part)
+
+
+def test_a_call_without_a_message_is_refused(replica: InProcess) -> None:
+    with grpc.insecure_channel(replica.grpc) as channel:
+        infer = channel.stream_unary(f"/{grpc_handlers.SERVICE}/ModelInfer")
+        with pytest.raises(grpc.RpcError) as caught:
+            infer(iter([]))
+    assert caught.value.code() in CLIENT_ERRORS  # type: ignore[attr-defined]
+
+
+def test_a_message_that_does_not_arrive_is_not_waited_for(leagues: Storage) -> None:
+    settings = SETTINGS.model_copy(update={"timeout": 0.1})
+    ends = threading.Event()
+
+    def never() -> Iterator[bytes]:
+        ends.wait()
+        yield b""
+
+    with Listening(Replica(Registry.open(leagues), settings, "replica-2")) as slow:
+        with grpc.insecure_channel(slow.grpc) as channel:
+            infer = channel.stream_unary(f"/{grpc_handlers.SERVICE}/ModelInfer")
+            with pytest.raises(grpc.RpcError, match=r"did not arrive within 0\.1 s") as caught:
+                infer(never())
+            assert slow.server.inference.in_flight == 0
+        ends.set()
+    assert caught.value.code() == grpc.StatusCode.DEADLINE_EXCEEDED  # type: ignore[attr-defined]
 
 
 def test_the_number_of_concurrent_calls_is_limited(

@@ -1,7 +1,9 @@
 """API keys in both protocols, sent by the unmodified client as a header or as metadata."""
 
+import threading
 from collections.abc import Iterator
 
+import grpc
 import numpy as np
 import pytest
 from tritonclient.utils import InferenceServerException
@@ -9,6 +11,7 @@ from tritonclient.utils import InferenceServerException
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
+from serve_app.inference_protocol import grpc_handlers
 from tests.support.clients.triton import FORMS, Triton
 from tests.support.leagues.served_leagues import everything
 from tests.support.servers.protocol_servers import InProcess, Listening
@@ -52,3 +55,21 @@ def test_a_key_is_limited_to_its_scope(locked: tuple[InProcess, dict[str, str]],
         assert_rejected("wrong", "infer", "vector", VECTOR, headers=reads)
         assert_rejected("unknown", "get_model_metadata", "get_model_metadata", "vector")
         assert_rejected("wrong", "get_model_repository_index", "get_model_repository_index", headers=acts)
+
+
+@pytest.mark.parametrize("rpc", ["ModelInfer", "ModelReady", "ModelStatistics", "RepositoryIndex", "ServerMetadata"])
+def test_a_caller_without_a_key_is_refused_before_its_message_arrives(
+    locked: tuple[InProcess, dict[str, str]], rpc: str
+) -> None:
+    address, _ = locked
+    ends = threading.Event()
+
+    def never() -> Iterator[bytes]:
+        ends.wait()
+        yield b""
+
+    with grpc.insecure_channel(address.grpc) as channel:
+        with pytest.raises(grpc.RpcError) as caught:
+            channel.stream_unary(f"/{grpc_handlers.SERVICE}/{rpc}")(never(), timeout=4)
+        ends.set()
+    assert caught.value.code() == grpc.StatusCode.UNAUTHENTICATED  # type: ignore[attr-defined]
