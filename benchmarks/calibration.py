@@ -96,7 +96,7 @@ def traps(quick: bool) -> bool:
     beaten = promoted = 0
     for _ in range(number):
         champion = _decided(settings, against_champion, rng)
-        anchor = _decided(settings.against_anchor(None), against_anchor, rng)
+        anchor = _decided(settings.against_anchor(settings.margin), against_anchor, rng)
         seen = combine_results(
             champion, [AnchorResult(AnchorTest("trap@1", margin, "s"), anchor)], planned_companions=1, forfeits=0
         )
@@ -150,7 +150,7 @@ def sampled(quick: bool) -> bool:
 def exploiters(quick: bool) -> bool:
     """Tests against exploiters at the default margin, and intervals of the difference in exploitability."""
     number, margin, met = 200 if quick else 1_000, SINGLE.margin_against_exploiters, True
-    settings = SINGLE.model_copy(update={"max_blocks": 4000}).against_exploiter(margin)
+    settings = SINGLE.model_copy(update={"max_blocks": 4000}).compared_with_champion(margin)
     for pairs in (1, 3):
         found = {gap: exploiter_gates.simulated(settings, gap, pairs, number) for gap in (0.0, -margin)}
         wrong = {0.0: ~found[0.0].promoted, -margin: found[-margin].promoted}
@@ -175,6 +175,36 @@ def exploiters(quick: bool) -> bool:
             f" blocks covers {by_block:.2%}, over blocks and exploiters {by_both:.2%} (95 %)"
         )
         met &= _high(round(by_both * number), number) >= 0.95
+    return met
+
+
+AGAINST_ANCHORS = {
+    "as strong as the champion": (0.5, 0.0),
+    "stronger: the champion scores 22 %": (0.22, 0.0),
+    "weaker, and four of five games of candidate and champion are the same": (0.7, 0.8),
+}
+"""Anchor → mean score of the champion against it, and the share of equal games."""
+
+
+def anchors(quick: bool) -> bool:
+    """Tests that a candidate does no worse than the champion against an anchor, at the default margin."""
+    margin, met = SINGLE.margin_against_exploiters, True
+    for alpha, number in ((0.05, 500 if quick else 5_000), (alpha_per_verdict(1, 0.05), 500 if quick else 20_000)):
+        settings = GateConfig().of_one_verdict(alpha).compared_with_champion(margin)
+        for anchor, (champion, alike) in AGAINST_ANCHORS.items():
+            worse, equal, better = (
+                exploiter_gates.against_anchor(settings, champion, gap, alike, number, seed)
+                for seed, gap in enumerate((-margin, 0.0, margin / 2), start=21)
+            )
+            false, passed = int(worse.promoted.sum()), int(equal.promoted.sum())
+            ends = binomtest(false, number).proportion_ci(0.95)
+            print(
+                f"  α = {alpha:.2g}, anchor {anchor}, {number} tests: worse by {margin:g}: {false / number:.3%} passed"
+                f" [{ends.low:.3%}, {ends.high:.3%}] (≤ {alpha:.3%}); as good: {passed / number:.2%} passed (≥ 95 %)"
+                f" after {equal.blocks.mean():.0f} pairs on average; better by {margin / 2:g}:"
+                f" {better.promoted.mean():.2%} after {better.blocks.mean():.0f}"
+            )
+            met &= ends.low <= alpha and _high(passed, number) >= 0.95
     return met
 
 
@@ -212,6 +242,7 @@ PARTS: dict[str, Callable[[bool], bool]] = {
     "play": play,
     "sampled": sampled,
     "exploiters": exploiters,
+    "anchors": anchors,
     "intervals": intervals,
 }
 

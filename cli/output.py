@@ -247,10 +247,9 @@ def verdict(report: "VerdictReport") -> str:
     games = f"after {report.games} games ({report.unique_games} unique), score {score}"
     place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
     gap = f", returns differ by {difference(report.difference)}" if report.difference else ""
-    anchors = "".join(f"; {wording.against_anchor(each, report.model)}" for each in report.anchors)
+    anchors = "".join(f"; {wording.against_anchor(each, report.opponent, report.model)}" for each in report.anchors)
     exploiters = "".join(
-        f"; against {each.ref} {wording.against_exploiter(each, report.opponent, report.model)}"
-        for each in report.exploiters
+        f"; {wording.against_exploiter(each, report.opponent, report.model)}" for each in report.exploiters
     )
     note = f": {report.note}" if report.note else ""
     exploiters += "" if report.exploitability is None else f"; {_exploitability(report.exploitability, report.model)}"

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from league.conditions import ActionSelection
 from league.results.records import Scoring
+from league.verdict_tests import AnchorMode
 
 
 class Document:
@@ -209,11 +210,18 @@ class CompanionReport(Document):
 
 @dataclass(frozen=True, slots=True)
 class AnchorReport(CompanionReport):
-    """One non-inferiority test. margin: in the gate's unit. outcome: `not inferior` or `inferior`."""
+    """One test against an anchor.
+
+    mode: `at_least`: the margin is in the gate's unit, and the outcome `not inferior` or `inferior`. `no_worse`: all
+    other fields are those of an ExploiterReport, and there is no Elo.
+    """
 
     score: float | None
     elo: float | None
     interval: tuple[float | None, float | None] | None
+    mode: AnchorMode = "at_least"
+    champion_score: float | None = None
+    difference: Difference | None = None
 
 
 @dataclass(frozen=True, slots=True)

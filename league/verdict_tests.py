@@ -4,19 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
+
+AnchorMode = Literal["no_worse", "at_least"]
+"""What a test against an anchor compares the candidate with: the champion's results against it, or the anchor."""
 
 
 @dataclass(frozen=True, slots=True)
 class AnchorTest:
-    """Whether the candidate is not inferior to an anchor.
+    """Whether the candidate is not inferior to an anchor, or to the champion against the anchor.
 
-    ref: the anchor. margin: by how much the candidate may be weaker. schedule: id of the schedule of its matches.
+    Attributes:
+        ref: The anchor.
+        margin: By how much the candidate may be weaker, or do worse than the champion.
+        schedule: Id of the schedule of its matches.
+        mode: `at_least` in verdicts of releases without modes.
     """
 
     ref: str
     margin: float
     schedule: str
+    mode: AnchorMode = "at_least"
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +108,10 @@ class CompanionTests:
         anchors, exploiters = settings.get("anchors", ()), settings.get("exploiters", ())
         trained = settings.get("exploitability")
         return cls(
-            anchors=tuple(AnchorTest(each["ref"], each["margin"], each["schedule"]) for each in anchors),
+            anchors=tuple(
+                AnchorTest(each["ref"], each["margin"], each["schedule"], each.get("mode", "at_least"))
+                for each in anchors
+            ),
             exploiters=tuple(
                 ExploiterTest(each["ref"], each["exploits"], each["margin"], each["schedule"]) for each in exploiters
             ),

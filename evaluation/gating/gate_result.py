@@ -17,13 +17,14 @@ from evaluation.gating.sequential_tests import SequentialTest, sequential_test
 from evaluation.results import Difference
 from evaluation.statistics.payoff import crossed_interval, student_interval
 from league.config.gate import GateConfig
+from league.refs import CheckpointRef, parse_ref
 from league.results.records import Match
 from league.verdict_tests import AnchorTest, CompanionTest, ExploitabilityTest, ExploiterTest
 
 
 @dataclass(frozen=True, slots=True)
 class AnchorResult:
-    """Result of a non-inferiority test against one anchor."""
+    """Result of a non-inferiority test against one anchor, with the mode `at_least`."""
 
     test: AnchorTest
     decision: Decision
@@ -40,17 +41,19 @@ class AnchorResult:
 
 
 @dataclass(frozen=True, slots=True)
-class ExploiterResult:
-    """Result of a paired test of candidate and champion against one exploiter.
+class PairedResult:
+    """Result of a paired test of candidate and champion against one exploiter, or an anchor with the mode `no_worse`.
 
     Attributes:
         test: The test.
+        champion: Reference of the champion.
         decision: Its decision, whose blocks are pairs of blocks.
         scores: Mean scores of candidate and champion over the counted pairs; None without pairs.
         difference: Score of the candidate minus the champion's, or its difference of returns if the gate tests returns.
     """
 
-    test: ExploiterTest
+    test: ExploiterTest | AnchorTest
+    champion: str
     decision: Decision
     scores: tuple[float, float] | None
     difference: Difference | None
@@ -58,16 +61,21 @@ class ExploiterResult:
     @property
     def failure(self) -> str:
         """What a `reject` shows."""
-        return f"does worse than the champion against {self._exploiter}"
+        return f"does worse than {name_of_champion(self.champion)} against {self._opponent}"
 
     @property
     def claim(self) -> str:
         """What a `promote` shows."""
-        return f"is at most {self.test.margin:g} worse than the champion against {self._exploiter}"
+        worse = f"at most {self.test.margin:g} worse than {name_of_champion(self.champion)}"
+        return f"is {worse} against {self._opponent}"
 
     @property
-    def _exploiter(self) -> str:
-        return f"{self.test.ref}, an exploiter of {self.test.exploits}"
+    def _opponent(self) -> str:
+        match self.test:
+            case AnchorTest(ref=ref):
+                return ref
+            case ExploiterTest(ref=ref, exploits=target):
+                return f"{ref}, an exploiter of {target}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +112,12 @@ class ExploitabilityResult:
         return f"is {less} exploitable than {self.champion} by exploiters trained against each"
 
 
-CompanionResult = AnchorResult | ExploiterResult | ExploitabilityResult
+CompanionResult = AnchorResult | PairedResult | ExploitabilityResult
+
+
+def name_of_champion(opponent: str) -> str:
+    """`the champion`, or the script that is the opponent of a verdict without a champion."""
+    return "the champion" if isinstance(parse_ref(opponent), CheckpointRef) else opponent
 
 
 def companion_result(
@@ -114,26 +127,31 @@ def companion_result(
     sequential = sequential_test(gate, test, candidate, champion)
     decision = decide_matches(sequential, matches)
     match test:
-        case AnchorTest():
+        case AnchorTest(mode="at_least"):
             return AnchorResult(test, decision)
-        case ExploiterTest():
-            return _exploiter_result(test, decision, sequential, matches[: decision.blocks * sequential.matches_each])
+        case AnchorTest() | ExploiterTest():
+            counted = matches[: decision.blocks * sequential.matches_each]
+            return _paired_result(test, champion, decision, sequential, counted)
         case ExploitabilityTest():
             size = sequential.at_least * sequential.matches_each
             return _exploitability_result(test, decision, sequential, matches[:size] if len(matches) >= size else ())
 
 
-def _exploiter_result(
-    test: ExploiterTest, decision: Decision, sequential: SequentialTest, counted: Sequence[Match]
-) -> ExploiterResult:
+def _paired_result(
+    test: ExploiterTest | AnchorTest,
+    champion: str,
+    decision: Decision,
+    sequential: SequentialTest,
+    counted: Sequence[Match],
+) -> PairedResult:
     if not counted:
-        return ExploiterResult(test, decision, None, None)
+        return PairedResult(test, champion, decision, None, None)
     own, other = (
         sum(match.score(match.contestants.index(each)) for match in counted if each in match.contestants)
         for each in (sequential.candidate, sequential.champion)
     )
     scores = own / decision.blocks, other / decision.blocks
-    return ExploiterResult(test, decision, scores, student_interval(observe(sequential, counted).gaps))
+    return PairedResult(test, champion, decision, scores, student_interval(observe(sequential, counted).gaps))
 
 
 def _exploitability_result(
@@ -169,12 +187,14 @@ class GateResult:
     shown: str = "it beat the champion"
 
     @property
-    def anchors(self) -> tuple[AnchorResult, ...]:
-        return tuple(each for each in self.companions if isinstance(each, AnchorResult))
+    def anchors(self) -> tuple[AnchorResult | PairedResult, ...]:
+        results = (each for each in self.companions if isinstance(each, AnchorResult | PairedResult))
+        return tuple(each for each in results if isinstance(each.test, AnchorTest))
 
     @property
-    def exploiters(self) -> tuple[ExploiterResult, ...]:
-        return tuple(each for each in self.companions if isinstance(each, ExploiterResult))
+    def exploiters(self) -> tuple[PairedResult, ...]:
+        results = (each for each in self.companions if isinstance(each, PairedResult))
+        return tuple(each for each in results if isinstance(each.test, ExploiterTest))
 
     @property
     def exploitability(self) -> ExploitabilityResult | None:

@@ -1,8 +1,8 @@
 """What a sequential test observes: blocks against an opponent, or rounds in which candidate and champion are compared.
 
-In a round, candidate and champion each play a block against an exploiter from the same seed, opening and seats. With
-their scores s in [0, 1], the observation is (1 + s_candidate - s_champion) / 2, the score of a contest in which the
-candidate beats the champion by scoring more. What an opening is worth against the exploiter cancels.
+In a round, candidate and champion each play a block against an exploiter or an anchor from the same seed, opening and
+seats. With their scores s in [0, 1], the observation is (1 + s_candidate - s_champion) / 2, the score of a contest in
+which the candidate beats the champion by scoring more. What an opening is worth against the opponent cancels.
 
 In the test of exploitability a round has several pairs of blocks, one for each pair of exploiters, all from the same
 seed. s is then the mean over the blocks of a round, because these are not independent.

@@ -15,8 +15,8 @@ class SequentialTest:
     Attributes:
         settings: The gate's settings, with the hypotheses of this test.
         candidate: Reference of the candidate.
-        champion: For a comparison with the champion against exploiters, the contestant of every second match. None for
-            a test against one opponent.
+        champion: For a comparison with the champion against others, the contestant of every second match. None for a
+            test against one opponent.
         pairs: Pairs of matches in a round.
         at_least: Observations to be made even if fewer decide the test.
     """
@@ -36,10 +36,10 @@ class SequentialTest:
 def sequential_test(gate: GateConfig, test: CompanionTest, candidate: str, champion: str) -> SequentialTest:
     """Return how a test of a verdict is decided. gate: the settings of the test against the champion."""
     match test:
-        case AnchorTest():
+        case AnchorTest(mode="at_least"):
             return SequentialTest(gate.against_anchor(test.margin), candidate)
-        case ExploiterTest():
-            return SequentialTest(gate.against_exploiter(test.margin), candidate, champion)
+        case AnchorTest() | ExploiterTest():
+            return SequentialTest(gate.compared_with_champion(test.margin), candidate, champion)
         case ExploitabilityTest():
             settings = gate.of_exploitability(test.margin, test.improvement)
             return SequentialTest(settings, candidate, champion, pairs=len(test.of_candidate), at_least=test.blocks)

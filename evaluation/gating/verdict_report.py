@@ -12,10 +12,11 @@ from evaluation.gating.gate_result import (
     AnchorResult,
     CompanionResult,
     ExploitabilityResult,
-    ExploiterResult,
     GateResult,
+    PairedResult,
     combine_results,
     companion_result,
+    name_of_champion,
 )
 from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_records import forfeits
@@ -30,11 +31,11 @@ from evaluation.results import (
 from evaluation.statistics.payoff import paired_difference
 from evaluation.statistics.sequential import elo_estimate
 from league.config.gate import GateConfig
-from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.rows import VerdictRow
 from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match
+from league.verdict_tests import AnchorTest, ExploiterTest
 
 
 def is_applied(registry: Registry, verdict: VerdictRow) -> bool:
@@ -89,7 +90,7 @@ def gate_result(registry: Registry, verdict: VerdictRow) -> GateResult:
         found = companion_result(gate, test, candidate_ref, verdict.champion, matches)
         companions.append(found)
         forfeited += forfeits(matches[: found.decision.games // GAMES_PER_BLOCK], candidate_ref)
-    opponent = "the champion" if isinstance(parse_ref(verdict.champion), CheckpointRef) else verdict.champion
+    opponent = name_of_champion(verdict.champion)
     shown = f"it beat {opponent}" if gate.requires_gain else f"it is not inferior to {opponent}"
     return combine_results(champion, companions, tests.number, None if gate.forfeits else forfeited, shown)
 
@@ -132,25 +133,28 @@ def report_of(
 
 
 OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "inconclusive", None: "open"}
+PAIRED_OUTCOMES = OUTCOMES | {"promote": "not worse", "reject": "worse"}
 
 
-def anchor_report(anchor: AnchorResult) -> AnchorReport:
-    """Report of one non-inferiority test."""
+def anchor_report(anchor: AnchorResult | PairedResult) -> AnchorReport:
+    """Report of one test against an anchor."""
+    assert isinstance(anchor.test, AnchorTest), "it is the result of an anchor"
+    statistics, outcomes = gate_statistics(anchor.decision), OUTCOMES
+    if isinstance(anchor, PairedResult):
+        statistics, outcomes = statistics | _paired_statistics(anchor), PAIRED_OUTCOMES
     return AnchorReport(
         ref=anchor.test.ref,
         margin=anchor.test.margin,
         schedule=anchor.test.schedule,
-        outcome=OUTCOMES[anchor.decision.outcome],
-        **gate_statistics(anchor.decision),
+        outcome=outcomes[anchor.decision.outcome],
+        **statistics,
+        mode=anchor.test.mode,
     )
 
 
-PAIRED_OUTCOMES = OUTCOMES | {"promote": "not worse", "reject": "worse"}
-
-
-def exploiter_report(exploiter: ExploiterResult) -> ExploiterReport:
+def exploiter_report(exploiter: PairedResult) -> ExploiterReport:
     """Report of one paired test against an exploiter."""
-    own, champion = exploiter.scores or (None, None)
+    assert isinstance(exploiter.test, ExploiterTest), "it is the result of an exploiter"
     return ExploiterReport(
         ref=exploiter.test.ref,
         exploits=exploiter.test.exploits,
@@ -158,10 +162,13 @@ def exploiter_report(exploiter: ExploiterResult) -> ExploiterReport:
         schedule=exploiter.test.schedule,
         outcome=PAIRED_OUTCOMES[exploiter.decision.outcome],
         **_test_statistics(exploiter.decision),
-        score=own,
-        champion_score=champion,
-        difference=exploiter.difference,
+        **_paired_statistics(exploiter),
     )
+
+
+def _paired_statistics(result: PairedResult) -> dict[str, Any]:
+    score, champion_score = result.scores or (None, None)
+    return {"score": score, "champion_score": champion_score, "difference": result.difference}
 
 
 EXPLOITABILITY_OUTCOMES = OUTCOMES | {"promote": "not more exploitable", "reject": "more exploitable"}

@@ -17,13 +17,13 @@ from dataclasses import replace
 from evaluation.gating.anchors import resolve_anchors
 from evaluation.gating.exploiters import recent_exploiters
 from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
-from evaluation.gating.gate_result import GateResult
+from evaluation.gating.gate_result import AnchorResult, GateResult, PairedResult
 from evaluation.gating.sequential_tests import SequentialTest, sequential_test
 from evaluation.gating.trained_exploiters import Trainer, prepared_test
 from evaluation.gating.verdict_report import confirmation, gate_of, gate_result, is_applied, report_of
 from evaluation.matches import tournament
 from evaluation.results import Confirmation, Listener, Progress, VerdictReport
-from evaluation.schedules.builders import companion, exploiter_test
+from evaluation.schedules.builders import companion, paired_test
 from evaluation.schedules.builders import verdict as verdict_schedule
 from league.config.gate import GateConfig
 from league.errors import AliasMoved
@@ -119,11 +119,13 @@ def _opened_tests(
     opponent = schedule.contestants[1]
     anchors, exploiters, confirmation = list[AnchorTest](), list[ExploiterTest](), None
     for anchor in resolve_anchors(registry, league, candidate, opponent):
-        own = companion(config, interface, "anchor", schedule, anchor.ref, gate.max_blocks)
-        anchors.append(AnchorTest(anchor.ref, anchor.margin or gate.margin, ledger.open(own).id))
+        mode = anchor.tested_mode
+        play = companion if mode == "at_least" else paired_test
+        own = play(config, interface, "anchor", schedule, anchor.ref, gate.max_blocks)
+        anchors.append(AnchorTest(anchor.ref, gate.margin_of(anchor), ledger.open(own).id, mode))
     for exploiter in recent_exploiters(registry, league, opponent):
         assert exploiter.exploits is not None, "it is an exploiter"
-        own = exploiter_test(config, interface, schedule, exploiter.ref, gate.max_blocks)
+        own = paired_test(config, interface, "exploiter", schedule, exploiter.ref, gate.max_blocks)
         margin = gate.margin_against_exploiters
         exploiters.append(ExploiterTest(exploiter.ref, exploiter.exploits, margin, ledger.open(own).id))
     if gate.confirmation_blocks:
@@ -294,9 +296,10 @@ def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str 
 
 def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     decision = seen.champion
-    anchors = f", and is not inferior to {', '.join(each.test.ref for each in seen.anchors)}" if seen.anchors else ""
-    exploiters = ", ".join(each.test.ref for each in seen.exploiters)
-    unexploited = f", and does no worse than it against {exploiters}" if exploiters else ""
+    strong = ", ".join(each.test.ref for each in seen.companions if isinstance(each, AnchorResult))
+    paired = ", ".join(each.test.ref for each in seen.companions if isinstance(each, PairedResult))
+    anchors = f", and is not inferior to {strong}" if strong else ""
+    no_worse = f", and does no worse than it against {paired}" if paired else ""
     exploitability = ""
     if (result := seen.exploitability) is not None:
         exploitability = (
@@ -305,7 +308,7 @@ def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     shown = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
     return (
         f"{shown} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
-        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{unexploited}{exploitability}"
+        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{no_worse}{exploitability}"
     )
 
 

@@ -70,8 +70,7 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     outcome = VOID if row.outcome == VOID else str(seen.outcome)
     note = seen.note if outcome not in (VOID, "promote") else row.evidence.get("note")
     computed = report_of(registry, row, outcome, seen, note).to_json()
-    if "model" not in row.evidence:
-        del computed["model"]  # recorded by an earlier release
+    _omit_later_fields(computed, row.evidence)
     if row.outcome == VOID:
         # A voided verdict keeps its evidence, which is empty if it was open.
         computed = {name: value for name, value in computed.items() if name in row.evidence and name != "outcome"}
@@ -86,6 +85,15 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     conditions = Ledger(registry).schedule(row.schedule).conditions
     is_current = conditions == registry.leagues.get(row.league).conditions
     return Verification(row.id, row.outcome, len(matches), len(computed), replayed, is_current)
+
+
+def _omit_later_fields(computed: dict[str, Any], recorded: dict[str, Any]) -> None:
+    """Remove the fields that the release that recorded the evidence did not have."""
+    if "model" not in recorded:
+        del computed["model"]
+    for anchor, known in zip(computed["anchors"], recorded.get("anchors", ()), strict=False):
+        if "mode" not in known:
+            del anchor["mode"]
 
 
 def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Match]:

@@ -302,10 +302,10 @@ def chunks_of(length: int, played: int, num_envs: int) -> list[range]:
 
 def _describe(schedule: Schedule) -> str:
     first, *others = schedule.contestants
-    if schedule.kind == "exploiter":
-        return f"{first} and {others[0]} against {others[1]}"
     if schedule.kind == "exploitability":
         return f"{first} and {others[0]} against their exploiters"
+    if schedule.common_seeds:
+        return f"{first} and {others[0]} against {others[1]}"
     if len(others) == 1:
         return f"{first} against {others[0]}"
     return f"{first} against {len(others)} others" if schedule.kind == "gauntlet" else f"{len(others) + 1} contestants"

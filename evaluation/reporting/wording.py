@@ -8,15 +8,17 @@ if TYPE_CHECKING:
     from evaluation.results import AnchorReport, CompanionReport, ExploitabilityReport, ExploiterReport
 
 
-def against_anchor(test: AnchorReport, model: str) -> str:
-    """`not inferior to connect_four@1 by 50 Elo after 600 games`. model: of the gate."""
+def against_anchor(test: AnchorReport, champion: str, model: str) -> str:
+    """`not inferior to connect_four@1 by 50 Elo after 600 games`, or as against an exploiter. model: of the gate."""
+    if test.mode == "no_worse":
+        return against_exploiter(test, champion, model)
     unit = "in returns" if model == "returns" else "Elo"
     return _compared(test, "to", test.ref, f"by {test.margin:g} {unit}")
 
 
-def against_exploiter(test: ExploiterReport, champion: str, model: str) -> str:
-    """`not worse than connect_four@1 by 0.1 of all points after 600 games`. model: of the gate."""
-    return _compared(test, "than", champion, f"by {test.margin:g} {margin_unit(model)}")
+def against_exploiter(test: ExploiterReport | AnchorReport, champion: str, model: str) -> str:
+    """`against connect_four@7 not worse than connect_four@1 by 0.1 of all points after 600 games`."""
+    return f"against {test.ref} " + _compared(test, "than", champion, f"by {test.margin:g} {margin_unit(model)}")
 
 
 def exploitability(test: ExploitabilityReport, model: str) -> str:

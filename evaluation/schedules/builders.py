@@ -139,16 +139,17 @@ def companion(
     return _schedule(config, interface, kind, contestants, [(0, 1)], blocks, verdict.seed, of=verdict.id)
 
 
-def exploiter_test(
-    config: LeagueConfig, interface: Interface, verdict: Schedule, exploiter: str, blocks: int
+def paired_test(
+    config: LeagueConfig, interface: Interface, kind: str, verdict: Schedule, opponent: str, blocks: int
 ) -> Schedule:
-    """The candidate of a verdict and its champion play up to `blocks` matches each against an exploiter.
+    """The candidate of a verdict and its champion play up to `blocks` matches each against an exploiter or an anchor.
 
     Their matches alternate, the candidate's first. The two matches of a round have the same seed, opening and seats.
+    kind: `exploiter` or `anchor`.
     """
-    contestants, pairings = [*verdict.contestants, exploiter], [(0, 2), (1, 2)]
+    contestants, pairings = [*verdict.contestants, opponent], [(0, 2), (1, 2)]
     length, seed = blocks * len(pairings), verdict.seed
-    schedule = _schedule(config, interface, "exploiter", contestants, pairings, length, seed, of=verdict.id)
+    schedule = _schedule(config, interface, kind, contestants, pairings, length, seed, of=verdict.id)
     return replace(schedule, common_seeds=True)
 
 

@@ -6,6 +6,8 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from league.config.base import ContestantRef, Part
+from league.refs import CheckpointRef, of_league, parse_ref
+from league.verdict_tests import AnchorMode
 
 MAX_NORMALIZED_ELO = 190
 """Bound for hypotheses with a usable test; see evaluation/statistics/sequential.py."""
@@ -15,18 +17,32 @@ EXPLOITER_MARGIN = 0.1
 
 
 class AnchorConfig(Part):
-    """An opponent for the non-inferiority test of a candidate."""
+    """An opponent for a non-inferiority test of a candidate."""
 
     ref: ContestantRef
     """A script (`script:one_ply`), a bot (`script:my_package.module:name`), a version (`connect_four@3`), or an alias,
     which is resolved when the verdict is opened. `@3` and `@gold` refer to the league itself."""
+    mode: AnchorMode | None = None
+    """`no_worse`: the candidate does not do worse against the anchor than the champion, from common seeds. `at_least`:
+    it is not weaker than the anchor. Null: `at_least` for versions and anchors with a margin, otherwise `no_worse`."""
     margin: float | None = Field(default=None, gt=0)
-    """Non-inferiority margin; by default the gate's `margin`."""
+    """Non-inferiority margin. Default: the gate's `margin` with `at_least`, its `exploiter_margin` with `no_worse`."""
 
     @model_validator(mode="before")
     @classmethod
     def _from_yaml(cls, value: Any) -> Any:
         return {"ref": value} if isinstance(value, str) else value
+
+    @property
+    def tested_mode(self) -> AnchorMode:
+        """`mode` or its default.
+
+        A margin alone was Elo before there were modes, and still is.
+        """
+        if self.mode is not None:
+            return self.mode
+        is_version = isinstance(parse_ref(of_league(self.ref, "league")), CheckpointRef)
+        return "at_least" if is_version or self.margin is not None else "no_worse"
 
 
 class ExploitersConfig(Part):
@@ -84,8 +100,9 @@ class GateConfig(Part):
     exploited_champions: int = Field(default=2, ge=0)
     """Number of champions, the current one and previous ones, whose newest exploiters a candidate is tested against."""
     exploiter_margin: float | None = Field(default=None, gt=0)
-    """How much less than the champion a candidate may score against an exploiter, and how much more exploitable it may
-    be, as a share of all points (default 0.1), or in returns with the model `returns` (default: `margin`)."""
+    """How much less than the champion a candidate may score against an exploiter or an anchor with `no_worse`, and how
+    much more exploitable it may be, as a share of all points (default 0.1), or in returns with the model `returns`
+    (default: `margin`)."""
     exploiters: ExploitersConfig = ExploitersConfig()
     """Exploiters trained against a candidate that passed all other tests, and against the champion."""
     confirmation_blocks: int = Field(default=200, ge=0)
@@ -102,7 +119,7 @@ class GateConfig(Part):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        margins = [self.margin, *(anchor.margin for anchor in self.anchors if anchor.margin is not None)]
+        margins = [self.margin, *self._anchor_margins("at_least").values()]
         if self.model == "returns":
             self._check_returns(max(margins))
             return self
@@ -135,12 +152,21 @@ class GateConfig(Part):
         margins = {
             "exploiter_margin": self.margin_against_exploiters,
             "exploiters.improvement": self.exploiters.improvement,
+            **self._anchor_margins("no_worse"),
         }
         for setting, margin in margins.items():
             if margin >= largest:
                 name = "twice return_bound" if self.model == "returns" else "all points"
                 raise ValueError(f"{setting} must be smaller than {largest:g} ({name}), got {margin:g}")
         return self
+
+    def _anchor_margins(self, mode: AnchorMode) -> dict[str, float]:
+        """Return setting → margin, of the anchors with this mode that have one."""
+        return {
+            f"anchors[{i}].margin": anchor.margin
+            for i, anchor in enumerate(self.anchors)
+            if anchor.margin is not None and anchor.tested_mode == mode
+        }
 
     @property
     def requires_gain(self) -> bool:
@@ -158,9 +184,15 @@ class GateConfig(Part):
             return self.model_copy(update={"return0": 0.0, "return1": max(self.return1, -self.return0)})
         return self.model_copy(update={"elo0": 0.0, "elo1": max(self.elo1, -self.elo0)})
 
-    def against_anchor(self, margin: float | None) -> Self:
-        """Return the settings of a non-inferiority test. H0: weaker by the margin; H1: equally strong."""
-        below = -(self.margin if margin is None else margin)
+    def margin_of(self, anchor: AnchorConfig) -> float:
+        """Return the margin of an anchor or its default, in the unit of its mode."""
+        if anchor.margin is not None:
+            return anchor.margin
+        return self.margin if anchor.tested_mode == "at_least" else self.margin_against_exploiters
+
+    def against_anchor(self, margin: float) -> Self:
+        """Return the settings of a test of the mode `at_least`. H0: weaker by the margin; H1: equally strong."""
+        below = -margin
         zero = {"return0": below, "return1": 0.0} if self.model == "returns" else {"elo0": below, "elo1": 0.0}
         return self.model_copy(update=zero)
 
@@ -171,9 +203,9 @@ class GateConfig(Part):
             return self.exploiter_margin
         return self.margin if self.model == "returns" else EXPLOITER_MARGIN
 
-    def against_exploiter(self, margin: float) -> Self:
-        """Return the settings of a paired test against an exploiter, which observes half of the difference between
-        candidate and champion. H0: the candidate is worse by the margin; H1: it is as good.
+    def compared_with_champion(self, margin: float) -> Self:
+        """Return the settings of a paired test against an exploiter or an anchor, which observes half of the difference
+        between candidate and champion. H0: the candidate is worse by the margin; H1: it is as good.
         """
         return self._of_pairs(-margin, 0.0)
 

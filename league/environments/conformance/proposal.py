@@ -182,7 +182,7 @@ def _gate() -> Iterator[_Line]:
     yield _Line("gate:", "league nightly: the test for promotions")
     yield _Line("  elo1: 30", "gain in Elo that the test should detect")
     yield _Line("  max_blocks: 4000", "pairs of games after which a test ends undecided")
-    yield _Line("  anchors: []", "bots or versions that a champion must not lose to")
+    yield _Line("  anchors: []", "bots or versions that a new champion must hold its own against")
 
 
 def _patterns(own: list[str], agents: list[str]) -> list[str]:

@@ -2,16 +2,21 @@
 
 import dataclasses
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import pytest
+from scipy.stats import binomtest
 from sqlalchemy import delete
 
+from benchmarks.simulations.exploiter_gates import against_anchor
 from evaluation.gating.anchors import earlier_champions, resolve_anchors
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
 from evaluation.matches.tournament import evaluate
+from evaluation.results import VerdictReport
+from league.config.gate import GateConfig
 from league.config.league import LeagueConfig
 from league.errors import ConfigError, UnknownPolicy, VerdictRefuted
 from league.policies.loading import check_anchors
@@ -20,6 +25,8 @@ from league.registry.storage import tables
 from league.results.ledger import Ledger
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
+
+BOT = "script:examples.tictactoe_bot:act"
 
 
 @pytest.fixture
@@ -117,7 +124,7 @@ def test_a_candidate_that_beats_the_champion_but_not_an_anchor_is_not_promoted(t
     """Version 3 beats the champion but loses to the script that wins and blocks."""
     registry = league_of(tmp_path / "trap", WEAK, MIDDLING, STRONG)
     promote(registry, 1, 2)
-    league = config(anchors=["script:one_ply"], earlier_champions=0, elo1=60, margin=30)
+    league = config(anchors=[{"ref": "script:one_ply", "mode": "at_least"}], earlier_champions=0, elo1=60, margin=30)
     report = nightly(league, registry=registry)
     rejected = {verdict.candidate: verdict for verdict in report.verdicts}["tictactoe@3"]
     assert (rejected.outcome, rejected.promoted) == ("reject", False)
@@ -140,10 +147,10 @@ def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry:
     league = config(anchors=["script:random"], earlier_champions=1, margin=60)
     nightly(league, registry=registry)
     event = next(event for event in registry.aliases.history(tictactoe.LEAGUE) if event.version == 3)
-    assert "is not inferior to script:random, tictactoe@1" in event.reason
+    assert "is not inferior to tictactoe@1, and does no worse than it against script:random" in event.reason
     row = registry.verdicts.get(str(event.verdict))
     assert row.evidence is not None
-    assert [anchor["outcome"] for anchor in row.evidence["anchors"]] == ["not inferior", "not inferior"]
+    assert [anchor["outcome"] for anchor in row.evidence["anchors"]] == ["not worse", "not inferior"]
     assert verify(row.id, registry=registry).outcome == "promote"
 
 
@@ -152,6 +159,8 @@ def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry:
     [
         ({"anchors": [{"ref": "script:random", "margin": 300}]}, "margins must lie within ±190"),
         ({"anchors": [{"ref": "script:random", "margins": 3}]}, "did you mean 'margin'"),
+        ({"anchors": [{"ref": BOT, "mode": "no_worse", "margin": 50}]}, r"anchors\[0\]\.margin must be smaller than 1"),
+        ({"anchors": [{"ref": BOT, "mode": "best"}]}, "should be 'no_worse' or 'at_least', got 'best'"),
         ({"margin": 0}, "gate.margin"),
         ({"model": "returns"}, "return_bound"),
         ({"model": "returns", "return_bound": 2}, "margin, which is a return with model: returns, must be smaller"),
@@ -162,9 +171,6 @@ def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry:
 def test_an_invalid_gate_is_rejected(gate: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         config(**gate)
-
-
-BOT = "script:examples.tictactoe_bot:act"
 
 
 def test_a_candidate_that_loses_to_a_bot_is_refused_and_the_bot_is_rated(tmp_path: Path) -> None:
@@ -193,9 +199,122 @@ def test_a_malformed_anchor_is_rejected_with_the_configuration() -> None:
 
 def test_without_a_champion_the_note_names_the_script_that_was_beaten(tmp_path: Path) -> None:
     registry = league_of(tmp_path / "first", STRONG)
-    league = config(anchors=["script:one_ply"], earlier_champions=0, elo1=60, margin=30)
+    league = config(anchors=[{"ref": "script:one_ply", "mode": "at_least"}], earlier_champions=0, elo1=60, margin=30)
     report = nightly(league, registry=registry)
     (rejected,) = report.verdicts
     assert rejected.note == "it beat script:random, but is weaker than script:one_ply"
     assert report.champion is None
     assert verify(rejected.verdict, registry=registry).outcome == "reject"
+
+
+def decided_against_bot(home: Path, league: LeagueConfig) -> tuple[Registry, VerdictReport]:
+    """The verdict on a candidate that beats the champion; the bot is stronger than both."""
+    registry = league_of(home, MIDDLING, STRONG)
+    promote(registry, 1)
+    report = nightly(league, registry=registry)
+    return registry, report.verdicts[0]
+
+
+@pytest.mark.parametrize(("mode", "outcome"), [(None, "promote"), ("no_worse", "promote"), ("at_least", "reject")])
+def test_a_bot_that_is_stronger_than_all_versions_blocks_no_progress(
+    tmp_path: Path, mode: str | None, outcome: str
+) -> None:
+    """The candidate does better against it than the champion, but loses to it."""
+    league = config(anchors=[{"ref": BOT, "mode": mode}], earlier_champions=0)
+    registry, verdict = decided_against_bot(tmp_path, league)
+    assert verdict.outcome == outcome, verdict
+    (anchor,) = verdict.anchors
+    assert anchor.score is not None
+    assert anchor.score < 0.5, "the bot is stronger"
+    if outcome == "promote":
+        assert anchor.champion_score is not None
+        assert anchor.difference is not None
+        assert (anchor.mode, anchor.outcome, anchor.margin, anchor.elo) == ("no_worse", "not worse", 0.1, None)
+        assert anchor.champion_score < anchor.score - 0.1
+        assert anchor.difference.mean == pytest.approx(anchor.score - anchor.champion_score)
+        assert f"does no worse than it against {BOT}" in registry.aliases.history(tictactoe.LEAGUE)[0].reason
+    assert verify(verdict.verdict, registry=registry, replays=4).outcome == outcome
+    registry.close()
+
+
+def test_a_candidate_that_does_worse_against_a_bot_than_the_champion_is_refused(tmp_path: Path) -> None:
+    """The hypotheses of the first test are so low that a weaker candidate passes it."""
+    registry = league_of(tmp_path, STRONG, MIDDLING)
+    promote(registry, 1)
+    anchors = [{"ref": BOT, "mode": "no_worse", "margin": 0.05}]
+    league = config(anchors=anchors, earlier_champions=0, model="logistic", elo0=-2000, elo1=-1500)
+    (verdict,) = nightly(league, registry=registry).verdicts
+    assert (verdict.outcome, verdict.anchors[0].outcome) == ("reject", "worse")
+    assert verdict.note == f"it is not inferior to the champion, but does worse than the champion against {BOT}"
+    verify(verdict.verdict, registry=registry)
+    registry.close()
+
+
+def test_without_a_champion_a_candidate_is_compared_with_the_script_that_it_plays(tmp_path: Path) -> None:
+    registry = league_of(tmp_path, STRONG)
+    (verdict,) = nightly(config(anchors=[BOT, "script:random"]), registry=registry).verdicts
+    assert [(anchor.ref, anchor.outcome) for anchor in verdict.anchors] == [(BOT, "not worse")]
+    assert set(Ledger(registry).schedule(verdict.anchors[0].schedule).contestants) == {
+        "tictactoe@1",
+        "script:random",
+        BOT,
+    }
+    assert verdict.promoted
+    verify(verdict.verdict, registry=registry)
+    registry.close()
+
+
+def test_candidate_and_champion_play_an_anchor_from_common_seeds(tmp_path: Path) -> None:
+    registry, verdict = decided_against_bot(tmp_path, config(anchors=[BOT], earlier_champions=0))
+    schedule = Ledger(registry).schedule(verdict.anchors[0].schedule)
+    assert [schedule.contestants_at(position) for position in range(2)] == [("tictactoe@2", BOT), ("tictactoe@1", BOT)]
+    seeds = schedule.seeds_at(range(20))
+    assert seeds[::2] == seeds[1::2]
+    registry.close()
+
+
+def test_a_verdict_of_a_release_without_modes_is_verified(tmp_path: Path) -> None:
+    registry, verdict = decided_against_bot(tmp_path, config(anchors=[{"ref": BOT, "margin": 50}], earlier_champions=0))
+    with registry.database.write() as session:
+        row = session.get_one(tables.VerdictTable, verdict.verdict)
+        settings, evidence = deepcopy(row.settings), deepcopy(row.evidence)
+        assert evidence is not None
+        for name in ("mode", "champion_score", "difference"):
+            evidence["anchors"][0].pop(name)
+        settings["anchors"][0].pop("mode")
+        settings["gate"]["anchors"][0].pop("mode")
+        row.settings, row.evidence = settings, evidence
+    assert verify(verdict.verdict, registry=registry).outcome == "reject"
+    registry.close()
+
+
+@pytest.mark.parametrize(
+    ("anchor", "expected"),
+    [
+        ("script:one_ply", ("no_worse", 0.1)),
+        (BOT, ("no_worse", 0.1)),
+        ("https://models.example.org/v2/models/solver", ("no_worse", 0.1)),
+        ("@gold", ("at_least", 50)),
+        ("tictactoe@3", ("at_least", 50)),
+        ({"ref": BOT, "margin": 40}, ("at_least", 40)),
+        ({"ref": BOT, "mode": "at_least"}, ("at_least", 50)),
+        ({"ref": BOT, "mode": "no_worse", "margin": 0.02}, ("no_worse", 0.02)),
+        ({"ref": "@3", "mode": "no_worse"}, ("no_worse", 0.1)),
+    ],
+)
+def test_the_default_mode_depends_on_the_anchor(anchor: Any, expected: tuple[str, float]) -> None:
+    gate = config(anchors=[anchor]).gate
+    assert (gate.anchors[0].tested_mode, gate.margin_of(gate.anchors[0])) == expected
+
+
+def test_a_margin_of_no_worse_is_in_returns_if_the_gate_tests_them() -> None:
+    gate = config(anchors=[BOT], model="returns", return_bound=4, margin=0.5).gate
+    assert gate.margin_of(gate.anchors[0]) == 0.5
+
+
+def test_a_comparison_against_an_anchor_keeps_its_error_rates() -> None:
+    """The anchor is stronger than all versions. `benchmarks.calibration` measures more cases."""
+    settings = GateConfig(alpha=0.05, nights=None).compared_with_champion(0.1)
+    worse, equal = (against_anchor(settings, 0.22, gap, 0.0, gates=300, seed=1) for gap in (-0.1, 0.0))
+    assert binomtest(int(worse.promoted.sum()), 300).proportion_ci(0.99).low <= 0.05
+    assert binomtest(int(equal.promoted.sum()), 300).proportion_ci(0.99).high >= 0.95

@@ -30,7 +30,7 @@ def test_a_round_is_one_observation_of_mean_scores() -> None:
     assert seen.scores == pytest.approx([0.5 + 0.25, 0.5 - 0.375])
     assert seen.gaps == pytest.approx([0.5, -0.75])
     assert (seen.comparisons, test.matches_each) == (8, 4)
-    decision = decide_matches(replace(test, settings=GATE.against_exploiter(0.1)), matches)
+    decision = decide_matches(replace(test, settings=GATE.compared_with_champion(0.1)), matches)
     assert (decision.blocks, decision.games, len(decision.counts)) == (2, 16, 17)
 
 

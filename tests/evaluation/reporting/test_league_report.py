@@ -139,7 +139,7 @@ def test_anchors_and_confirmations_are_included(tmp_path: Path) -> None:
         nightly(tictactoe.config(gate=gate), registry=registry)
         newest = league_report(registry, LEAGUE).verdicts[0]
     assert newest.promoted
-    assert [(anchor.ref, anchor.outcome) for anchor in newest.anchors] == [("script:random", "not inferior")]
+    assert [(anchor.ref, anchor.outcome) for anchor in newest.anchors] == [("script:random", "not worse")]
     assert newest.confirmation is not None
     assert newest.confirmation.games == 40
 

@@ -19,13 +19,19 @@ EVIDENCE = (0.0, (-3.0, 3.0), 100, 200, 200, (0, 0, 100, 0, 0))
 )
 def test_a_comparison_with_an_anchor(outcome: str, model: str, expected: str) -> None:
     test = AnchorReport("memory@1", 50, "s", outcome, *EVIDENCE, 0.5, 0.0, (-10.0, 10.0))
-    assert wording.against_anchor(test, model) == expected
+    assert wording.against_anchor(test, "memory@3", model) == expected
 
 
 def test_a_comparison_against_an_exploiter_names_the_champion() -> None:
     test = ExploiterReport("memory@7", 0.1, "s", "not worse", *EVIDENCE, "memory@1", 0.5, 0.5, None)
     shown = wording.against_exploiter(test, "memory@1", "logistic")
-    assert shown == "not worse than memory@1 by 0.1 of all points after 200 games"
+    assert shown == "against memory@7 not worse than memory@1 by 0.1 of all points after 200 games"
+
+
+def test_an_anchor_that_is_no_standard_by_itself_is_described_as_an_exploiter() -> None:
+    test = AnchorReport("script:one_ply", 0.1, "s", "worse", *EVIDENCE, 0.5, None, None, "no_worse", 0.7)
+    shown = wording.against_anchor(test, "memory@1", "normalized")
+    assert shown == "against script:one_ply worse than memory@1 by 0.1 of all points after 200 games"
 
 
 @pytest.mark.parametrize(
