@@ -254,7 +254,8 @@ def verdict(report: "VerdictReport") -> str:
     note = f": {report.note}" if report.note else ""
     exploiters += "" if report.exploitability is None else f"; {_exploitability(report.exploitability, report.model)}"
     who = f"{short_verdict(report.verdict)}: {report.candidate} against {report.opponent}"
-    return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}"
+    forfeits = "".join(f"; {ref} forfeited {lost}" for ref, lost in report.forfeits.items())
+    return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}{forfeits}"
 
 
 def _exploitability(test: "ExploitabilityReport", model: str) -> str:

@@ -155,6 +155,36 @@ class CrossPlay(Document):
     mixed: Estimate | None
 
 
+@dataclass(frozen=True, slots=True)
+class Forfeits(Document):
+    """The games that a contestant forfeited.
+
+    reasons: reason → number of games. details: reason → the detail of the first forfeit, see
+    league.results.records.Forfeit; without reasons of which none was recorded.
+    """
+
+    games: int
+    reasons: dict[str, int]
+    details: dict[str, str]
+
+    def __str__(self) -> str:
+        """`12 games: 10 by an exception (the first: RuntimeError: engine ended at bot.py, line 9), 2 by …`"""
+        counts = (
+            f"{count} by {_BY[reason]}" + (f" (the first: {self.details[reason]})" if reason in self.details else "")
+            for reason, count in self.reasons.items()
+        )
+        return f"{self.games} game{'' if self.games == 1 else 's'}: {', '.join(counts)}"
+
+
+_BY: dict[str, str] = {
+    "crashed": "an exception",
+    "illegal_action": "an illegal action",
+    "malformed": "an output that is no action",
+    "not_finite": "an action that is not finite",
+}
+"""Reason of a forfeit → its cause in words."""
+
+
 StoppedBy = Literal["schedule", "games", "minutes", "precision"]
 """What ended an evaluation: the end of the schedule, a budget, or sufficient precision."""
 
@@ -168,7 +198,7 @@ class EvaluationReport(Document):
     by_side: leaderboard of each side; empty if sides are alike or there is only one.
     population: for a round robin in which all pairs met, else None.
     cross_play: None for a tournament. With cross-play, leaderboard and payoff are empty.
-    forfeits: contestant → forfeited games, if any.
+    forfeits: contestant → its forfeits, if any.
     """
 
     league: str
@@ -181,7 +211,7 @@ class EvaluationReport(Document):
     scoring: Scoring
     by_side: dict[str, tuple[Standing, ...]]
     actions: ActionSelection = "greedy"
-    forfeits: dict[str, int] = field(default_factory=dict)
+    forfeits: dict[str, Forfeits] = field(default_factory=dict)
     kind: str = "round_robin"
     stopped_by: StoppedBy = "schedule"
     population: Population | None = None
@@ -280,6 +310,7 @@ class VerdictReport(Document):
     tests returns, else None.
     promoted: whether this verdict made the candidate champion.
     note: why it did not although the opponent was beaten, or why it is void.
+    forfeits: contestant → its forfeits in the counted games, if any.
     """
 
     verdict: str
@@ -303,6 +334,7 @@ class VerdictReport(Document):
     exploitability: ExploitabilityReport | None = None
     difference: Difference | None = None
     note: str | None = None
+    forfeits: dict[str, Forfeits] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

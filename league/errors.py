@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 _INSTALLED = tuple(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib"))
-_OWN = str(Path(__file__).parent)
+_OWN = tuple(
+    f"{Path(__file__).parents[1] / package}/" for package in ("cli", "evaluation", "league", "serve_app", "training")
+)
 
 
 class LeagueError(Exception):
@@ -256,9 +258,10 @@ def one_line(error: BaseException, with_type: bool = False, first_line: bool = F
 
 
 def raised_at(error: BaseException) -> str | None:
-    """Return where an error was raised, as `FILE, line N`: the last line outside of the Python installation."""
+    """Return where the user's code raised an error, as `FILE, line N`: the last line outside of the Python installation
+    and of this project."""
     frames = traceback.extract_tb(error.__traceback__)
-    outside = [frame for frame in frames if not frame.filename.startswith((*_INSTALLED, "<", _OWN))]
+    outside = [frame for frame in frames if not frame.filename.startswith((*_INSTALLED, "<", *_OWN))]
     return f"{outside[-1].filename}, line {outside[-1].lineno}" if outside else None
 
 

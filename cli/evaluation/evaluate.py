@@ -112,7 +112,7 @@ def _show(report: "EvaluationReport") -> None:
         show_leaderboard(leaderboard)
     _show_payoff(report)
     for ref, lost in report.forfeits.items():
-        complain(f"{ref} forfeited {lost} games: it returned no legal action")
+        complain(f"{ref} forfeited {lost}")
     if report.population is not None:
         _show_population(report.payoff.contestants, report.population)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from evaluation.gating.exploitability import exploitability_bound
@@ -19,7 +19,7 @@ from evaluation.gating.gate_result import (
     name_of_champion,
 )
 from evaluation.gating.sequential_tests import SequentialTest
-from evaluation.matches.game_records import forfeits
+from evaluation.matches.game_records import forfeits, forfeits_of_all
 from evaluation.results import (
     AnchorReport,
     Confirmation,
@@ -129,7 +129,16 @@ def report_of(
         exploitability=exploitability_report(seen.exploitability, verdict.candidate_ref),
         difference=difference_of_returns(registry, verdict, seen.champion.blocks),
         note=note,
+        forfeits=forfeits_of_all(_counted(registry, verdict, seen)),
     )
+
+
+def _counted(registry: Registry, verdict: VerdictRow, seen: GateResult) -> Iterator[Match]:
+    """The matches of a verdict that count."""
+    yield from _matches(registry, verdict)[: seen.champion.blocks]
+    for companion in seen.companions:
+        games = companion.decision.games
+        yield from _matches(registry, verdict, companion.test.schedule)[: games // GAMES_PER_BLOCK]
 
 
 OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "inconclusive", None: "open"}

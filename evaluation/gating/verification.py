@@ -89,8 +89,8 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
 
 def _omit_later_fields(computed: dict[str, Any], recorded: dict[str, Any]) -> None:
     """Remove the fields that the release that recorded the evidence did not have."""
-    if "model" not in recorded:
-        del computed["model"]
+    for name in {"model", "forfeits"} - recorded.keys():
+        del computed[name]
     for anchor, known in zip(computed["anchors"], recorded.get("anchors", ()), strict=False):
         if "mode" not in known:
             del anchor["mode"]

@@ -207,7 +207,7 @@ class _GameLoop:
                 self._states[group] = AgentStates(*self._returns.shape)
             self._states[group].update(batch, answer.states)
         for row, fault in answer.faults.items():
-            self.recorder.add_fault(int(games[row]), int(batch.agents[row]), fault.reason)
+            self.recorder.add_fault(int(games[row]), int(batch.agents[row]), fault)
             self._faulty.add(int(batch.envs[row]))
             self._log_forfeit(ref, fault)
         return answer.actions
@@ -225,7 +225,7 @@ class _GameLoop:
         return None
 
     def _log_forfeit(self, ref: str, fault: PolicyFault) -> None:
-        """Log the details of a forfeit once. The record contains only the reason."""
+        """Log the first forfeit of a contestant for each reason."""
         if (ref, fault.reason) not in self._logged:
             self._logged.add((ref, fault.reason))
             logger.warning("%s forfeits a game (%s): %s", ref, fault.reason, fault.detail)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 
+from evaluation.results import Forfeits
 from evaluation.statistics.sequential import score_of
 from league.results.records import Game, Match
 
@@ -19,6 +20,22 @@ def forfeits(matches: Iterable[Match], contestant: str) -> int:
         for game in match.games
         for forfeit in game.forfeits
     )
+
+
+def forfeits_of_all(matches: Iterable[Match]) -> dict[str, Forfeits]:
+    """Return contestant → its forfeits in `matches`, of those that have any, by name."""
+    reasons: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    details: defaultdict[str, dict[str, str]] = defaultdict(dict)
+    for match in matches:
+        for forfeit in (forfeit for game in match.games for forfeit in game.forfeits):
+            ref = match.contestants[forfeit.contestant]
+            reasons[ref][forfeit.reason] += 1
+            if forfeit.detail:
+                details[ref].setdefault(forfeit.reason, forfeit.detail)
+    return {
+        ref: Forfeits(counts.total(), dict(counts.most_common()), details[ref])
+        for ref, counts in sorted(reasons.items())
+    }
 
 
 def forfeit_difference(match: Match, contestant: str) -> float | None:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.matches.action_log import ActionLog
+from evaluation.matches.policy_calls import PolicyFault
 from evaluation.matches.returns import returns_of_games
 from evaluation.schedules.builders import GamePlans
 from league.environments.stepping import Indices
-from league.results.records import GAMES_PER_BLOCK, Forfeit, Game, Match, Members, Reason, Schedule
+from league.results.records import GAMES_PER_BLOCK, Forfeit, Game, Match, Members, Schedule
 from league.results.scoring import scores
 
 
@@ -34,12 +35,12 @@ class MatchRecorder:
         self._schedule, self._plans, self._members = schedule, plans, members
         self._agents, self._side_of = agents, side_of
         self.actions = ActionLog()
-        self._faults: defaultdict[int, dict[int, Reason]] = defaultdict(dict)
+        self._faults: defaultdict[int, dict[int, PolicyFault]] = defaultdict(dict)
         self._ended: list[tuple[Indices, Indices, NDArray[np.float64], Indices]] = []
 
-    def add_fault(self, game: int, agent: int, reason: Reason) -> None:
+    def add_fault(self, game: int, agent: int, fault: PolicyFault) -> None:
         """A game ends because an agent has no playable action."""
-        self._faults[game][agent] = reason
+        self._faults[game][agent] = fault
 
     def end(self, games: Indices, episodes: Indices, returns: NDArray[np.float64], steps: Indices) -> None:
         """Record k ended games. returns: of the agents, (k, agents). steps: those that count, (k,)."""
@@ -70,7 +71,7 @@ class MatchRecorder:
 
     def _forfeits(self, game: int) -> tuple[Forfeit, ...]:
         found: dict[int, Forfeit] = {}
-        for agent, reason in sorted(self._faults[game].items()):
+        for agent, fault in sorted(self._faults[game].items()):
             contestant = int(self._plans.sides[game, self._side_of[agent]])
-            found.setdefault(contestant, Forfeit(contestant, self._agents[agent], reason))
+            found.setdefault(contestant, Forfeit(contestant, self._agents[agent], fault.reason, fault.detail))
         return tuple(found.values())

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.matches.game_state import ActionNumbers, State
 from league.environments.stepping import Batch, allows_nothing, legal_rows
-from league.errors import IllegalMask, RemoteError, one_line
+from league.errors import IllegalMask, RemoteError, one_line, raised_at
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, MalformedAction, Policy
-from league.results.records import Reason
+from league.results.records import MAX_DETAIL, Reason
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete
 
 Generators = Sequence[np.random.Generator]
@@ -27,7 +28,7 @@ Randomness = Generators | ActionNumbers | None
 
 @dataclass(frozen=True, slots=True)
 class PolicyFault:
-    """Why a row has no playable action. detail: human-readable; differs between machines."""
+    """Why a row has no playable action. detail: as in a Forfeit."""
 
     reason: Reason
     detail: str
@@ -66,7 +67,7 @@ def call_policy(policy: Policy, batch: Batch, space: Leaf, state: State | None, 
     if answer.faults or not legal.all():
         _check_mask(mask, space)
         for row in np.flatnonzero(~legal).tolist():
-            answer.faults.setdefault(row, _illegal(answer.actions[row], mask, row))
+            answer.faults.setdefault(row, _illegal(answer.actions[row], space, mask, row))
     return answer
 
 
@@ -75,13 +76,22 @@ def action_fault(given: Actions, space: Leaf, mask: NDArray | None) -> PolicyFau
     try:
         _check_form(given, 1, space)
     except MalformedAction as error:
-        return _fault(error)
+        return fault_of(error)
     if given.faults:
-        return _fault(given.faults[0])
+        return fault_of(given.faults[0])
     if legal_rows(given.actions, space, mask).all():
         return None
     _check_mask(mask, space)
-    return _illegal(given.actions[0], mask, 0)
+    return _illegal(given.actions[0], space, mask, 0)
+
+
+def fault_of(error: Exception) -> PolicyFault:
+    """The fault of a policy that raised, with the line of the user's code, or whose output is malformed."""
+    if isinstance(error, MalformedAction):
+        return PolicyFault("malformed", str(error)[:MAX_DETAIL])
+    place = raised_at(error)
+    where = f" at {Path(place).name}" if place else ""
+    return PolicyFault("crashed", f"{one_line(error, with_type=True)[: MAX_DETAIL - len(where)]}{where}")
 
 
 def _call_batch(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
@@ -92,7 +102,7 @@ def _call_batch(policy: Policy, batch: Batch, space: Leaf, state: State | None, 
     else:
         given = policy.act(batch.observations, state=state, rng=randomness)
     _check_form(given, len(batch), space)
-    return PolicyOutput(given.actions, given.state, {row: _fault(error) for row, error in given.faults.items()})
+    return PolicyOutput(given.actions, given.state, {row: fault_of(error) for row, error in given.faults.items()})
 
 
 def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
@@ -108,7 +118,7 @@ def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, r
         except (MemoryError, RemoteError):
             raise
         except Exception as error:
-            faults[row] = _fault(error)
+            faults[row] = fault_of(error)
         else:
             given[row] = answer.actions[0]
             faults |= {row + index: fault for index, fault in answer.faults.items()}
@@ -139,17 +149,26 @@ def _check_form(given: Actions, rows: int, space: Leaf) -> None:
             raise MalformedAction(f"{name} has {len(array)} rows, expected {rows}")
 
 
-def _fault(error: Exception) -> PolicyFault:
-    if isinstance(error, MalformedAction):
-        return PolicyFault("malformed", str(error))
-    return PolicyFault("crashed", one_line(error, with_type=True))
-
-
-def _illegal(action: NDArray, mask: NDArray | None, row: int) -> PolicyFault:
+def _illegal(action: NDArray, space: Leaf, mask: NDArray | None, row: int) -> PolicyFault:
     if not np.isfinite(action).all():
-        return PolicyFault("not_finite", f"action {action.tolist()}")
-    allowed = "" if mask is None else f", where action_mask is {mask[row].tolist()}"
-    return PolicyFault("illegal_action", f"action {action.tolist()}{allowed}")
+        return PolicyFault("not_finite", f"action {action.tolist()}"[:MAX_DETAIL])
+    legal = _legal(space, None if mask is None else mask[row])
+    return PolicyFault("illegal_action", f"action {action.tolist()}, legal: {legal}"[:MAX_DETAIL])
+
+
+def _legal(space: Leaf, mask: NDArray | None) -> str:
+    """What a legal action is, in words."""
+    match space:
+        case Discrete(n=n, start=start) if mask is not None and mask[:n].any():
+            return ", ".join(map(str, (np.flatnonzero(mask) + start).tolist()))
+        case Discrete(n=n, start=start):
+            return f"{start} to {start + n - 1}"
+        case MultiDiscrete(nvec=nvec, start=start):
+            masked = "" if mask is None else f", where action_mask is {mask.tolist()}"
+            return f"from {start} on, {nvec} choices{masked}"
+        case Box(low=low, high=high):
+            return f"from {low} to {high}"
+    return "0 or 1"
 
 
 def _check_mask(mask: NDArray | None, space: Leaf) -> None:

@@ -23,7 +23,7 @@ from typing import Generic, TypeVar, get_args
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from evaluation.matches.game_records import forfeits, unique_games
+from evaluation.matches.game_records import forfeits_of_all, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
 from evaluation.matches.worker import match_worker, num_envs
 from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
@@ -283,7 +283,7 @@ def _report(
         # Pairs chosen by rating may meet only once or twice, too rarely to estimate payoffs.
         population=population(order, matches) if kind == "round_robin" else None,
         cross_play=None if tournament else cross_play_table(plan.contestants, matches),
-        forfeits={ref: lost for ref in plan.contestants if (lost := forfeits(matches, ref))},
+        forfeits=forfeits_of_all(matches),
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.policy_calls import PolicyFault, action_fault
+from evaluation.matches.policy_calls import PolicyFault, action_fault, fault_of
 from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.action_names import action_names, direction_keys
 from evaluation.playback.environment_hooks import Area, Board, Declarations, EnvironmentHooks
@@ -344,7 +344,7 @@ class _Opponent:
         except (MemoryError, RemoteError):
             raise
         except Exception as error:
-            raise _Forfeited(self._agent, PolicyFault("crashed", one_line(error, with_type=True))) from error
+            raise _Forfeited(self._agent, fault_of(error)) from error
         if fault := action_fault(given, self._space, observations.get(ACTION_MASK)):
             raise _Forfeited(self._agent, fault)
         return given if self._with_probabilities else replace(given, dist_inputs=None)

@@ -219,9 +219,10 @@ def _graphs(controllers: Mapping[str, str], registry: Registry, interface: Inter
 
 
 def _forfeits(match: Match, game: int) -> str | None:
-    """`forfeited by duo@3 as player_1: illegal action`"""
+    """`forfeited by duo@3 as player_1: illegal action (action 3, legal: 0, 1)`"""
     reasons = [
         f"forfeited by {match.contestants[forfeit.contestant]} as {forfeit.agent}: {forfeit.reason.replace('_', ' ')}"
+        + (f" ({forfeit.detail})" if forfeit.detail else "")
         for forfeit in match.games[game].forfeits
     ]
     return "; ".join(reasons) or None

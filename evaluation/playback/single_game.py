@@ -12,7 +12,7 @@ from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
-from league.errors import GameCrashed, UnknownPolicy, one_line
+from league.errors import GameCrashed, UnknownPolicy, cause
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
@@ -117,7 +117,7 @@ class _AgentPolicy:
         """Actions (1, …) for a batch of this agent alone, and the move."""
         given = policy_output(self._policy, batch.observations, self._state, [self._draws], self._explore)
         for fault in given.faults.values():
-            raise GameCrashed(f"{self._agent} has no action: {one_line(fault, with_type=True)}") from fault
+            raise GameCrashed(f"{self._agent} has no action{cause(fault)}") from fault
         self._state, inputs = given.state, given.dist_inputs
         seen = {name: array[0] for name, array in batch.observations.items()}
         move = Move(self._agent, seen, given.actions[0].tolist(), None if inputs is None else inputs[0])

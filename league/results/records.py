@@ -6,7 +6,7 @@ opening, in which the contestants swap sides. Position i of a schedule is match 
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
 from typing import Any, Literal
@@ -30,6 +30,8 @@ _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 Reason = Literal["illegal_action", "not_finite", "malformed", "crashed"]
 """Why a game was forfeited: an action outside the space or its mask; an action with NaN or infinity; an output that is
 not an array of the space's shape and kind; a policy that raised."""
+MAX_DETAIL = 300
+"""Maximum characters of the detail of a forfeit, since each forfeited game has one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,11 +126,16 @@ class Schedule:
 
 @dataclass(frozen=True, slots=True)
 class Forfeit:
-    """A contestant (index) had to act as `agent` and returned no valid action."""
+    """A contestant (index) had to act as `agent` and returned no valid action.
+
+    detail: the exception with its place, or the action and what was expected; at most MAX_DETAIL characters. It may
+    differ between machines, and is no part of the result. Empty in records from before it was stored.
+    """
 
     contestant: int
     agent: str
     reason: Reason
+    detail: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +273,7 @@ def load_schedule(text: str) -> Schedule:
 
 def dump_games(games: Sequence[Game]) -> str:
     """Return a block as JSON: the common seed and opening, and [sides, actions, returns, scores] of each game, followed
-    by [contestant, agent, reason] of each forfeit and {"members": [version, …]} if a mixture took part."""
+    by [contestant, agent, reason, detail] of each forfeit and {"members": [version, …]} if a mixture took part."""
     first = games[0]
     return _ENCODER.encode([first.seed, first.opening, [_game(game) for game in games]])
 
@@ -295,7 +302,7 @@ def _game(game: Game) -> list[Any]:
         game.actions,
         game.returns,
         game.scores,
-        *([forfeit.contestant, forfeit.agent, forfeit.reason] for forfeit in game.forfeits),
+        *([forfeit.contestant, forfeit.agent, forfeit.reason, forfeit.detail] for forfeit in game.forfeits),
         *([{"members": game.members}] if game.members else ()),
     ]
 

@@ -39,7 +39,7 @@ def test_a_forfeited_game_is_rendered_until_the_forfeit(league: League, registry
     match, index = next((m, i) for m in matches for i, game in enumerate(m.games) if game.forfeits)
     result = league("replay", "--match", match.id, "--game", str(index), "--out", str(tmp_path / "game.webp"))
     assert result.code == 0, result.err
-    assert f"forfeited by {faulty} as {match.games[index].forfeits[0].agent}: illegal action" in result.out
+    assert f"forfeited by {faulty} as {match.games[index].forfeits[0].agent}: illegal action (action" in result.out
     assert "max-frames" not in result.out
 
 

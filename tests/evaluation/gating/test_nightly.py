@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from cli.output import verdict as verdict_line
 from evaluation.gating import verdicts
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
@@ -544,6 +545,11 @@ def test_a_forfeit_prevents_promotion_unless_the_gate_allows_it(tmp_path: Path) 
     assert (rejected.outcome, rejected.promoted) == ("reject", False)
     assert re.fullmatch(r"it forfeited \d+ games, but the gate allows none", str(rejected.note))
     assert rejected.llr >= rejected.bounds[1]
+    assert re.fullmatch(
+        r"\d+ games: \d+ by an illegal action \(the first: action \d, legal: .*\)",
+        str(rejected.forfeits["tictactoe@2"]),
+    )
+    assert f"; tictactoe@2 forfeited {rejected.forfeits['tictactoe@2']}" in verdict_line(rejected)
     verify(rejected.verdict, registry=registry)
     lenient = tictactoe.config(gate={"elo1": 60, "forfeits": True})
     verdicts.void(registry, rejected.verdict, actor="me", reason="the gate was too strict")

@@ -1,16 +1,22 @@
 """Bots as contestants in matches."""
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from evaluation.matches.game_loop import play_matches
+from evaluation.matches.game_records import forfeits_of_all
+from evaluation.matches.policy_calls import fault_of
 from evaluation.schedules.builders import round_robin
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.policies.loading import contestant
-from league.results.records import Match
+from league.results.records import MAX_DETAIL, Match, dump_games, load_games
 from tests.support.leagues import tictactoe
+from tests.support.policies import bots
 from tests.support.policies.bots import MODULE
 
 CONFIG = tictactoe.config(play={"opening_plies": 2})
@@ -36,6 +42,36 @@ def test_an_exception_forfeits_the_game_in_which_it_occurs() -> None:
     forfeits = [forfeit for game in games for forfeit in game.forfeits]
     assert 0 < len(forfeits) < len(games)
     assert {(forfeit.contestant, forfeit.reason) for forfeit in forfeits} == {(1, "crashed")}
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Failing", r"by an exception \(the first: RuntimeError: no idea at bots.py, line {RuntimeError}\)"),
+        ("failing_at_once", r"by an exception \(the first: ValueError: cannot reshape .* at bots.py, line {reshape}\)"),
+        ("taken", r"by an illegal action \(the first: action (\d), legal: (?!.*\1.*\))[\d, ]*\)"),
+        ("text", r"by an output that is no action \(the first: the bot returned str 'left': expected int64 \[\]\)"),
+    ],
+)
+def test_forfeits_are_reported_with_the_first_fault(name: str, sentence: str) -> None:
+    """An exception with the line of the bot that raised it, an action with those that were legal."""
+    lines = Path(bots.__file__).read_text().splitlines()
+    places = {
+        word: str(1 + next(i for i, line in enumerate(lines) if word in line)) for word in ("RuntimeError", "reshape")
+    }
+    for word, line in places.items():
+        sentence = sentence.replace(f"{{{word}}}", line)
+    bot = f"script:{MODULE}:{name}"
+    matches = [replace(match, games=load_games(dump_games(match.games))) for match in play(["script:random", bot], 8)]
+    lost = forfeits_of_all(matches)
+    assert lost.keys() == {bot}
+    assert re.fullmatch(rf"{lost[bot].games} games: {lost[bot].games} {sentence}", str(lost[bot]))
+    assert lost[bot].games == sum(bool(game.forfeits) for match in matches for game in match.games) > 0
+
+
+def test_a_long_message_of_a_bot_is_cut() -> None:
+    fault = fault_of(ValueError("x" * 10_000))
+    assert len(fault.detail) == MAX_DETAIL
 
 
 def test_a_wrong_return_value_forfeits_the_game() -> None:

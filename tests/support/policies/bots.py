@@ -45,6 +45,18 @@ class Failing(Alternating):
         return action
 
 
+def failing_at_once(observation: NDArray, action_mask: NDArray) -> NDArray:
+    return action_mask.reshape(2, 3)
+
+
+failing_at_once.batched = True  # type: ignore[attr-defined]
+
+
+def taken(observation: NDArray, action_mask: NDArray) -> int:
+    """The first square that is taken, or one beside the board."""
+    return int((np.flatnonzero(action_mask == 0)[:1].tolist() or [99])[0])
+
+
 def text(observation: NDArray) -> Any:
     return "left"
 
