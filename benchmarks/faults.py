@@ -3,6 +3,8 @@
 A server with two replicas behind HAProxy answers calls without pause, half of them from our client, which retries, half
 from a client without retries; in the meantime a fault is injected. Counted are the unanswered calls of each kind, and
 the time until full recovery: from the injection, or from the end of a lasting fault. Target: our client loses no call.
+Then the champion is promoted again and again, as by `league promote --wait`, right after a replica, HAProxy or the
+controller was killed: the time until all replicas have confirmed it.
 Overload is measured last: requests arrive at four times the capacity of the server; 99 % of the accepted ones must be
 answered within twice the normal time, and all others with 429 and Retry-After.
 
@@ -22,6 +24,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
@@ -40,6 +43,8 @@ SETTLING = 2.0
 DEADLINE = 90.0
 """Seconds after which recovery has failed."""
 SLOW = 200
+VICTIMS = ("PolicyServer", "PolicyServer", "PolicyServer", "/haproxy", "ServeController")
+"""What is killed before each promotion, in turn."""
 HEADER = ("case", "calls", "lost by our client", "lost without retries", "p99 ms", "recovered after s", "target")
 
 
@@ -86,9 +91,9 @@ def main() -> int:
     """Print a line for each case; 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="smoke test: faults of a minute last 5 s")
-    parser.add_argument("--only", choices=[*FAULTS, "overload"], action="append", help="a case; may be repeated")
+    parser.add_argument("--only", choices=[*FAULTS, *LAST], action="append", help="a case; may be repeated")
     options = parser.parse_args()
-    wanted = options.only or [*FAULTS, "overload"]
+    wanted = options.only or [*FAULTS, *LAST]
     with tempfile.TemporaryDirectory() as scratch:
         registry = publish(Path(scratch) / "home", versions=2)
         print(" | ".join(HEADER), flush=True)
@@ -96,6 +101,8 @@ def main() -> int:
             server = FaultTarget(url, registry, 5.0 if options.quick else 60.0)
             until(lambda: server.serving(1) == REPLICAS)
             met = [_report(name, *_inject(server, FAULTS[name], Path(scratch))) for name in FAULTS if name in wanted]
+            if "promotions" in wanted:
+                _report_confirmations(confirmations(server, count=5 if options.quick else 25))
             if "overload" in wanted:
                 met.append(_report_overload(overload(url, seconds=3.0 if options.quick else 10.0)))
         registry.close()
@@ -124,6 +131,14 @@ def _report(name: str, log: CallLog, seconds: float) -> bool:
     for error, count in log.errors.items():
         print(f"    {count} × {error}", flush=True)
     return not with_retries
+
+
+def _report_confirmations(seconds: list[float]) -> None:
+    print(
+        f"{len(seconds)} promotions, each after a kill | confirmed by all replicas after: "
+        f"median {median(seconds):.2f} s, maximum {max(seconds):.2f} s",
+        flush=True,
+    )
 
 
 def _report_overload(result: Overload) -> bool:
@@ -164,6 +179,27 @@ def replica_killed(server: FaultTarget) -> float:
     since = _kill(server, "PolicyServer", 1)
     server.promote()
     return since
+
+
+def confirmations(server: FaultTarget, count: int) -> list[float]:
+    """Kill a process and promote, `count` times; returns the seconds that each promotion was waited for."""
+    return [_confirmation(server, VICTIMS[number % len(VICTIMS)]) for number in range(count)]
+
+
+def _confirmation(server: FaultTarget, victim: str) -> float:
+    """Kill a process and promote; returns the seconds waited for, when all processes run again."""
+    running_before = server.processes(victim)
+    os.kill(running_before[0], signal.SIGKILL)
+    now, since = server.registry.aliases.current(LEAGUE)["champion"], time.perf_counter()
+    event = server.registry.aliases.set(
+        LEAGUE, "champion", 3 - now, expected=ANY, actor="benchmark", reason="is it confirmed?"
+    )
+    server.registry.changes.wait_for_alias(event, DEADLINE)
+    seconds = time.perf_counter() - since
+    print(f"    {victim} killed: confirmed after {seconds:.2f} s", flush=True)
+    until(lambda: len(set(server.processes(victim)) - {running_before[0]}) >= len(running_before))
+    until(lambda: server.serving(3 - now) == REPLICAS)
+    return seconds
 
 
 def controller_killed(server: FaultTarget) -> float:
@@ -265,6 +301,7 @@ def _database(server: FaultTarget) -> Path:
     return server.registry.storage.home / "league.db"
 
 
+LAST = ("promotions", "overload")
 FAULTS: dict[str, Fault] = {
     "replica killed": replica_killed,
     "controller killed": controller_killed,

@@ -29,6 +29,8 @@ from league.registry.training import runs
 
 OPEN = "open"
 POLL_SECONDS = 0.02
+ENDED_SECONDS = 0.3
+"""Seconds between two searches for replicas whose processes have ended; most promotions are followed earlier."""
 
 
 class ChangeRepository(Repository):
@@ -75,8 +77,8 @@ class ChangeRepository(Repository):
     ) -> list[str]:
         """Wait until all registered replicas, at least one, follow the move of an alias, and return them.
 
-        A replica is waited for until it deregisters, or is removed because its process has ended: one that does not
-        respond, or cannot reach the database, may still serve another version.
+        A replica is waited for until it deregisters, or is removed because its process has ended, which is looked for
+        here on this machine: one that does not respond, or cannot reach the database, may still serve another version.
         timeout: in seconds. Raises AliasMoved if the alias points elsewhere by now, or NotReady, which names the
         replicas that do not follow, and why.
         """
@@ -153,6 +155,7 @@ class ChangeRepository(Repository):
             replicas.with_acknowledgement(league)
         )
         deadline = time.monotonic() + timeout
+        next_search = time.monotonic() + ENDED_SECONDS
         while True:
             with self._database.read() as session:
                 registered, following, current = session.execute(count).one()
@@ -167,6 +170,9 @@ class ChangeRepository(Repository):
                     if one.replica in late
                 ]
                 raise NotReady(f"{done}, but after {timeout:g} s {_why(registered, reasons)}")
+            if time.monotonic() >= next_search:
+                self._replicas.remove_ended()
+                next_search = time.monotonic() + ENDED_SECONDS
             sleep(POLL_SECONDS)
 
     def _names(self, league: str, condition: ColumnElement[bool]) -> list[str]:

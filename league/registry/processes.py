@@ -7,12 +7,12 @@ from pathlib import Path
 
 def this_process() -> str:
     """Return `machine:pid:start`, where `start` distinguishes processes that reuse a pid, if the system reports it."""
-    return f"{_machine()}:{os.getpid()}:{_start(os.getpid())}"
+    return f"{this_machine()}:{os.getpid()}:{_start(os.getpid())}"
 
 
 def is_local(process: str) -> bool:
     """Return whether a process runs, or ran, on this machine, since its last start and in this container."""
-    return process.rsplit(":", 2)[0] == _machine()
+    return process.rsplit(":", 2)[0] == this_machine()
 
 
 def has_ended(process: str) -> bool:
@@ -26,8 +26,8 @@ def host_name(process: str) -> str:
     return process.rsplit(":", 2)[0].partition("/")[0]
 
 
-def _machine() -> str:
-    """Host name, last start and container, if the system reports them: several may have the same name."""
+def this_machine() -> str:
+    """Return host name, last start and container, if the system reports them: several may have the same name."""
     try:
         boot, container = (
             Path("/proc/sys/kernel/random/boot_id").read_text().strip(),

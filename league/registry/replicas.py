@@ -18,7 +18,7 @@ from sqlalchemy import ColumnElement, Join, and_, bindparam, case, delete, func,
 from sqlalchemy.orm import Session
 
 from league.refs import CHAMPION
-from league.registry import leagues, traffic
+from league.registry import leagues, processes, traffic
 from league.registry.storage.database import Repository, clock, insert, row_count, sql_clock, upsert, upsert_all
 from league.registry.storage.rows import (
     Acknowledgement,
@@ -42,6 +42,8 @@ KEPT = timedelta(days=1)
 """Replicas that died without deregistering are removed after this time, unless another replica notices earlier."""
 LIVENESS_TIMEOUT = timedelta(seconds=15)
 """A replica without a report for longer is silent: dead, stuck, or cut off from the database."""
+PROCESS = "process"
+"""Key in the description of a process, for its identity, see `league.registry.processes`."""
 DRAINING = "draining"
 """Key in the description of a process, for a replica that is being stopped."""
 _UPDATE = update(ReplicaTable).where(ReplicaTable.replica == bindparam("name"))
@@ -86,18 +88,30 @@ class ReplicaRepository(Repository):
         with self._database.read() as session:
             return _registered(session, true())
 
-    def counts(self) -> ReplicaCounts:
-        """Return how many replicas have registered and were not removed, are silent, and are being stopped."""
+    def counts(self, silence: timedelta = LIVENESS_TIMEOUT) -> ReplicaCounts:
+        """Return how many replicas have registered and were not removed, are silent, and are being stopped.
+
+        silence: the time without a report after which a replica counts as silent.
+        """
         now = datetime.now(UTC) if self._database.is_sqlite else func.clock_timestamp()
-        silent = func.count().filter(ReplicaTable.seen_at <= now - LIVENESS_TIMEOUT)
+        silent = func.count().filter(ReplicaTable.seen_at <= now - silence)
         draining = func.count().filter(ReplicaTable.process[DRAINING].as_string() == "true")
         (found,) = self._database.rows(select(func.count(), silent, draining).select_from(ReplicaTable))
         return ReplicaCounts(*found)
 
-    def silent(self) -> list[RegisteredReplica]:
-        """Return the registered replicas that are silent."""
+    def silent(self, silence: timedelta = LIVENESS_TIMEOUT) -> list[RegisteredReplica]:
+        """Return the registered replicas without a report for this time."""
         with self._database.read() as session:
-            return _registered(session, ReplicaTable.seen_at <= sql_clock(session) - LIVENESS_TIMEOUT)
+            return _registered(session, ReplicaTable.seen_at <= sql_clock(session) - silence)
+
+    def remove_ended(self) -> None:
+        """Remove the replicas of this machine whose processes have ended without deregistering."""
+        is_local = ReplicaTable.process[PROCESS].as_string().startswith(f"{processes.this_machine()}:", autoescape=True)
+        with self._database.read() as session:
+            local = _registered(session, is_local)
+        for replica in local:
+            if processes.has_ended(replica.process[PROCESS]):
+                self.remove(replica.replica)
 
     def acknowledge(
         self,

@@ -11,6 +11,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping, Set
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import timedelta
 
 from league.conditions import ActionSelection
 from league.errors import LeagueError, StorageError
@@ -32,6 +33,10 @@ POLL_NOTIFIED = 1.0
 """Seconds between polls where PostgreSQL notifies of changes: a notification may be lost, for example in a pooler."""
 SPREAD = 0.02
 """Seconds over which replicas that were notified at the same moment read. Changes in this time are read together."""
+OVERDUE_HEARTBEATS = 1.5
+"""Heartbeats without a report after which it is examined whether the process of another replica has ended."""
+MAX_EXAMINED = 20
+"""Replicas that one examines at a heartbeat. After an interruption of the database, all others are overdue."""
 REREAD = 60.0
 """Seconds after which everything is read again: processes of earlier releases do not count changes."""
 
@@ -168,8 +173,10 @@ class RegistryWatcher:
     def _report_life(self, registry: Registry) -> tuple[bool, int]:
         """Whether this replica was registered, and the number of replicas that are not being stopped."""
         is_known = registry.replicas.register(self._replica, self._process.description, self._is_draining())
-        replicas = registry.replicas.counts()
-        for other in registry.replicas.silent() if replicas.silent else ():
+        overdue = OVERDUE_HEARTBEATS * timedelta(seconds=self._settings.heartbeat)
+        replicas = registry.replicas.counts(overdue)
+        silent = registry.replicas.silent(overdue) if replicas.silent else []
+        for other in random.sample(silent, min(len(silent), MAX_EXAMINED)):
             if other.silence > KEPT or self._process.has_ended(other.process):
                 registry.replicas.remove(other.replica)
                 logger.info("replica %s has ended without deregistering", other.replica)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from league.registry import processes
+from league.registry.replicas import PROCESS
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +25,9 @@ class ReplicaProcess:
 
 def this_process() -> ReplicaProcess:
     """This process, known by its machine."""
-    return ReplicaProcess({"process": processes.this_process()}, has_ended)
+    return ReplicaProcess({PROCESS: processes.this_process()}, has_ended)
 
 
 def has_ended(other: Mapping[str, str]) -> bool:
     """Whether a process ran on this machine, since its last start and in this container, and has ended."""
-    return "process" in other and processes.has_ended(other["process"])
+    return PROCESS in other and processes.has_ended(other[PROCESS])

@@ -12,7 +12,9 @@ from sqlalchemy import update
 
 from league.errors import AliasMoved, NotReady
 from league.registry.aliases import ANY
+from league.registry.processes import this_process
 from league.registry.registry import Registry
+from league.registry.replicas import PROCESS
 from league.registry.storage.database import clock
 from league.registry.storage.rows import AliasEvent
 from league.registry.storage.tables import ReplicaTable
@@ -88,6 +90,15 @@ def test_a_silent_replica_is_awaited_and_named(served: Registry) -> None:
     silence(served, "replica-2", 3600)
     with pytest.raises(NotReady, match="replica-2 has been silent for 3600 s; last known: serves version 1"):
         served.changes.wait_for_alias(newest(served), 0)
+
+
+def test_a_replica_of_this_machine_is_not_awaited_when_its_process_has_ended(served: Registry) -> None:
+    """No other replica has noticed it yet."""
+    acknowledge(served, "replica-1", 2)
+    machine, pid, _ = this_process().rsplit(":", 2)
+    for replica, process in {"replica-1": this_process(), "replica-2": f"{machine}:{pid}:1"}.items():
+        assert served.replicas.register(replica, {PROCESS: process})
+    assert served.changes.wait_for_alias(newest(served), 60) == ["replica-1"]
 
 
 def test_a_replica_that_followed_before_it_fell_silent_is_no_obstacle(served: Registry) -> None:

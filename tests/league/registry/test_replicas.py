@@ -6,8 +6,9 @@ from sqlalchemy import select, update
 
 from league.errors import UnknownLeague
 from league.registry import replicas
+from league.registry.processes import this_process
 from league.registry.registry import Registry
-from league.registry.replicas import LIVENESS_TIMEOUT
+from league.registry.replicas import LIVENESS_TIMEOUT, PROCESS
 from league.registry.storage import database
 from league.registry.storage.database import clock
 from league.registry.storage.rows import ReadPosition
@@ -48,6 +49,20 @@ def test_a_silent_replica_is_listed(registry: Registry) -> None:
     assert [row.replica for row in registry.replicas.silent()] == ["silent"]
     assert registry.replicas.counts() == (2, 1, 0)
     assert [row.replica for row in registry.replicas.registered()] == ["alive", "silent"]
+
+
+def test_replicas_whose_processes_have_ended_are_removed_on_their_machine(registry: Registry) -> None:
+    machine, pid, _ = this_process().rsplit(":", 2)
+    descriptions = {
+        "alive": {PROCESS: this_process()},
+        "ended": {PROCESS: f"{machine}:{pid}:1"},
+        "elsewhere": {PROCESS: f"another:{pid}:1"},
+        "of an earlier release": {"pid": pid},
+    }
+    for replica, description in descriptions.items():
+        registry.replicas.register(replica, description)
+    registry.replicas.remove_ended()
+    assert {row.replica for row in registry.replicas.registered()} == descriptions.keys() - {"ended"}
 
 
 def test_replicas_that_are_being_stopped_are_counted_until_they_end(registry: Registry) -> None:

@@ -246,7 +246,7 @@ def test_replicas_that_ended_are_removed_and_silent_ones_are_not(registry: Regis
     }
     for name, process in processes.items():
         registry.replicas.register(name, process)
-        backdate(registry, name, 20)
+        backdate(registry, name, 2)  # a few heartbeats
     registry.replicas.register("elsewhere for a day", processes["elsewhere"])
     backdate(registry, "elsewhere for a day", 25 * 3600)
     with replica(registry.storage):
