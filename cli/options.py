@@ -29,6 +29,11 @@ Timeout = Annotated[float, typer.Option(min=0, help="Maximum time for --wait, in
 Workers = Annotated[
     int, typer.Option(min=0, help="Number of Ray tasks that play games in parallel; 0 plays in this process.")
 ]
+DEFAULT_SECONDS = 60.0
+Seconds = Annotated[
+    float,
+    typer.Option(min=1, help="Seconds after which the checks of a slow environment are cut short, which is reported."),
+]
 ClusterWorkers = Annotated[
     int | None,
     typer.Option(

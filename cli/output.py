@@ -3,7 +3,7 @@
 import re
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, TextIO
@@ -166,6 +166,24 @@ def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:
 
 SECONDS_PER_LINE = 10.0
 """Seconds between two lines of progress, where there is no bar."""
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Callable[[str], None]]:
+    """Return a function that shows what is done now: beside a spinner in a terminal, in plain lines elsewhere."""
+    if errors.is_terminal:
+        with errors.status(Text(title)) as status:
+            yield lambda doing: status.update(Text(f"{title}: {doing}"))
+        return
+    next_line = time.monotonic() + SECONDS_PER_LINE
+
+    def show(doing: str) -> None:
+        nonlocal next_line
+        if time.monotonic() >= next_line:
+            next_line = time.monotonic() + SECONDS_PER_LINE
+            complain(f"{title}: {doing}")
+
+    yield show
 
 
 class GameProgress:

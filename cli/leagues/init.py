@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cli.output import console, say
+from cli.options import DEFAULT_SECONDS, Seconds
+from cli.output import progress, say
 from league.errors import ConfigError, InvalidInput
 from league.refs import check_slug
 
@@ -34,6 +35,14 @@ def init(
         list[str] | None,
         typer.Option("--arg", metavar="NAME=VALUE", help="Argument of the constructor, such as game=kuhn_poker."),
     ] = None,
+    team: Annotated[
+        bool | None,
+        typer.Option(
+            "--team/--no-team",
+            help="All agents are one side, or each is a side of its own. Default: a team if their returns agree.",
+        ),
+    ] = None,
+    seconds: Seconds = DEFAULT_SECONDS,
 ) -> None:
     """Write a commented configuration that fits an environment.
 
@@ -54,17 +63,30 @@ def init(
         raise ConfigError(f"{path} exists and is not overwritten: choose another file with --output")
     if not folder.is_dir():
         raise ConfigError(f"{path}: {folder} is not a directory")
-    with console.status(f"playing {entry_point}"):
-        proposal = propose(league, entry_point, kwargs, *_search(entry_point, folder))
+    with progress(f"playing {entry_point}") as show:
+        proposal = propose(
+            league,
+            entry_point,
+            kwargs,
+            *_search(entry_point, folder),
+            is_team=team,
+            seconds=seconds,
+            progress=show,
+        )
     with disk_errors(path, action="written"), replacing(path) as part:
         part.write_text(proposal.text, encoding="utf-8")
-    say(proposal.found.policies)
-    say(proposal.found.actions)
-    if proposal.config.play.actions == "greedy":
-        say(str(proposal.found.openings))
-    for finding in proposal.found.findings:
+    found = proposal.found
+    say(found.policies)
+    say(found.actions)
+    if proposal.config.play.actions == "greedy" and found.openings is not None:
+        say(str(found.openings))
+    for finding in found.findings:
         if "play.opening_plies" not in finding.text:  # the file sets it
             say(f"Note: {finding}")
+    if team is None and found.is_team:
+        say("The file makes all agents one team. If they are opponents, use --no-team.")
+    elif team is None and any("one team" in finding.text for finding in found.findings):
+        say("The file makes each agent a side of its own. If they are one team, use --team.")
     say(f"Wrote {path}. Next: league train {shlex.quote(str(path))}")
 
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import AsJson, Config, open_registry
-from cli.output import emit, say, table
+from cli.options import DEFAULT_SECONDS, AsJson, Config, Seconds, open_registry
+from cli.output import counted, emit, progress, say, table
 from configs.bundled import find
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ def check_env(
         int | None, typer.Option(min=1, help="Maximum number of steps per episode. Default: play.max_moves.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
+    seconds: Seconds = DEFAULT_SECONDS,
     as_json: AsJson = False,
 ) -> None:
     """Test a league's environment against the contract.
@@ -35,7 +36,8 @@ def check_env(
     from league.policies.loading import errors_of_contestants
 
     league = LeagueConfig.load(find(config))
-    found = examine(league, episodes, steps, seed)
+    with progress(f"checking {league.environment.entry_point}") as show:
+        found = examine(league, episodes, steps, seed, seconds=seconds, progress=show)
     if found.interface is not None:
         for error in errors_of_contestants(league, found.interface, open_registry):
             found.add("fault", str(error))
@@ -52,8 +54,8 @@ def _show(league: "LeagueConfig", found: "Examination") -> None:
     if found.lengths:
         state = "no global state" if found.state_size is None else f"a global state of {found.state_size:,} numbers"
         say(
-            f"{league.environment.entry_point}: {found.api}, {found.agents} agents, {state}, episodes of"
-            f" {min(found.lengths)} to {max(found.lengths)} steps, {found.steps_per_second:,.0f} steps per second"
+            f"{league.environment.entry_point}: {found.api}, {counted(found.agents, 'agent')}, {state}, episodes of"
+            f" {_lengths(found)}, {found.steps_per_second:,.{found.steps_per_second < 10:d}f} steps per second"
         )
         say(found.implementation)
         say(found.policies)
@@ -74,3 +76,11 @@ def _show(league: "LeagueConfig", found: "Examination") -> None:
         table(("severity", "finding"), rows, prose=("finding",))
     if found.passed:
         say("The environment passes all checks." if not found.findings else "The environment passes, with notes.")
+
+
+def _lengths(found: "Examination") -> str:
+    """`10 steps`, `34 to 59 steps`, or `12 or more steps` if an episode was cut."""
+    least, most = min(found.lengths), max(found.lengths)
+    if found.actions_per_episode is None:
+        return f"{most:,} or more steps"
+    return counted(most, "step") if least == most else f"{least:,} to {most:,} steps"

@@ -1,5 +1,6 @@
 """Builds environments (AEC, Parallel or MultiAgentEnv) from their configuration and describes their interface."""
 
+import copy
 import fnmatch
 import os
 import re
@@ -89,7 +90,8 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
         # Lets environments draw without a display.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     constructor = _constructor(config)
-    kwargs = config.kwargs if render_mode is None else config.kwargs | {"render_mode": render_mode}
+    # Copied, because some environments change their arguments.
+    kwargs = copy.deepcopy(config.kwargs) | ({} if render_mode is None else {"render_mode": render_mode})
     try:
         env = constructor(**kwargs)
     except LeagueError:

@@ -1,7 +1,9 @@
 """Episodes with random legal actions, whose reports are checked."""
 
 import math
+import random
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -11,17 +13,23 @@ import numpy as np
 from league.config.league import LeagueConfig
 from league.environments.adapters import EnvAdapter, Report, adapter_for
 from league.environments.building import action_space, build
-from league.environments.conformance.findings import Examination, Trace
+from league.environments.conformance.findings import Episode, Examination, Trace
 from league.environments.conformance.observations import ObservationCheck, check_constant_observations
 from league.environments.conformance.openings import joined, measure_openings
 from league.environments.conformance.random_actions import RandomActions
+from league.environments.conformance.time_budget import TimeBudget
 from league.errors import EnvironmentMismatch, IllegalMask, one_line
 from league.interface import Interface
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check_mask
 
-MANY_ENDED = 0.05
-"""Fraction of openings that end the game above which there is a note."""
+FIRST, RETURNS, OPENINGS = 0.2, 0.7, 0.9
+"""Shares of the time after which no further episodes are played: the first ones, which are repeated; those that compare
+returns; random openings."""
+GAMES, LONGEST_GAME = 20, 100
+"""Games of which the returns of agents are compared, and the steps after which they are cut."""
+AGREEMENT = 0.75
+"""Correlation of the returns of all agents from which they may be one team: in MPE, teams have 0.75 to 1."""
 
 
 @dataclass(slots=True)
@@ -38,10 +46,18 @@ class Place:
 class Examiner:
     """Plays episodes of one environment and records what is wrong with them."""
 
-    def __init__(self, env: Any, interface: Interface, config: LeagueConfig, found: Examination, steps: int | None):
+    def __init__(
+        self,
+        env: Any,
+        interface: Interface,
+        config: LeagueConfig,
+        found: Examination,
+        steps: int | None,
+        budget: TimeBudget,
+    ) -> None:
         """steps: maximum number of steps per episode. None: episodes must end within `play.max_moves` steps."""
-        self._env, self._config, self._found = env, config, found
-        self._agents = list(interface.agents)
+        self._env, self._config, self._found, self._budget = env, config, found, budget
+        self._agents, self._sides = list(interface.agents), interface.sides
         self._most, self._must_end = (config.play.max_moves, True) if steps is None else (steps, False)
         self._checks = [ObservationCheck(agent, env, found) for agent in env.possible_agents]
         self._spaces = [action_space(env, agent) for agent in env.possible_agents]
@@ -53,64 +69,156 @@ class Examiner:
 
         Raises what the environment raises; `place` is then where.
         """
-        found, adapter = self._found, adapter_for(self._env, self._checks)
+        found, adapter, budget = self._found, adapter_for(self._env, self._checks), self._budget
         began = time.perf_counter()
-        first = [self._episode(adapter, seed + i) for i in range(episodes)]
-        found.lengths = [len(trace) for trace in first]
+        first: list[Episode] = []
+        while len(first) < episodes and not (first and budget.is_spent(FIRST)):
+            first.append(self._first_episode(adapter, seed + len(first), f"episode {len(first) + 1} of {episodes}"))
+        found.lengths = [episode.steps for episode in first]
         found.steps_per_second = sum(found.lengths) / (time.perf_counter() - began)
-        found.has_common_reward = _has_common_reward(first, len(self._agents))
-        # After the timing, because a global state may be a large image.
-        again = [self._episode(adapter, seed + i, states=True) for i in reversed(range(episodes))][::-1]
-        with closing(adapter_for(build(self._config.environment), self._checks)) as fresh:
-            anew = self._episode(fresh, seed)
-        if first != again:
-            found.add("fault", "the same seed gives another episode after other episodes: reset must clear all state")
-        elif first[0] != anew:
-            found.add(
-                "fault",
-                "the same seed gives another episode in a new environment: all randomness must depend on the seed",
-            )
-        check_constant_observations(first, self._env, found)
-        _check_endings(first, found)
-        found.openings = measure_openings(adapter, self._spaces, seed)
+        is_whole = all(episode.is_whole for episode in first)
+        found.actions_per_episode = max(episode.actions for episode in first) if is_whole else None
+        if budget.is_spent(FIRST) and (len(first) < episodes or not is_whole):
+            cut = "" if is_whole else f", the last one only to step {first[-1].steps}"
+            budget.skipped.append(f"{len(first)} of {episodes} episodes were played{cut}")
+        self._check_seeding(adapter, first, seed)
+        traces = [episode.trace for episode in first]
+        check_constant_observations(traces, self._env, found)
+        if is_whole:
+            _check_endings(traces, found)
+        self._check_returns(adapter, first, seed + episodes)
+        found.openings = measure_openings(adapter, self._spaces, seed, budget, OPENINGS)
+        if found.openings is None:
+            budget.skipped.append("random openings were not measured")
         _check_openings(self._config.play.opening_plies, found)
 
-    def _episode(self, adapter: EnvAdapter, seed: int, states: bool = False) -> Trace:
-        """Play an episode with random legal actions. states: check the global state at each step."""
-        trace: Trace = []
-        self.place = Place(seed)
-        reports = adapter.reset(seed)
-        self._actions.seed(seed)
-        for step in range(1, self._most + 1):
-            self.place.step = step
-            if states:
-                _check_state(adapter, self._found)
-            moves = []
-            for agent, observation, reward, terminated, truncated in reports:
-                trace.append((agent, joined(observation), reward, terminated, truncated))
-                _check_report(self._agents[agent], (agent, observation, reward, terminated, truncated), self._found)
-                if not (terminated or truncated):
-                    moves.append((agent, self._actions.draw(agent, observation.get(ACTION_MASK))))
-            if not moves:
-                return trace
-            reports = adapter.step(moves)
+    def _first_episode(self, adapter: EnvAdapter, seed: int, doing: str) -> Episode:
+        episode = self._episode(adapter, seed, doing, self._most, share=FIRST)
+        if episode.steps < self._most or episode.is_whole:
+            return episode
         if self._must_end:
             raise EnvironmentMismatch(
                 f"the episode with seed {seed} did not end within {self._most:,} steps (play.max_moves), after which a"
                 " match fails: terminate or truncate it in the environment, or raise play.max_moves"
             )
         self._found.add("note", f"an episode did not end within {self._most} steps (--steps)")
-        return trace
+        return episode
+
+    def _check_seeding(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
+        """Play the same episodes again, in reverse order, and the first one in a new environment."""
+        # After the timing, because a global state may be a large image.
+        again = [
+            self._episode(adapter, seed + i, "the same episodes again", first[i].steps, states=True)
+            for i in reversed(range(len(first)))
+        ][::-1]
+        before = _global_generators()
+        anew = self._anew(first[0], seed)
+        after = _global_generators()
+        pairs = [*zip(first, again, strict=True), (first[0], anew)]
+        change = next((change for one, other in pairs if (change := self._change(one, other))), None)
+        if change is None:
+            return
+        if not self._change(self._anew(first[0], seed), anew):
+            text = "the same seed gives another episode after other episodes: reset must clear all state"
+        else:
+            drawn = [name for name, state in after.items() if state != before[name]]
+            text = (
+                "the same seed gives another episode in each new environment: all randomness must follow the seed of"
+                " reset"
+            ) + "".join(f", and it draws from the generator of the module {name}" for name in drawn)
+        self._found.add("fault", text, example=change)
+
+    def _anew(self, episode: Episode, seed: int) -> Episode:
+        """Play an episode in a new environment."""
+        with closing(adapter_for(build(self._config.environment), self._checks)) as fresh:
+            return self._episode(fresh, seed, "the first episode in a new environment", episode.steps)
+
+    def _change(self, one: Episode, other: Episode) -> str:
+        """Describe the first report that differs between two episodes; empty if they are equal."""
+        names = ("agent", "observation", "reward", "termination", "truncation")
+        for number, (before, after) in enumerate(zip(one.trace, other.trace, strict=False), start=1):
+            for name, value, changed in zip(names, before, after, strict=True):
+                if value != changed:
+                    return f"the {name} in report {number}, of {self._agents[before[0]]}"
+        return "the length of an episode" if len(one.trace) != len(other.trace) else ""
+
+    def _episode(
+        self, adapter: EnvAdapter, seed: int, doing: str, most: int, share: float | None = None, states: bool = False
+    ) -> Episode:
+        """Play an episode with random legal actions.
+
+        Args:
+            adapter: The environment.
+            seed: Seed of the episode.
+            doing: What the progress says.
+            most: Steps after which the episode is cut.
+            share: Share of the time after which it is cut.
+            states: Check the global state at each step.
+        """
+        trace: Trace = []
+        returns, actions, step = [0.0] * len(self._agents), [0] * len(self._agents), 0
+        self.place = Place(seed)
+        reports = adapter.reset(seed)
+        self._actions.seed(seed)
+        while True:
+            if states:
+                _check_state(adapter, self._found)
+            moves = []
+            for agent, observation, reward, terminated, truncated in reports:
+                trace.append((agent, joined(observation), reward, terminated, truncated))
+                returns[agent] += reward
+                _check_report(self._agents[agent], (agent, observation, reward, terminated, truncated), self._found)
+                if not (terminated or truncated):
+                    moves.append((agent, self._actions.draw(agent, observation.get(ACTION_MASK))))
+            is_late = share is not None and step > 0 and self._budget.is_spent(share)
+            if not moves or step == most or is_late:
+                return Episode(trace, step, max(actions), tuple(returns), is_whole=not moves)
+            for agent, _ in moves:
+                actions[agent] += 1
+            step += 1
+            self.place.step = step
+            self._budget.report(f"{doing}, step {step}")
+            reports = adapter.step(moves)
+
+    def _check_returns(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
+        """Find agents whose returns agree, as those of a team do."""
+        games = [episode.returns for episode in first if episode.is_whole]
+        if not games or len(self._agents) == 1:
+            return
+        if _agreement(games) != 1.0:
+            # Returns of episodes of very different lengths would agree by their lengths.
+            games = [episode.returns for episode in first if episode.is_whole and episode.steps <= LONGEST_GAME]
+        while len(games) < GAMES and _agreement(games) != 1.0 and not self._budget.is_spent(RETURNS):
+            doing = f"returns of game {len(games) + 1} of {GAMES}"
+            games.append(self._episode(adapter, seed + len(games), doing, LONGEST_GAME, share=RETURNS).returns)
+        agreement = self._found.agreement = _agreement(games)
+        if agreement is not None and agreement >= AGREEMENT and len(self._sides) > 1 and self._config.sides is None:
+            how = "are equal" if agreement == 1.0 else f"agree (correlation {agreement:.2f} in {len(games)} games)"
+            self._found.add(
+                "note",
+                f'the returns of all agents {how}: are they one team? A team is one side: `sides: {{team: ["*"]}}`',
+            )
 
 
-def _has_common_reward(traces: list[Trace], agents: int) -> bool:
-    """Return whether all agents had the same return in each episode, and not always 0."""
-    returns = [[0.0] * agents for _ in traces]
-    for own, trace in zip(returns, traces, strict=True):
-        for agent, _, reward, *_ in trace:
-            own[agent] += reward
-    alike = all(math.isclose(value, own[0], rel_tol=1e-6) for own in returns for value in own)
-    return agents > 1 and alike and any(own[0] for own in returns)
+def _agreement(games: Sequence[Sequence[float]]) -> float | None:
+    """Return the smallest correlation between the returns (games, agents) of two agents.
+
+    1 if all agents have equal returns that are not always 0. None if there are too few games, or constant returns.
+    """
+    if len(games) < 2:
+        return None
+    returns = np.array(games)
+    if np.allclose(returns, returns[:, :1], rtol=1e-6) and returns.any():
+        return 1.0
+    if len(games) < GAMES or not returns.std(axis=0).all():
+        return None
+    return min(float(np.corrcoef(returns.T).min()), 0.999)
+
+
+def _global_generators() -> dict[str, object]:
+    """The states of the generators that all code shares, by module."""
+    legacy: Any = np.random.get_state()
+    return {"random": random.getstate(), "numpy.random": (legacy[1].tobytes(), legacy[2])}
 
 
 def _check_endings(traces: list[Trace], found: Examination) -> None:
@@ -135,12 +243,18 @@ def _check_endings(traces: list[Trace], found: Examination) -> None:
 
 def _check_openings(plies: int, found: Examination) -> None:
     """Compare `play.opening_plies` with what is recommended."""
-    assert found.openings is not None
-    if (best := found.openings.recommended) and not plies:
+    openings = found.openings
+    if openings is None:
+        return
+    if openings.recommended and not plies:
+        best = openings.recommended
         found.add("note", f"greedy policies would repeat one game: set play.opening_plies, for example to {best}")
-    lengths = found.openings.lengths
-    if 0 < plies <= len(lengths) and lengths[plies - 1].ended > MANY_ENDED:
-        found.add("note", f"play.opening_plies: {plies} is long for this game. {found.openings.effect(plies)}")
+    if not 0 < plies <= len(openings.lengths):
+        return
+    if warning := openings.warning(plies):
+        found.add("note", f"play.opening_plies: {plies} is long for this game. {openings.effect(plies)}. {warning}")
+    if openings.lengths[plies - 1].positions <= 1:
+        found.add("note", f"play.opening_plies: {plies} does nothing. {openings.effect(plies)}")
 
 
 def _check_report(agent: str, report: Report, found: Examination) -> None:

@@ -6,8 +6,7 @@ Episodes are played with random legal actions. A *fault* leads to wrong results 
 import contextlib
 import io
 import warnings
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
@@ -19,6 +18,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import build, describe, describe_policies
 from league.environments.conformance.episodes import Examiner
 from league.environments.conformance.findings import Examination, Vectorised
+from league.environments.conformance.time_budget import TimeBudget
 from league.environments.implementation import implementation
 from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
@@ -35,7 +35,15 @@ MEASURED_COPIES, MEASURED_SECONDS = 1024, 1.0
 """Copies and duration of the measurement of its speed."""
 
 
-def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, seed: int = 0) -> Examination:
+def examine(
+    config: LeagueConfig,
+    episodes: int = 3,
+    steps: int | None = None,
+    seed: int = 0,
+    *,
+    seconds: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Examination:
     """Play and check episodes with random legal actions. Never raises exceptions of the environment.
 
     Args:
@@ -44,11 +52,13 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, s
         steps: Maximum number of steps per episode. None: an episode that has not ended after `play.max_moves` steps is
             a fault.
         seed: Seed of the first episode.
+        seconds: Time after which the checks are cut short, which a note says. None: they take as long as they need.
+        progress: Receives what is done, at most twice per second.
 
     Returns:
         The findings, with the lengths of the episodes, the speed and the effect of random openings.
     """
-    found = Examination()
+    found, budget = Examination(), TimeBudget(seconds, progress)
     try:
         found.implementation = implementation(config.environment).reason
         env = build(config.environment)
@@ -69,7 +79,7 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, s
                 "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
             )
     found.interface = interface
-    examiner = Examiner(env, interface, config, found, steps)
+    examiner = Examiner(env, interface, config, found, steps, budget)
     try:
         examiner.examine(episodes, seed)
     except LeagueError as error:
@@ -81,9 +91,15 @@ def examine(config: LeagueConfig, episodes: int = 3, steps: int | None = None, s
     finally:
         env.close()
     if found.passed:
-        _run_pettingzoo_tests(build(config.environment), found)
+        _run_pettingzoo_tests(config.environment, found, budget)
     if found.passed:
         _compare_vectorised(config.environment, interface, found, seed)
+    if budget.skipped:
+        found.add(
+            "note",
+            f"the checks were cut short after {seconds:.0f} s, because the environment takes"
+            f" {1 / found.steps_per_second:.2g} s per step: {', '.join(budget.skipped)} (--seconds)",
+        )
     return found
 
 
@@ -110,18 +126,24 @@ def _is_supported(space: Space) -> bool:
     return isinstance(space, Discrete | MultiDiscrete) or (isinstance(space, Box) and np.dtype(space.dtype).kind == "f")
 
 
-def _run_pettingzoo_tests(env: Any, found: Examination) -> None:
+def _run_pettingzoo_tests(config: EnvironmentConfig, found: Examination, budget: TimeBudget) -> None:
     """Run PettingZoo's API tests. They check more than is required here, so failures are notes."""
-    try:
-        with _silence():
-            if isinstance(env, AECEnv):
-                api_test(env, num_cycles=CYCLES)
-            elif isinstance(env, ParallelEnv):
-                parallel_api_test(env, num_cycles=CYCLES)
-    except Exception as error:
-        found.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")
-    finally:
-        env.close()
+    steps = CYCLES * (found.agents if found.api == "AEC" else 1)
+    if found.api == "MultiAgentEnv" or not found.steps_per_second:
+        return
+    if not budget.allows(steps / found.steps_per_second):
+        budget.skipped.append("PettingZoo's API test was not run")
+        return
+    budget.report("PettingZoo's API test")
+    with contextlib.closing(build(config)) as env:
+        try:
+            with _silence():
+                if isinstance(env, AECEnv):
+                    api_test(env, num_cycles=CYCLES)
+                else:
+                    parallel_api_test(env, num_cycles=CYCLES)
+        except Exception as error:
+            found.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")
 
 
 @contextlib.contextmanager

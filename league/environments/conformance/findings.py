@@ -6,11 +6,33 @@ from typing import Literal
 from league.environments.conformance.openings import OpeningMeasurement
 from league.interface import Interface
 
+CERTAIN_AGREEMENT = 0.95
+"""Correlation of returns from which agents count as one team."""
+
 Severity = Literal["fault", "note"]
 
 
 Trace = list[tuple[int, bytes, float, bool, bool]]
 """All reports of an episode, in order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A played episode.
+
+    Attributes:
+        trace: All reports.
+        steps: Environment steps, in which several agents may act.
+        actions: Number of actions of the agent with the most.
+        returns: Return of each agent.
+        is_whole: Whether it ended, and was not cut.
+    """
+
+    trace: Trace
+    steps: int
+    actions: int
+    returns: tuple[float, ...]
+    is_whole: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +71,18 @@ class Vectorised:
 
 @dataclass(slots=True)
 class Examination:
-    """Distinct findings, the lengths of the episodes and the speed."""
+    """Distinct findings, and what was measured."""
 
     findings: list[Finding] = field(default_factory=list)
     api: str = ""
     agents: int = 0
     lengths: list[int] = field(default_factory=list)
+    """Environment steps of each episode."""
+    actions_per_episode: int | None = None
+    """The most actions of one agent in an episode; None if an episode was cut."""
     steps_per_second: float = 0.0
-    has_common_reward: bool = False
-    """Whether all agents had the same return in each episode, and not always 0."""
+    agreement: float | None = None
+    """Smallest correlation of the returns of two agents, 1 if all are equal; None if it was not measured."""
     state_size: int | None = None
     """Size of the global state; None without one."""
     implementation: str = ""
@@ -72,6 +97,11 @@ class Examination:
     """What random openings are worth; None if it was not measured."""
     vectorised: Vectorised | None = None
     """Comparison with the vectorised environment, if there is one."""
+
+    @property
+    def is_team(self) -> bool:
+        """Whether the returns of all agents agree, as only those of a team do."""
+        return self.agreement is not None and self.agreement >= CERTAIN_AGREEMENT
 
     @property
     def passed(self) -> bool:

@@ -6,7 +6,7 @@ and algorithm; the openings are those that were measured.
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from league.conditions import action_selection
+from league.conditions import action_selection, describe_selection
 from league.config.base import JSON
 from league.config.league import LeagueConfig
 from league.environments.conformance.examination import examine
@@ -64,7 +64,17 @@ class _Line:
         return f"{self.text:<{COMMENT_COLUMN}}  # {self.comment}" if self.comment else self.text
 
 
-def propose(league: str, entry_point: str, kwargs: JSON, folder: str, shown: str | None = None) -> Proposal:
+def propose(
+    league: str,
+    entry_point: str,
+    kwargs: JSON,
+    folder: str,
+    shown: str | None = None,
+    *,
+    is_team: bool | None = None,
+    seconds: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Proposal:
     """Examine an environment and propose a configuration.
 
     Args:
@@ -73,6 +83,9 @@ def propose(league: str, entry_point: str, kwargs: JSON, folder: str, shown: str
         kwargs: As `environment.kwargs`.
         folder: Where entry points are searched first.
         shown: This folder relative to the file; None if it is that of the file.
+        is_team: Whether all agents are one side. None: if only a team's returns agree so well.
+        seconds: Time after which the examination is cut short.
+        progress: Receives what is done.
 
     Raises:
         ConfigError: The environment cannot be built, or violates the contract.
@@ -80,15 +93,19 @@ def propose(league: str, entry_point: str, kwargs: JSON, folder: str, shown: str
     environment: JSON = {"entry_point": entry_point} | ({"kwargs": kwargs} if kwargs else {})
     document = {"league": league, "environment": environment, "folder": folder}
     config = LeagueConfig.from_mapping(document, source=entry_point)
-    found = examine(config)
+    found = examine(config, seconds=seconds, progress=progress)
     faults = [str(finding) for finding in found.findings if finding.severity == "fault"]
-    if faults or found.interface is None or found.openings is None:
+    if faults or found.interface is None:
         raise ConfigError(f"{entry_point} cannot be a league's environment: {'; '.join(faults)}")
+    team = found.is_team if is_team is None else is_team
+    if team:
+        one_side = found.interface.model_copy(update={"sides": {"team": tuple(found.interface.agents)}})
+        found.actions = describe_selection(config, one_side)
     lines = [
         *_header(config, environment, shown),
-        *_policies(found.interface, found.has_common_reward),
-        *_play(config, found, found.interface),
-        *_training(found, found.interface),
+        *_policies(found.interface, team),
+        *_play(config, found, found.interface, team),
+        *_training(found, found.interface, team),
         *_gate(),
     ]
     text = "\n".join(map(str, lines)) + "\n"
@@ -118,7 +135,7 @@ def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
     yield _Line()
     if is_team:
         yield _Line("sides:", "side → its agents; the sides are opponents")
-        yield _Line('  team: ["*"]', "all agents had equal returns, so they are one team")
+        yield _Line('  team: ["*"]', "all agents are one team; without it, each is a side of its own")
     elif len(interface.sides) <= LISTED_AGENTS and all(map(SLUG.fullmatch, interface.sides)):
         yield _Line("sides:", "side → its agents; the sides are opponents")
         for side, agents in interface.sides.items():
@@ -127,26 +144,28 @@ def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
         yield _Line("sides: null", "each agent is a side of its own")
 
 
-def _play(config: LeagueConfig, found: Examination, interface: Interface) -> Iterator[_Line]:
-    assert found.openings is not None
+def _play(config: LeagueConfig, found: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
     measured, reason = found.openings, "the most likely ones; sampled if information is hidden"
-    actions = "greedy" if found.has_common_reward else action_selection(config, interface)
-    if found.has_common_reward:
+    actions = "greedy" if is_team else action_selection(config, interface)
+    if is_team:
         reason = "the most likely ones, as there is no opponent"
     elif actions == "sampled":
         reason = "drawn at random, as the environment hides information"
     yield _Line()
     yield _Line("play:", "the games that are rated")
     yield _Line(f"  actions: {actions}", reason)
+    opening = "random moves at the start"
     if actions == "sampled":
-        yield _Line("  opening_plies: 0", "random moves at the start; sampled actions vary the games")
+        yield _Line("  opening_plies: 0", f"{opening}; sampled actions vary the games")
+    elif measured is None:
+        yield _Line("  opening_plies: 0", f"{opening}; not measured, as the environment is slow")
     else:
         seeds = f"{measured.games} seeds alone: {measured.different_games} different"
-        yield _Line(f"  opening_plies: {measured.recommended}", f"random moves at the start; {seeds}")
+        yield _Line(f"  opening_plies: {measured.recommended}", f"{opening}; {seeds}")
 
 
-def _training(found: Examination, interface: Interface) -> Iterator[_Line]:
-    turns = max(found.lengths) / len(interface.agents)
+def _training(found: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
+    turns = found.actions_per_episode
     others = _other_algorithms(interface, found.api)
     yield _Line()
     yield _Line("training:", "league train")
@@ -157,11 +176,12 @@ def _training(found: Examination, interface: Interface) -> Iterator[_Line]:
     yield _Line("  minutes: null", "time limit; the earlier of the two ends training")
     yield _Line("  checkpoint_every: 200_000", "actions between published versions")
     yield _Line("  runners: 1", "processes that sample; 0 samples in the learner's")
-    if turns <= SHORT_EPISODE:
-        yield _Line("  gamma: 1.0", f"no discount: at most {turns:.0f} actions of an agent per episode")
+    if turns is not None and turns <= SHORT_EPISODE:
+        most = "1 action" if turns == 1 else f"{turns} actions"
+        yield _Line("  gamma: 1.0", f"no discount: at most {most} of an agent per episode")
     else:
         yield _Line("  gamma: 0.99", "discount per action; smaller favours quick wins")
-    if interface.hidden_information and not found.has_common_reward:
+    if interface.hidden_information and not is_team:
         yield _Line("  lr: {initial: 0.001, final: 0.0}", "learning rate, annealed as information is hidden")
         yield _Line("  entropy: {initial: 0.1, final: 0.02}", "exploration, annealed for the same reason")
     else:
@@ -173,7 +193,7 @@ def _training(found: Examination, interface: Interface) -> Iterator[_Line]:
     yield _Line("  hidden: [256, 256]", "widths of the hidden layers")
     if any(map(_is_wide, leaves)):
         yield _Line("  normalize_observations: true", "the bounds of observations are wide or infinite")
-    if not found.has_common_reward:
+    if not is_team:
         yield _Line("  opponents: []", "such as {ref: script:random, share: 0.2}; else self-play")
 
 

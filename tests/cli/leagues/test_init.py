@@ -58,6 +58,17 @@ def test_code_in_the_working_directory_is_found_from_another_folder(league: Leag
     LeagueConfig.load("leagues/a.yaml")
 
 
+def test_a_team_is_one_side_unless_the_user_says_otherwise(league: League) -> None:
+    for options, sides in ((), {"team": ["*"]}), (("--no-team",), {f"agent_{i}": [f"agent_{i}"] for i in range(2)}):
+        written = league("init", "examples.two_step:parallel_env", "--output", f"game{len(options)}.yaml", *options)
+        assert written.code == 0, written.err
+        assert "are they one team?" in written.out
+        assert ("If they are opponents, use --no-team." in written.out) == (not options)
+        assert yaml.safe_load(Path(f"game{len(options)}.yaml").read_text())["sides"] == sides
+    assert league("init", TICTACTOE, "--team").code == 0
+    assert yaml.safe_load(Path("tictactoe.yaml").read_text())["sides"] == {"team": ["*"]}
+
+
 def test_without_a_usable_environment_nothing_is_written(league: League) -> None:
     Path("broken_for_init.py").write_text(BROKEN)
     for arguments, message in (

@@ -202,3 +202,19 @@ def test_agents_with_equal_spaces_share_a_policy() -> None:
 def test_action_names_must_fit_the_action_spaces(entry_point: str, names: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         interface(league(entry_point, play={"action_names": names}))
+
+
+class Changing(AECEnv):
+    """It changes its arguments, as RLlib's chess does."""
+
+    def __init__(self, options: dict) -> None:
+        options["length"] = options.get("length", 3) + 1
+        self.possible_agents = []
+
+
+def test_an_environment_cannot_change_its_configuration() -> None:
+    config = EnvironmentConfig(entry_point=f"{__name__}:Changing", kwargs={"options": {"length": 3}})
+    digest = config.digest()
+    build(config)
+    assert config.kwargs == {"options": {"length": 3}}
+    assert config.digest() == digest

@@ -1,4 +1,6 @@
+import random
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +15,7 @@ from league.config.league import LeagueConfig
 from league.environments.conformance import examination
 from league.environments.conformance.examination import examine
 from league.environments.conformance.findings import Examination
+from league.environments.conformance.openings import OpeningLength, OpeningMeasurement, recommended
 from league.environments.vector.vector_env import AgentRows
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
@@ -76,6 +79,103 @@ class IgnoresSeed(Counting):
 
 def ignores_seed() -> IgnoresSeed:
     return IgnoresSeed()
+
+
+class Forgetful(Simultaneous):
+    """Its first reset has other observations than the later ones."""
+
+    resets = 0
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        self.resets += 1
+        return super().reset(min(self.resets, 2), options)
+
+
+def forgetful() -> Forgetful:
+    return Forgetful()
+
+
+class Shuffled(Simultaneous):
+    """It draws from a generator that all code shares. module: `random` or `numpy.random`."""
+
+    def __init__(self, module: str) -> None:
+        super().__init__()
+        self.draw = random.random if module == "random" else np.random.random
+
+    def _observe(self, agent: str) -> np.ndarray:
+        return np.full(3, self.draw(), np.float32)
+
+
+def shuffled(module: str) -> Shuffled:
+    return Shuffled(module)
+
+
+def test_state_that_resets_keep_is_told_from_randomness_without_a_seed() -> None:
+    kept = findings(examine(league(f"{__name__}:forgetful")), "fault")
+    assert "after other episodes: reset must clear all state; first: the observation in report 1, of agent_0" in kept
+    for module in ("random", "numpy.random"):
+        drawn = findings(examine(league(f"{__name__}:shuffled", module=module)), "fault")
+        assert "in each new environment: all randomness must follow the seed of reset" in drawn
+        assert f"it draws from the generator of the module {module};" in drawn
+
+
+def test_steps_are_those_of_the_environment() -> None:
+    """Several agents act in one step, and removed agents are no step."""
+    for entry_point, kwargs, lengths, actions in (
+        (f"{SUPPORT}.simultaneous:meeting", {"leaves": [3, 3]}, [3] * 3, 3),
+        (f"{SUPPORT}.simultaneous:meeting", {"leaves": [2, 7]}, [7] * 3, 7),
+        (f"{SUPPORT}.simultaneous:rllib_meeting", {"ends": 5}, [5] * 3, 3),
+        (f"{SUPPORT}.counting:counting", {"lives": [3, 3]}, [6] * 3, 3),
+        ("mpe2.simple_spread_v3", {}, [25] * 3, 25),
+    ):
+        found = examine(league(entry_point, **kwargs))
+        assert (found.lengths, found.actions_per_episode) == (lengths, actions), entry_point
+
+
+class Slow(Simultaneous):
+    """Seeds alone do not vary its games."""
+
+    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
+        time.sleep(0.02)
+        return super().step(actions)
+
+    def _observe(self, agent: str) -> np.ndarray:
+        return np.array([self.time, 0, 0], np.float32)
+
+
+def slow() -> Slow:
+    return Slow(leaves=(1000, 1000))
+
+
+def test_checks_of_a_slow_environment_are_cut_short_and_reported() -> None:
+    doing: list[str] = []
+    found = examine(league(f"{__name__}:slow"), seconds=1.0, progress=doing.append)
+    assert found.passed, found.findings
+    assert re.search(
+        r"the checks were cut short after 1 s, because the environment takes 0.0\d+ s per step: 1 of 3 episodes were"
+        r" played, the last one only to step \d+, random openings were not measured, PettingZoo's API test was not run",
+        findings(found, "note"),
+    )
+    assert found.actions_per_episode is None
+    assert found.openings is None
+    assert doing
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "least", "most"),
+    [
+        ("mpe2.simple_spread_v3", 0.95, 0.999),
+        ("examples.two_step:parallel_env", 1.0, 1.0),
+        ("mpe2.simple_adversary_v3", -1.0, 0.0),
+        ("pettingzoo.classic.connect_four_v3", -1.0, -1.0),
+    ],
+)
+def test_returns_that_agree_are_those_of_a_team(entry_point: str, least: float, most: float) -> None:
+    found = examine(LeagueConfig.from_mapping({"league": "x", "environment": {"entry_point": entry_point}}))
+    assert found.agreement is not None
+    assert round(found.agreement, 6) >= least
+    assert round(found.agreement, 6) <= most
+    assert found.is_team == ("are they one team?" in findings(found, "note")) == (least > 0)
 
 
 class WrongShape(Simultaneous):
@@ -209,6 +309,54 @@ def test_openings_are_not_recommended_where_seeds_differ(entry_point: str) -> No
     assert found is not None
     assert found.recommended == 0
     assert "random openings are not needed" in str(found)
+
+
+class OneRound(Simultaneous):
+    """Nothing but the time is observed. rounds: steps of a game; odd: share of games that end after the first."""
+
+    def __init__(self, rounds: int, early: bool) -> None:
+        super().__init__(leaves=(rounds, rounds))
+        self.rounds, self.early = rounds, early
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        self.leaves = (self.rounds,) * 2
+        return super().reset(0, options)
+
+    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
+        if self.early and self.time == 0 and sum(actions.values()) > 0:
+            self.leaves = (1, 1)
+        return super().step(actions)
+
+    def _observe(self, agent: str) -> np.ndarray:
+        return np.array([self.time, self.seed, 0], np.float32)
+
+
+def one_round(rounds: int, early: bool = False) -> OneRound:
+    return OneRound(rounds, early)
+
+
+def test_openings_that_lead_to_one_position_are_not_recommended() -> None:
+    for rounds in (1, 2, 20):
+        found = examine(league(f"{__name__}:one_round", rounds=rounds))
+        assert found.openings is not None
+        assert found.openings.recommended == 0
+        assert "they are not recommended" in str(found.openings)
+        assert "set play.opening_plies" not in findings(found, "note")
+
+
+def test_openings_that_end_many_games_are_warned_of() -> None:
+    openings = (OpeningLength(0.05, 0.4), OpeningLength(0.6, 0.5))
+    found = OpeningMeasurement(1, 20, openings, 1)
+    assert "end 40.0% of them: play.opening_plies: 1 is recommended. Openings of 1 ply end many games" in str(found)
+
+
+def test_a_game_that_is_short_or_ends_early_gets_the_shortest_opening() -> None:
+    lengths = [OpeningLength(0.1 * plies, 0.0 if plies <= 2 else 0.1) for plies in range(1, 9)]
+    assert recommended(lengths, game=40) == 2, "longer ones end many games"
+    assert recommended(lengths, game=3) == 1
+    assert recommended([OpeningLength(0.02, 0.3)] * 8, game=40) == 1, "all end many games"
+    assert recommended([OpeningLength(0.02, 0.0)] * 8, game=40) == 1, "longer ones add nothing"
+    assert recommended([OpeningLength(0.005, 0.0)] * 8, game=40) == 0, "one position"
 
 
 def test_openings_that_end_many_games_get_a_note() -> None:

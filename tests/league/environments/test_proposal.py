@@ -31,9 +31,9 @@ def interface(*kinds: AgentInterface, hidden: bool = False) -> Interface:
     )
 
 
-def examined(api: str = "AEC", length: int = 100, common: bool = False) -> Examination:
+def examined(api: str = "AEC", actions: int | None = 100) -> Examination:
     openings = OpeningMeasurement(1, 20, (), 3)
-    return Examination(api=api, lengths=[length], has_common_reward=common, openings=openings)
+    return Examination(api=api, actions_per_episode=actions, openings=openings)
 
 
 def parsed(lines: Any) -> Any:
@@ -44,7 +44,7 @@ def parsed(lines: Any) -> Any:
 
 
 def training(found: Examination, *kinds: AgentInterface, hidden: bool = False) -> Any:
-    return parsed(_training(found, interface(*kinds, hidden=hidden)))["training"]
+    return parsed(_training(found, interface(*kinds, hidden=hidden), is_team=False))["training"]
 
 
 def test_the_network_fits_the_observations() -> None:
@@ -72,21 +72,26 @@ def test_the_algorithm_fits_the_actions() -> None:
         ("AEC", box, "the only one for these spaces"),
         ("Parallel", MultiDiscrete(nvec=[2, 3], start=[0, 0], shape=(2,)), "the only one for these spaces"),
     ):
-        lines = list(map(str, _training(examined(api), interface(spaces(action), spaces(action)))))
+        lines = list(map(str, _training(examined(api), interface(spaces(action), spaces(action)), is_team=False)))
         assert next(line for line in lines if "algorithm: ppo" in line).endswith(others)
 
 
 def test_episodes_and_hidden_information_decide_discount_and_annealing() -> None:
-    assert training(examined(length=8), spaces(), spaces())["gamma"] == 1.0
+    for actions in (1, 5, 6, 100, None):
+        lines = map(str, _training(examined(actions=actions), interface(spaces(), spaces()), is_team=False))
+        line = next(line for line in lines if "gamma" in line)
+        is_short = actions in (1, 5)
+        assert yaml.safe_load(line) == {"gamma": 1.0 if is_short else 0.99}
+        assert (f"no discount: at most {actions} action" in line) == is_short, line
     open_, hidden = (training(examined(), spaces(), spaces(), hidden=value) for value in (False, True))
     assert (open_["gamma"], open_["lr"]) == (0.99, 0.0005)
     assert hidden["lr"] == {"initial": 0.001, "final": 0.0}
 
 
 def test_measured_openings_are_used_unless_actions_are_sampled() -> None:
-    known = parsed(_play(config(), examined(), interface(spaces(), spaces())))["play"]
-    hidden = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True)))["play"]
-    team = parsed(_play(config(), examined(common=True), interface(spaces(), spaces(), hidden=True)))["play"]
+    known = parsed(_play(config(), examined(), interface(spaces(), spaces()), is_team=False))["play"]
+    hidden = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True), is_team=False))["play"]
+    team = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True), is_team=True))["play"]
     assert known == {"actions": "greedy", "opening_plies": 3}
     assert hidden == {"actions": "sampled", "opening_plies": 0}
     assert team == {"actions": "greedy", "opening_plies": 3}
