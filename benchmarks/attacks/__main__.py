@@ -1,7 +1,9 @@
 """What can one caller do to the others? Memory that a caller without a key can hold in a replica, and how long a caller
 can stall a probe.
 
-grpc_messages   messages of gRPC with millions of elements
+grpc_messages     messages of gRPC with millions of elements
+websocket_pings   streams that send pings, pongs and fragments; without a key, to a server that requires none
+idle_connections  thousands of connections that are idle, or of which nothing arrives
 
 Each attack is a module of benchmarks.attacks, which runs in a process of its own:
 
@@ -30,7 +32,9 @@ from benchmarks.processes import replica_processes
 from serve_app.runtime.haproxy import free_ports
 from serve_app.runtime.launch import running
 
-ATTACKS = ("grpc_messages",)
+ATTACKS = ("grpc_messages", "websocket_pings", "idle_connections")
+NEED_ACCESS = ("websocket_pings",)
+"""Attacks by callers whose handshake must be accepted."""
 REPLICAS = 2
 RATE = 1.0
 """Requests per second that the attacker's key allows."""
@@ -128,12 +132,16 @@ def main() -> int:
         registry = publish(Path(scratch) / "home", versions=1)
         _, key = registry.keys.create("probe", ["act"])
         _, limited = registry.keys.create("attacker", ["act"], rate=RATE)
-        with running(registry.storage, grpc_port=grpc_port, replicas=REPLICAS) as url:
-            met = [
-                attacked(name, url, f"127.0.0.1:{grpc_port}", token, key, seconds, pairs)
-                for name in options.only or ATTACKS
-                for token in ("", limited)
-            ]
+        runs = [(name, token) for name in options.only or ATTACKS for token in ("", limited)]
+        met = []
+        for insecure in (False, True):
+            chosen = [run for run in runs if (run[0] in NEED_ACCESS and not run[1]) == insecure]
+            if not chosen:
+                continue
+            with running(registry.storage, grpc_port=grpc_port, replicas=REPLICAS, insecure=insecure) as url:
+                met += [
+                    attacked(name, url, f"127.0.0.1:{grpc_port}", token, key, seconds, pairs) for name, token in chosen
+                ]
         registry.close()
     return int(not all(met))
 

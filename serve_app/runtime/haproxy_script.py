@@ -45,7 +45,7 @@ LIMITS = """
     tcp-request connection track-sc0 src,ipmask(32,64) table http_frontend
     tcp-request connection reject if { sc0_conn_cur gt SHARE } { sc0_get_gpt0 eq 0 } !{ src 127.0.0.0/8 ::1 }
     tcp-request connection reject if { sc0_conn_cur gt MOST }"""
-"""Lines of each frontend; SHARE and MOST are a quarter and three quarters of the connections. In IPv6 a client has all
+"""Lines of each frontend; SHARE and MOST are a quarter and a half of the connections. In IPv6 a client has all
 addresses of a network of 64 bits. Programs of this machine may be reverse proxies, or share a server without keys."""
 HTTP = f"""
     option http-buffer-request
@@ -85,7 +85,7 @@ amend() {{  # Ray's configuration
         -e 's|^\\( *\\)errorfile \\([0-9]*\\) .*$|\\1errorfile \\2 {here}/error.\\2|' \\
         -e 's|^frontend http_frontend$|&{http}|' \\
         -e 's|^frontend grpc_frontend$|&{grpc}|' \\
-        -e "s/MOST/$((connections * 3 / 4))/g; s/SHARE/$((connections / 4))/g" \\
+        -e "s/MOST/$((connections / 2))/g; s/SHARE/$((connections / 4))/g" \\
         "$1"
 }}
 
