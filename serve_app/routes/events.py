@@ -4,8 +4,9 @@
     GET  /v1/leagues/{league}/evaluations/{evaluation}/events   event `evaluation`: the evaluation, until it has ended
 
 A stream starts with the current state. Listeners get the newest state, not every intermediate one, so slow readers
-delay nobody. A stream ends when the replica stops or its key becomes invalid; clients reconnect. Clients read it with
-`fetch`, because the `EventSource` of browsers cannot send a key.
+delay nobody. A stream ends when the replica stops, its key becomes invalid, or its state cannot be read any more, as
+that of a removed league; clients reconnect, and get the error. Clients read it with `fetch`, because the `EventSource`
+of browsers cannot send a key.
 """
 
 import asyncio
@@ -18,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import DeadlineExceeded, NotReady, Unauthenticated
+from league.errors import DeadlineExceeded, NotFound, NotReady, StorageError, Unauthenticated
 from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import ChangeToken
@@ -28,6 +29,7 @@ from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.models.polling import Polling
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import documents, parsing
+from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
 
 Document = dict[str, Any]
@@ -41,7 +43,7 @@ considers the replica dead."""
 class Topic:
     """A state that listeners follow. It exists while it has listeners."""
 
-    __slots__ = ("changed", "document", "listeners", "query")
+    __slots__ = ("changed", "document", "has_ended", "listeners", "query")
 
     def __init__(self, query: Query, document: Document) -> None:
         self.query = query
@@ -50,6 +52,13 @@ class Topic:
         self.changed = asyncio.Event()
         """Set at the next change, and then replaced."""
         self.listeners = 0
+        self.has_ended = False
+        """Whether the state cannot be read any more."""
+
+    def end(self) -> None:
+        """End the streams of all listeners."""
+        self.has_ended = True
+        self.wake()
 
     def update(self, document: Document) -> None:
         """Store the state, and notify listeners if it has changed."""
@@ -108,7 +117,7 @@ class EventBroker:
                 yield self._updates(topic)
             finally:
                 topic.listeners -= 1
-                if not topic.listeners:
+                if not topic.listeners and self._topics.get(name) is topic:
                     del self._topics[name]
 
     def end(self) -> None:
@@ -126,7 +135,7 @@ class EventBroker:
 
     async def _updates(self, topic: Topic) -> AsyncIterator[Document | None]:
         document: Document | None = topic.document
-        while not self._is_over:
+        while not (self._is_over or topic.has_ended):
             changed = topic.changed
             yield document
             with suppress(TimeoutError):
@@ -135,12 +144,31 @@ class EventBroker:
             document = topic.document if changed.is_set() else None
 
     async def _poll(self) -> None:
-        """Query all topics. Raises StorageError."""
+        """Query all topics. One whose state cannot be read ends. Raises StorageError."""
         self._polling.mark_ready()
-        if topics := list(self._topics.values()):
-            found = await self._models.query(lambda registry: [topic.query(registry) for topic in topics])
-            for topic, document in zip(topics, found, strict=True):
-                topic.update(document)
+        topics = dict(self._topics)
+        if not topics:
+            return
+        states = await self._models.query(lambda registry: [_state(topic, registry) for topic in topics.values()])
+        for (name, topic), state in zip(topics.items(), states, strict=True):
+            if isinstance(state, Exception):
+                if not isinstance(state, NotFound):
+                    logger.error("the event streams of %s end", name, exc_info=state)
+                if self._topics.get(name) is topic:
+                    del self._topics[name]  # the next listener gets the error
+                topic.end()
+            else:
+                topic.update(state)
+
+
+def _state(topic: Topic, registry: Registry) -> Document | Exception:
+    """The state of a topic, or why it cannot be read. Raises StorageError if the database cannot be used at all."""
+    try:
+        return topic.query(registry)
+    except StorageError:
+        raise
+    except Exception as error:
+        return error
 
 
 EVENT_STREAM = "text/event-stream"
@@ -180,8 +208,13 @@ class EventRoutes:
         if request.method == "HEAD":
             return Response(headers=HEADERS, media_type=EVENT_STREAM)
 
+        def encodable(registry: Registry) -> Document:
+            """The document, if it is one that can be sent: later, the response has begun."""
+            orjson.dumps(document := query(registry))
+            return document
+
         async def stream(scope: Scope, receive: Receive, send: Send) -> None:
-            async with self._events.subscribe(scope["path"], query, scope.get(KEY)) as states:
+            async with self._events.subscribe(scope["path"], encodable, scope.get(KEY)) as states:
                 messages = _messages(states, kind, is_last, lambda: self._access.check_key(scope.get(KEY)))
                 await StreamingResponse(messages, headers=HEADERS, media_type=EVENT_STREAM)(scope, receive, send)
 

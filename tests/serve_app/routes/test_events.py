@@ -12,6 +12,7 @@ from jsonschema import Draft202012Validator
 from league.registry.changes import ChangeRepository
 from league.registry.registry import Registry
 from league.registry.storage.rows import ChangeToken
+from league.registry.storage.tables import EvaluationTable
 from serve_app.app import Replica
 from serve_app.openapi.document import document
 from serve_app.routes import events
@@ -108,6 +109,32 @@ def test_all_listeners_share_a_poll_and_there_is_none_without_listeners(
         until(lambda: server.server.events.topics == 1)
         wait_for_polls("memory", 3)
         assert polls.count("board") <= 1, "a poll may have been in progress"
+
+
+def test_the_stream_of_a_removed_league_ends_and_the_others_go_on(server: Listening, registry: Registry) -> None:
+    with listen(server) as board, listen(server, "/v1/leagues/memory/events") as memory:
+        registry.removal.remove_league("memory", force=True)
+        until(lambda: memory.is_over)
+        promote(registry, "board", 3)
+        until(lambda: board.last["aliases"] == {"champion": 3})
+        assert server.server.events.topics == 1
+        with listen(server, "/v1/leagues/memory/events") as again:
+            assert again.reply.status_code == 404
+
+
+def test_a_state_that_cannot_be_sent_is_an_error_and_ends_its_streams_only(
+    server: Listening, registry: Registry
+) -> None:
+    number = registry.evaluations.submit("board", {"kind": "tournament"}, actor="test", max_active=9).id
+    path = f"/v1/leagues/board/evaluations/{number}/events"
+    with listen(server, path) as evaluation, listen(server) as board:
+        with registry.database.write() as session:
+            session.get_one(EvaluationTable, number).request = {"kind": "tournament", "games": 2**70}
+        until(lambda: evaluation.is_over)
+        with listen(server, path) as again:
+            assert again.reply.status_code == 500
+        promote(registry, "board", 3)
+        until(lambda: board.last["aliases"] == {"champion": 3})
 
 
 def test_the_number_of_listeners_is_limited(registry: Registry) -> None:
