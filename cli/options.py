@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from league.registry.registry import Registry
 
 CORES = usable_cpus()
+MAX_SEED = 2**63 - 1
 DEFAULT_URL = "http://127.0.0.1:8000"
 """URL of the policy server that `league serve` starts and `league act` calls."""
 

@@ -7,6 +7,10 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, RootModel, Tag
 
 MOST_CONTESTANTS = 256
 MOST_BLOCKS = 100_000
+MOST_GAMES = 10_000_000
+MOST_MINUTES = 365 * 24 * 60
+MOST_NUMBER = 2**31 - 1
+"""Largest number of a game or a step."""
 
 
 class _Request(BaseModel):
@@ -29,8 +33,8 @@ class TournamentRequest(_WithReason):
     """Opponents of each contestant in a gauntlet. Empty: the champion and the baselines."""
     blocks: int | None = Field(default=None, ge=1, le=MOST_BLOCKS)
     """Matches of each pair. None: 32, or as many as the budget allows."""
-    games: int | None = Field(default=None, ge=2)
-    minutes: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    games: int | None = Field(default=None, ge=2, le=MOST_GAMES)
+    minutes: float | None = Field(default=None, gt=0, le=MOST_MINUTES)
     precision: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     """Target half-width of every rating's 95 % interval, in Elo."""
     seed: int = Field(default=0, ge=0, lt=2**63)
@@ -82,10 +86,10 @@ class RecordingRequest(_Request):
 
     kind: Literal["recording"] = "recording"
     match: str
-    game: int = Field(ge=0)
-    first: int = Field(default=0, ge=0)
-    end: int | None = Field(default=None, ge=0)
-    every: int = Field(default=1, ge=1)
+    game: int = Field(ge=0, le=MOST_NUMBER)
+    first: int = Field(default=0, ge=0, le=MOST_NUMBER)
+    end: int | None = Field(default=None, ge=0, le=MOST_NUMBER)
+    every: int = Field(default=1, ge=1, le=MOST_NUMBER)
 
     def includes(self, step: int, is_last: bool) -> bool:
         """Whether the response contains a step."""
@@ -100,7 +104,7 @@ class VideoRequest(_Request):
 
     kind: Literal["video"] = "video"
     match: str
-    game: int = Field(ge=0)
+    game: int = Field(ge=0, le=MOST_NUMBER)
 
 
 class PlayabilityRequest(_Request):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import AsJson, ClusterWorkers, EvaluationCluster, LeagueName, open_registry, workers_for
+from cli.options import MAX_SEED, AsJson, ClusterWorkers, EvaluationCluster, LeagueName, open_registry, workers_for
 from cli.output import GameProgress, complain, difference, emit, say, show_leaderboard, table
 from league.refs import check_slug
 from league.settings import Storage
@@ -53,7 +53,7 @@ Minutes = Annotated[float | None, typer.Option(help="Stop after this time.")]
 Precision = Annotated[
     float | None, typer.Option(metavar="ELO", help="Stop when the 95 % interval of each rating is within ± ELO.")
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Random seed. Another seed plays different games.")]
+Seed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Random seed. Another seed plays different games.")]
 
 
 def evaluate(

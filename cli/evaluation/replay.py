@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import open_registry
+from cli.options import MAX_SEED, open_registry
 from cli.output import console, say
 from league.errors import InvalidReference
 
@@ -25,7 +25,7 @@ def replay(
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Output file (.gif or .webp).")] = Path("replay.gif"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the environment and of random scripts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Seed of the environment and of random scripts.")] = 0,
     side: Annotated[
         str | None, typer.Option(help="Side of the first REF; the others follow in order. Default: the first side.")
     ] = None,

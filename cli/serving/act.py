@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import orjson
 import typer
 
-from cli.options import DEFAULT_URL, open_registry
+from cli.options import DEFAULT_URL, MAX_SEED, open_registry
 from cli.output import emit, say
 from league.errors import ConfigError, InvalidReference, RemoteError
 from league.refs import CheckpointRef, PolicyRef, parse_ref
@@ -34,7 +34,7 @@ def act(
         bool | None,
         typer.Option("--explore/--greedy", help="Sample an action, or take the greedy one. Default: as in matches."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Random seed for a sampled action.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED, help="Random seed for a sampled action.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the complete response as JSON.")] = False,
 ) -> None:
     """Request one action from a policy server, or compute it locally."""

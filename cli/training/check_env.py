@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import DEFAULT_SECONDS, AsJson, Config, Seconds, open_registry
+from cli.options import DEFAULT_SECONDS, MAX_SEED, AsJson, Config, Seconds, open_registry
 from cli.output import counted, emit, progress, say, table
 from configs.bundled import find
 
@@ -20,7 +20,7 @@ def check_env(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Maximum number of steps per episode. Default: play.max_moves.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Seed of the first episode.")] = 0,
     seconds: Seconds = DEFAULT_SECONDS,
     as_json: AsJson = False,
 ) -> None:

@@ -1,6 +1,6 @@
 """The configuration file of a league. Errors name the file, the key and the expected value."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -89,6 +89,8 @@ class LeagueConfig(Part):
         """Validate a mapping, as parsed from YAML. Raises ConfigError, whose message names `source`."""
         if not isinstance(document, Mapping):
             raise ConfigError(f"{source}: expected a mapping with keys such as 'league' and 'environment'")
+        if large := next(_large_integers(document), None):
+            raise ConfigError(f"{source}: {large}, expected integers of at most 64 bits")
         try:
             return cls.model_validate(document)
         except ValidationError as error:
@@ -157,6 +159,18 @@ class LeagueConfig(Part):
             checkpoint_every=None,
             checkpoint_minutes=None,
         )
+
+
+def _large_integers(value: Any, key: str = "") -> Iterator[str]:
+    """The integers that neither a database nor JSON of other languages can hold, with their keys."""
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _large_integers(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _large_integers(item, f"{key}.{index}")
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield f"{key}: {str(value)[:32]}"
 
 
 def _with_folder(document: Any, path: Path) -> Any:

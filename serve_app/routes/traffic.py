@@ -7,14 +7,14 @@
 of scope `promote` and an `Idempotency-Key`.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from league.histograms import Histogram
-from league.refs import check_slug, parse_version
+from league.refs import MAX_VERSION, check_slug, parse_version
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, ShadowCounts
 from league.registry.traffic import KEEP, Unchanged
@@ -31,7 +31,7 @@ class VersionShare(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    version: int | str
+    version: Annotated[int, Field(ge=1, le=MAX_VERSION)] | str
     share: float = Field(ge=0, le=1)
 
 

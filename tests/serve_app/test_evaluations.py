@@ -85,6 +85,8 @@ def test_by_default_all_versions_play(evaluator: TestClient) -> None:
         (BOARD, {"blocks": 0}, 400, "invalid_input"),
         (BOARD, {"blocks": "4"}, 400, "invalid_input"),
         (BOARD, {"seed": 2**63}, 400, "invalid_input"),
+        (BOARD, {"games": 2**70}, 400, "invalid_input"),
+        (BOARD, {"minutes": 1e300}, 400, "invalid_input"),
         (BOARD, {"game": 100}, 400, "invalid_input"),
         (BOARD, {"games": 1}, 400, "invalid_input"),
         (BOARD, {"against": ["script:random"]}, 400, "invalid_input"),

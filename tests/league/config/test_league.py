@@ -32,6 +32,14 @@ def test_only_league_and_environment_are_required() -> None:
         ({"gate": {"alpha": 2}}, "gate.alpha: input should be less than 0.5, got 2"),
         ({"gate": {"elo0": 10, "elo1": 5}}, "gate: elo1 must be greater than elo0 (10)"),
         ({"training": {"algorithm": "dqm"}}, f"training.algorithm: expected one of {', '.join(ALGORITHMS)}, got 'dqm'"),
+        (
+            {"training": {"steps": 2**70}},
+            "training.steps: 1180591620717411303424, expected integers of at",
+        ),
+        (
+            {"environment": {"entry_point": "a:b", "kwargs": {"sizes": [-(2**63) - 1]}}},
+            "environment.kwargs.sizes.0: ",
+        ),
         ({"training": {"lr": "fast"}}, "training.lr: expected a number, got 'fast'"),
         ({"training": {"lrr": 1}}, "training.lrr: unknown key, did you mean 'lr'?"),
         ({"training": {"algorithm": "dqn", "epochs": 4}}, "training.epochs: unknown key, "),
