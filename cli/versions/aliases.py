@@ -69,7 +69,7 @@ def promote(
         actor=actor or getpass.getuser(),
         reason=reason,
     )
-    _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
+    _moved(event, current, as_json, _followers(registry, event, timeout) if wait else None)
 
 
 def _mixture(registry: "Registry", text: str) -> "VersionRow":
@@ -186,22 +186,25 @@ def rollback(
         actor=actor or getpass.getuser(),
         reason=reason,
     )
-    _moved(event, as_json, _followers(registry, event, timeout) if wait else None)
+    _moved(event, event.previous, as_json, _followers(registry, event, timeout) if wait else None)
 
 
 def _followers(registry: "Registry", event: "AliasEvent", timeout: float) -> list[str]:
     return registry.changes.wait_for_alias(event, timeout)
 
 
-def _moved(event: "AliasEvent", as_json: bool, replicas: list[str] | None) -> None:
-    """Print the move of an alias, and the replicas that have confirmed it."""
+def _moved(event: "AliasEvent", previous: int | None, as_json: bool, replicas: list[str] | None) -> None:
+    """Print the move of an alias, and the replicas that have confirmed it.
+
+    previous: the version that it pointed to until now. If it is that of the event, the event is an earlier one.
+    """
     if as_json:
         emit(asdict(event) | ({} if replicas is None else {"replicas": replicas}))
         return
-    if event.previous == event.version:
+    if previous == event.version:
         say(f"{event.league}@{event.alias} already points to version {event.version}.")
     else:
-        before = "nothing" if event.previous is None else f"version {event.previous}"
+        before = "nothing" if previous is None else f"version {previous}"
         say(f"{event.league}@{event.alias} now points to version {event.version} (before: {before}).")
     if replicas is not None:
         say(f"Confirmed by {counted(len(replicas), 'replica')}.")

@@ -72,6 +72,7 @@ def test_text_with_invalid_unicode_is_rejected(league: League, registry: Registr
 def test_promotions_rollbacks_and_their_history(league: League, registry: Registry) -> None:
     assert "now points to version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
     assert "now points to version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out
+    assert league("promote", "tictactoe@3").out == "tictactoe@champion already points to version 3.\n"
     assert league("rollback", "tictactoe", "--json").json["version"] == 1
     events = league("history", "tictactoe", "--json").json["events"]
     assert [(event["version"], event["previous"], event["kind"]) for event in events] == [
