@@ -6,13 +6,14 @@ A reference is the URL of a model, `http://host:8000/v2/models/NAME`. docs/bots.
 import os
 from typing import Any
 
+import httpx
 import numpy as np
 from numpy.typing import NDArray
 
 from league.client import Client
 from league.client.calls import ApiCall
 from league.client.requests import JsonObject, to_json
-from league.errors import EnvironmentMismatch, RemoteError
+from league.errors import ConfigError, EnvironmentMismatch, RemoteError
 from league.interface import AgentInterface, Interface, digest
 from league.policies.actions import bounds
 from league.policies.draws import Generators
@@ -22,7 +23,7 @@ from league.refs import RemoteRef
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete, inputs
 
 KEY_VARIABLE = "LEAGUE_REMOTE_API_KEY"
-"""Environment variable with the API key for the servers of remote models."""
+"""Environment variable with the API keys for servers of remote models: `SERVER=KEY`, separated by spaces."""
 MAX_ROWS = 256
 """Rows of one request."""
 TIMEOUT = 10.0
@@ -40,15 +41,14 @@ class OpenInferencePolicy:
         spaces: The policy's observation and action space.
 
     Raises:
+        ConfigError: LEAGUE_REMOTE_API_KEY is malformed.
         EnvironmentMismatch: The model's metadata do not fit the spaces.
         RemoteError: The server cannot be reached, failed, or no longer has this version.
     """
 
     def __init__(self, ref: RemoteRef, policy: str, spaces: AgentInterface) -> None:
         self._ref, self._spaces, self._path = ref, spaces, ref.path(policy)
-        self._client = Client(
-            ref.server, key=os.environ.get(KEY_VARIABLE, ""), timeout=TIMEOUT, retry_deadline=RETRY_DEADLINE
-        )
+        self._client = Client(ref.server, key=_key_for(ref.server), timeout=TIMEOUT, retry_deadline=RETRY_DEADLINE)
         self.metadata: JsonObject = self._client.send(ApiCall(self._path, lambda document, _: document))
         self._signature: RemoteSignature = read_signature(str(ref), self.metadata, spaces)
 
@@ -129,6 +129,28 @@ class OpenInferencePolicy:
         if found.dtype.kind not in kinds or found.shape[1:] != space.shape:
             raise MalformedAction(f"{self._ref} returned {found.dtype} {list(found.shape)}: expected {space!r}")
         return found.astype(space.dtype)
+
+
+def _key_for(server: str) -> str:
+    """Return the API key for a server, empty if there is none. Raises ConfigError, without the keys."""
+    keys = {}
+    for entry in os.environ.get(KEY_VARIABLE, "").split():
+        owner, _, key = entry.partition("=")
+        if not owner.startswith(("http://", "https://")) or not key:
+            raise ConfigError(
+                f"{KEY_VARIABLE} has an entry without a server: expected SERVER=KEY, such as {server}=KEY, "
+                "separated by spaces"
+            )
+        keys[_origin(owner)] = key
+    return keys.get(_origin(server), "")
+
+
+def _origin(server: str) -> tuple[str, str, int | None]:
+    try:
+        url = httpx.URL(server)
+    except httpx.InvalidURL:
+        raise ConfigError(f"{KEY_VARIABLE}: {server!r} is not the address of a server") from None
+    return url.scheme, url.host, url.port  # a default port is None
 
 
 def fixed_version(ref: RemoteRef, interface: Interface) -> RemoteRef:

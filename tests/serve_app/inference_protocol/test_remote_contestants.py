@@ -1,11 +1,13 @@
 """Remote models as contestants, against a served version of our own."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from league.config.opponents import OpponentConfig
 from league.environments.stepping import Batch
-from league.errors import EnvironmentMismatch, InvalidReference, RemoteError, UnknownPolicy
+from league.errors import ConfigError, EnvironmentMismatch, InvalidReference, RemoteError, UnknownPolicy
 from league.interface import AgentInterface, Interface
 from league.policies.loading import contestant, pinned, requested
 from league.policies.open_inference import OpenInferencePolicy, fixed_version
@@ -13,8 +15,9 @@ from league.refs import RemoteRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Box, Discrete
+from serve_app.access.access_control import RequestHeaders
 from tests.support.clients.protocol_observations import observations, policy_of
-from tests.support.servers.protocol_servers import Address
+from tests.support.servers.protocol_servers import Address, InProcess
 from training.sampling.opponents import OpponentPolicy, Opponents
 
 
@@ -38,6 +41,35 @@ def test_a_remote_model_acts_as_the_version(replica: Address, leagues: Storage, 
     for _, acting in found.values():
         actions = acting.act(arrays).actions
         np.testing.assert_array_equal(actions, policy.act(arrays).actions)
+
+
+def test_a_key_is_sent_only_to_the_server_that_it_is_for(
+    replica: InProcess, leagues: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received = list[str | None]()
+    admit = replica.server.access.admit_request
+
+    def record(scope: Any, headers: RequestHeaders) -> Any:
+        received.append(None if headers.token is None else headers.token.decode())
+        return admit(scope, headers)
+
+    monkeypatch.setattr(replica.server.access, "admit_request", record)
+    host = replica.http.partition(":")[2]
+    interface = interface_of(leagues, "board")
+    for variable, sent in (
+        (f"http://other.example=wrong http://127.0.0.1:{host}/=right=", "right="),
+        (f"https://{replica.http}=wrong http://127.0.0.1:1=wrong", None),
+        ("", None),
+    ):
+        monkeypatch.setenv("LEAGUE_REMOTE_API_KEY", variable)
+        fixed_version(remote(replica, "board"), interface)
+        assert set(received) == {sent}
+        received.clear()
+    for variable in ("secret", "secret==", f"http://{replica.http}", f"http://{replica.http}="):
+        monkeypatch.setenv("LEAGUE_REMOTE_API_KEY", variable)
+        with pytest.raises(ConfigError, match="expected SERVER=KEY") as caught:
+            fixed_version(remote(replica, "board"), interface)
+        assert "secret" not in str(caught.value)
 
 
 def test_large_batches_are_split(replica: Address, leagues: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
