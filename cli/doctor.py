@@ -154,11 +154,11 @@ def _registry() -> Iterator[Check]:
         yield Check("registry", "ok", "not created yet: `league train CONFIG` creates it")
         return
     try:
-        leagues = Registry.open(storage).leagues.all()
+        leagues = Registry.open(storage).leagues.names()
     except LeagueError as error:
         yield Check("registry", "fail", str(error), "check LEAGUE_HOME and LEAGUE_DATABASE_URL")
         return
-    names = ", ".join(league.slug for league in leagues) or "no leagues yet: `league train CONFIG` creates one"
+    names = ", ".join(leagues) or "no leagues yet: `league train CONFIG` creates one"
     yield Check("registry", "ok", names)
 
 

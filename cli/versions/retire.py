@@ -40,7 +40,7 @@ def retire(
     """
     registry = open_registry()
     before = datetime.now(UTC) - timedelta(days=days)
-    names = [check_slug("league", name) for name in leagues or ()] or [row.slug for row in registry.leagues.all()]
+    names = [check_slug("league", name) for name in leagues or ()] or list(registry.leagues.names())
     plans = [registry.retention.plan(name, keep=keep, before=before) for name in names]
     replicas = {each.replica for each in registry.replicas.registered()}
     old_logs = former_logs(registry.storage.home / logs, replicas, before)

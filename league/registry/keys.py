@@ -62,7 +62,7 @@ class KeyRepository(Repository):
         }
         with self._database.write() as session:
             for league in only_leagues:
-                leagues.require(session, league)
+                leagues.lock(session, league)  # until the key is stored, so that a new league of this name sees it
             change_counter.count(session, "keys")
             if not insert(session, ApiKeyTable, [values]):
                 raise NameTaken(f"a key {name!r} exists or existed: names of keys are not reused")

@@ -2,9 +2,11 @@
 
 import difflib
 import logging
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -15,7 +17,7 @@ from league.refs import check_new
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert, upsert
 from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, require_active
-from league.registry.storage.tables import READY, EarlierGameTable, LeagueTable, MatchTable, VersionTable
+from league.registry.storage.tables import READY, ApiKeyTable, EarlierGameTable, LeagueTable, MatchTable, VersionTable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,6 +52,7 @@ class LeagueRepository(Repository):
                 check_new("league", config.league)
             if insert(session, LeagueTable, [first | values]):
                 change_counter.count(session, "leagues")
+                _end_keys(session, config.league)
                 return
             known = lock_active(session, config.league)
             if known.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
@@ -118,10 +121,17 @@ class LeagueRepository(Repository):
         with self._database.read() as session:
             return _action_selections(session)
 
-    def all(self) -> list[LeagueRow]:
-        """Return all leagues, sorted by name."""
+    def policy_ids(self) -> dict[str, tuple[str, ...]]:
+        """Return league → ids of its policies, sorted by name. Does not read configurations, of which one may be from
+        another release. Leaves out leagues whose interface is.
+        """
+        query = select(LeagueTable.slug, LeagueTable.interface).order_by(LeagueTable.slug)
+        found = {}
         with self._database.read() as session:
-            return [_row(league) for league in session.scalars(select(LeagueTable).order_by(LeagueTable.slug))]
+            for league, interface in session.execute(query):
+                with suppress(ValidationError):
+                    found[league] = Interface.model_validate(interface).policy_ids
+        return found
 
 
 def require(session: Session, league: str) -> None:
@@ -145,12 +155,25 @@ def lock_active(session: Session, league: str) -> LeagueTable:
     return row
 
 
+def _end_keys(session: Session, league: str) -> None:
+    """End the validity of keys for a removed league of this name: this one is another."""
+    query = select(ApiKeyTable).where(ApiKeyTable.revoked_at.is_(None)).with_for_update()
+    for key in session.scalars(query):
+        if key.leagues is None or league not in key.leagues:
+            continue
+        change_counter.count(session, "keys")
+        if rest := [name for name in key.leagues if name != league]:
+            key.leagues = rest
+        else:
+            key.revoked_at = datetime.now(UTC)
+
+
 def _action_selections(session: Session, league: str | None = None) -> dict[str, ActionSelection]:
     """league → action selection, of all leagues or of one."""
     chosen, interface = LeagueTable.config["play"]["actions"].as_string(), LeagueTable.interface
     query = select(LeagueTable.slug, chosen, interface["hidden_information"].as_boolean(), interface["sides"])
     rows = session.execute(query if league is None else query.where(LeagueTable.slug == league))
-    return {slug: actions or default_selection(bool(hidden), len(sides)) for slug, actions, hidden, sides in rows}
+    return {slug: actions or default_selection(bool(hidden), len(sides or ())) for slug, actions, hidden, sides in rows}
 
 
 def _has_versions(session: Session, league: str) -> bool:

@@ -123,9 +123,8 @@ class ModelCatalogue:
 def _models_and_versions(registry: Registry) -> tuple[dict[str, list[str]], dict[str, list[int]]]:
     """league → names of its models, and league → numbers of its versions."""
     models = {}
-    for row in registry.leagues.all():
-        policies = row.interface.policy_ids
-        models[row.slug] = [row.slug] if len(policies) == 1 else [f"{row.slug}.{policy}" for policy in policies]
+    for league, policies in registry.leagues.policy_ids().items():
+        models[league] = [league] if len(policies) == 1 else [f"{league}.{policy}" for policy in policies]
     return models, registry.versions.numbers()
 
 

@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import update
 
 from league.registry.registry import Registry
-from league.registry.storage.tables import VersionTable
+from league.registry.storage.tables import LeagueTable, VersionTable
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 
@@ -66,6 +66,22 @@ def test_versions_and_logs_are_removed_once(league: League, old: Registry, log: 
     result = league("export", f"{tictactoe.LEAGUE}@2")
     assert result.code != 0
     assert "tictactoe@2 was retired and its files were removed" in result.err
+
+
+def test_a_league_of_another_release_stops_no_other(league: League, old: Registry) -> None:
+    with old.database.write() as session:
+        session.add(
+            LeagueTable(
+                slug="later", last_version=0, registered_at=datetime.now(UTC), config={"of": "another release"},
+                interface={}, interface_digest="", environment_digest="", game={}, game_digest="",
+            )
+        )  # fmt: skip
+    result = league("retire", "--keep=1", "--yes", "--json")
+    assert result.code == 0, result.err
+    assert {plan["league"]: list(plan["versions"]) for plan in result.json["leagues"]} == {
+        tictactoe.LEAGUE: ["2"],
+        "later": [],
+    }
 
 
 @pytest.mark.usefixtures("old")

@@ -25,7 +25,7 @@ def _open(storage: Storage) -> int:
     registry = Registry.open(storage)
     registered(registry)
     registry.close()
-    return len(registry.leagues.all())
+    return len(registry.leagues.names())
 
 
 def _publish(storage: Storage, sources: list[str]) -> list[int]:

@@ -9,7 +9,7 @@ from sqlalchemy import text
 from league.errors import InvalidInput, InvalidReference, NameTaken, UnknownKey, UnknownLeague
 from league.registry.keys import SCOPES, TOKEN_LENGTH, digest
 from league.registry.registry import Registry
-from tests.support.leagues.registries import LEAGUE
+from tests.support.leagues.registries import LEAGUE, registered
 
 
 def test_a_token_is_returned_once_and_stored_as_a_digest(registry: Registry) -> None:
@@ -38,6 +38,24 @@ def test_a_revoked_key_is_invalid_and_its_name_is_not_reused(registry: Registry)
     assert registry.keys.all() == [revoked]
     with pytest.raises(NameTaken, match="'bot'"):
         registry.keys.create("bot", ["act"])
+
+
+def test_a_key_is_not_valid_for_another_league_of_the_same_name(registry: Registry) -> None:
+    registered(registry, "kept")
+    registry.keys.create("only", ["act"], only_leagues=[LEAGUE])
+    registry.keys.create("both", ["act"], only_leagues=["kept", LEAGUE])
+    registry.keys.create("all", ["act"])
+    registered(registry)  # again, which changes nothing
+    before = {key.name: key for key in registry.keys.all()}
+    assert before["only"].leagues == {LEAGUE}
+    registry.removal.remove_league(LEAGUE, force=True)
+    counts = registry.changes.counts()
+    registered(registry)
+    after = {key.name: key for key in registry.keys.all()}
+    assert after["only"].revoked_at is not None
+    assert after["both"].leagues == {"kept"}
+    assert after["all"] == before["all"]
+    assert registry.changes.counts().keys > counts.keys, "replicas read the keys again"
 
 
 def test_a_name_has_precedence_over_an_id(registry: Registry) -> None:

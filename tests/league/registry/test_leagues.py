@@ -23,7 +23,7 @@ def test_a_league_is_stored_as_registered(registry: Registry) -> None:
 
 def test_leagues_are_listed_by_name(registry: Registry) -> None:
     registered(registry, "another")
-    assert [row.slug for row in registry.leagues.all()] == ["another", LEAGUE]
+    assert list(registry.leagues.names()) == ["another", LEAGUE]
 
 
 def test_registering_again_updates_the_configuration_and_keeps_the_versions(registry: Registry) -> None:
@@ -102,7 +102,7 @@ def test_the_action_selections_of_all_leagues_are_read(registry: Registry) -> No
     registered(registry, "another")
     hidden = interface().model_copy(update={"hidden_information": True})
     registry.leagues.register(config(), hidden)
-    rows = registry.leagues.all()
+    rows = [registry.leagues.get(name) for name in registry.leagues.names()]
     assert registry.leagues.action_selections() == {row.slug: row.conditions.actions for row in rows}
     assert registry.leagues.action_selections() == {"another": "greedy", LEAGUE: "sampled"}
 

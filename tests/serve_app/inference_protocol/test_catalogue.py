@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
+from league.registry.storage.tables import LeagueTable
 from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.servers.replicas import READ_ONLY, local_client
@@ -20,6 +21,25 @@ def infer(replica: TestClient) -> None:
 def count(replica: TestClient) -> int:
     (entry,) = replica.get("/v2/models/vector/versions/1/stats").json()["model_stats"]
     return int(entry["inference_stats"]["success"]["count"])
+
+
+def test_a_league_of_another_release_is_left_out_of_the_index(leagues: Storage) -> None:
+    registry = Registry.open(leagues)
+    with local_client(Replica(Registry.open(leagues), RARELY, "catalogue-3")) as replica:
+        before = replica.post("/v2/repository/index").json()
+        for name, interface in (("configured", None), ("described", {"of": "another release"})):
+            with registry.database.write() as session:
+                row = session.get_one(LeagueTable, "board")
+                values = {column.key: getattr(row, column.key) for column in LeagueTable.__table__.columns}
+                values |= {"slug": name, "config": {"of": "another release"}}
+                session.add(LeagueTable(**values | ({} if interface is None else {"interface": interface})))
+        try:
+            assert replica.post("/v2/repository/index").json() == before
+            assert registry.leagues.action_selections().keys() >= {"board", "configured", "described"}, "replicas go on"
+        finally:
+            for name in ("configured", "described"):
+                registry.removal.remove_league(name)
+            registry.close()
 
 
 def test_counts_never_decrease_from_one_replica_to_the_next(leagues: Storage) -> None:

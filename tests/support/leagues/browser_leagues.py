@@ -92,8 +92,8 @@ def nights(registry: Registry) -> None:
 
 def compute(registry: Registry) -> None:
     """Compute the snapshots that the evaluation service would compute."""
-    for row in registry.leagues.all():
-        refresh(registry, row.slug)
+    for league in registry.leagues.names():
+        refresh(registry, league)
 
 
 def record(registry: Registry, steps: int) -> None:

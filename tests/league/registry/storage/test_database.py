@@ -17,7 +17,7 @@ from tests.support.servers import postgresql
 
 
 def slugs(registry: Registry) -> list[str]:
-    return [row.slug for row in registry.leagues.all()]
+    return list(registry.leagues.names())
 
 
 def test_a_new_database_is_readable_by_its_owner_only(local: Registry) -> None:
@@ -34,7 +34,7 @@ def test_a_moved_file_is_reported_and_found_again(local: Registry, tmp_path: Pat
         path.rename(tmp_path / "elsewhere")
         for _ in range(3):
             with pytest.raises(StorageError, match=r"league\.db does not exist"):
-                local.leagues.all()
+                local.leagues.names()
             with pytest.raises(StorageError, match=r"league\.db does not exist"):
                 local.publisher.sweep(before[0])
         assert not path.exists(), "a new file was created"

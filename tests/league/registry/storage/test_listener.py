@@ -108,12 +108,12 @@ def test_sqlite_does_not_notify(tmp_path: Path) -> None:
 
 
 def test_pooled_connections_are_closed_when_they_are_not_used(registry: Registry) -> None:
-    registry.leagues.all()
+    registry.leagues.names()
     registry.database.close_unused()
     assert registry.database.engine.pool.checkedin() == 1, "it was used since the last call"
     registry.database.close_unused()
     assert registry.database.engine.pool.checkedin() == 0
-    assert registry.leagues.all() == []
+    assert registry.leagues.names() == {}
 
 
 def test_discarded_notifications_are_not_seen_again(registry: Registry, listening: Database) -> None:

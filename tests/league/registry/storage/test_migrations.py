@@ -55,13 +55,13 @@ def test_concurrent_opening_migrates_once(storage: Storage) -> None:
     with registries[0].database.engine.connect() as connection:
         assert connection.execute(text("SELECT version_num FROM alembic_version")).all() == [(migrations.HEAD,)]
     for registry in registries:
-        assert registry.leagues.all() == []
+        assert registry.leagues.names() == {}
         registry.close()
 
 
 def test_reopening_keeps_the_data(registry: Registry, storage: Storage) -> None:
     again = Registry.open(storage)
-    assert again.leagues.all() == registry.leagues.all()
+    assert again.leagues.names() == registry.leagues.names()
     again.close()
 
 
@@ -88,7 +88,7 @@ def test_a_failed_migration_is_rolled_back(storage: Storage, monkeypatch: pytest
         Registry.open(storage)
     monkeypatch.undo()
     registry = Registry.open(storage)
-    assert registry.leagues.all() == []
+    assert registry.leagues.names() == {}
     registry.close()
 
 
