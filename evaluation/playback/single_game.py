@@ -17,7 +17,7 @@ from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.random.seeds import generator
-from league.spaces import Space, paths
+from league.spaces.arrays import nested
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,8 @@ def first_observation(config: LeagueConfig, interface: Interface, policy: str | 
         turn: Turn = environment.start(each_agent_alone([seed], len(agents)))
     for agent, batch in turn.batches.items():
         if policy in (None, interface.policies[agents[agent]]):
-            return _value(interface.agents[agents[agent]].observation, batch)
+            values = {name: array[0].tolist() for name, array in batch.observations.items()}
+            return nested(interface.agents[agents[agent]].observation, values)
     beginning = ", ".join(sorted({repr(interface.policies[agent]) for agent in _acting(turn, agents)}))
     raise UnknownPolicy(f"{policy!r} does not act first in {config.league} ({beginning} does): pass an observation")
 
@@ -126,17 +127,3 @@ class _AgentPolicy:
 
 def _acting(turn: Turn, agents: Sequence[str]) -> tuple[str, ...]:
     return tuple(agents[agent] for agent in turn.batches)
-
-
-def _value(space: Space, batch: Batch) -> Any:
-    """The first row of a batch as a value of `space`: nested lists under nested keys."""
-    value: Any = {}
-    for name, path in paths(space).items():
-        part = batch.observations[name][0].tolist()
-        if not path:
-            return part
-        inner = value
-        for key in path[:-1]:
-            inner = inner.setdefault(key, {})
-        inner[path[-1]] = part
-    return value

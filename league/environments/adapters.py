@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 
 from league.errors import EnvironmentMismatch
-from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Space
-from league.spaces.arrays import tensors
+from league.spaces import Space, paths
+from league.spaces.arrays import at_path
 
 Observation = dict[str, NDArray]
 """ONNX input name → array without a batch axis."""
@@ -49,13 +49,13 @@ def adapter_for(env: Any, splits: Sequence[Split]) -> EnvAdapter:
 
 def splitter(space: Space) -> Split:
     """Return a function from observation to named arrays, optimised for common spaces."""
-    if not isinstance(space, DictSpace):
-        return lambda value: {OBSERVATION: value}
-    if set(space.spaces) == {OBSERVATION, ACTION_MASK}:
-        plain = not any(isinstance(part, DictSpace) for part in space.spaces.values())
-        if plain:
-            return lambda value: {OBSERVATION: value[OBSERVATION], ACTION_MASK: value[ACTION_MASK]}
-    return lambda value: tensors(space, value)
+    match list(paths(space).items()):
+        case [(name, ())]:
+            return lambda value: {name: value}
+        case [(first, (key,)), (second, (next_key,))]:
+            return lambda value: {first: value[key], second: value[next_key]}
+        case leaves:
+            return lambda value: {name: at_path(value, path) for name, path in leaves}
 
 
 class _Adapter:

@@ -32,7 +32,7 @@ from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
 from league.spaces import Discrete
-from league.spaces.conversion import from_gymnasium
+from league.spaces.conversion import from_gymnasium, with_mask
 
 
 class Cycle(aec_to_parallel_wrapper):
@@ -130,13 +130,21 @@ def _refuses_arguments(constructor: Callable[..., Any], kwargs: Mapping[str, Any
 
 def _spaces(env: Any, agent: str, entry_point: str) -> AgentInterface:
     try:
-        spaces = observation_space(env, agent), action_space(env, agent)
+        return agent_interface(env, agent)
     except LeagueError:
         raise
     except Exception as error:
         raise EnvironmentMismatch(f"{entry_point}: the spaces of {agent} cannot be read{cause(error)}") from error
-    observation, action = map(from_gymnasium, spaces)
-    return AgentInterface(observation=observation, action=action)
+
+
+def agent_interface(env: Any, agent: str) -> AgentInterface:
+    """Return the spaces of an agent, for any API. Raises EnvironmentMismatch if they are not supported."""
+    spaces = observation_space(env, agent), action_space(env, agent)
+    try:
+        observation, action = map(from_gymnasium, spaces)
+        return AgentInterface(observation=with_mask(observation, action), action=action)
+    except EnvironmentMismatch as error:
+        raise EnvironmentMismatch(f"agent {agent}: {error}") from error
 
 
 def observation_space(env: Any, agent: str) -> gymnasium.Space[Any]:

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, adapter_for, splitter
-from league.environments.building import build, observation_space
-from league.environments.lockstep import plain_actions
+from league.environments.building import agent_interface, build
 from league.environments.stepping import Indices
 from league.environments.vector.vector_env import VectorEnv
-from league.spaces.conversion import from_gymnasium
+from league.spaces.arrays import environment_actions
 
 
 class StepActions(NamedTuple):
@@ -60,13 +59,15 @@ class EpisodeActions:
         further: a step after the recorded ones.
         """
         stock = build(config, render_mode)
-        splits = [splitter(from_gymnasium(observation_space(stock, agent))) for agent in stock.possible_agents]
-        adapter = adapter_for(stock, splits)
+        interfaces = [agent_interface(stock, agent) for agent in stock.possible_agents]
+        adapter = adapter_for(stock, [splitter(spaces.observation) for spaces in interfaces])
         try:
             adapter.reset(int(self._seeds[env]))
             for step in (*self._since(int(self._began[env])), *(() if further is None else (further,))):
                 own = slice(*np.searchsorted(step.envs, [env, env + 1]))
-                adapter.step(list(zip(step.agents[own].tolist(), plain_actions(step.actions[own]), strict=True)))
+                # The agents of a vectorised environment have actions of one space, but for their bounds.
+                actions = environment_actions(step.actions[own], interfaces[0].action)
+                adapter.step(list(zip(step.agents[own].tolist(), actions, strict=True)))
         except BaseException:
             with contextlib.suppress(Exception):
                 adapter.close()

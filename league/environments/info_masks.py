@@ -12,6 +12,8 @@ from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
 from league.errors import EnvironmentMismatch
 from league.spaces import ACTION_MASK, OBSERVATION
+from league.spaces.arrays import mask_size
+from league.spaces.conversion import from_gymnasium
 
 _reports_masks: dict[str, bool] = {}
 """Configuration of an environment → whether its infos contain masks. Finding out takes a reset."""
@@ -38,7 +40,7 @@ def with_info_masks(env: Any, configuration: str) -> Any:
 
 def _finds_masks(env: Any) -> bool:
     try:
-        if not any(_lacks_mask(env, agent) for agent in env.possible_agents):
+        if all(_missing_mask(env, agent) is None for agent in env.possible_agents):
             return False
         returned = env.reset(seed=0)
     except Exception:
@@ -48,10 +50,11 @@ def _finds_masks(env: Any) -> bool:
     return any(isinstance(info, Mapping) and ACTION_MASK in info for info in infos.values())
 
 
-def _lacks_mask(env: Any, agent: str) -> bool:
-    observation = env.observation_space(agent)
+def _missing_mask(env: Any, agent: str) -> int | None:
+    """Return the size of the mask that an agent could observe and does not."""
+    observation, action = env.observation_space(agent), env.action_space(agent)
     has_mask = isinstance(observation, Dict) and ACTION_MASK in observation.spaces
-    return not has_mask and isinstance(env.action_space(agent), Discrete | MultiDiscrete)
+    return None if has_mask or not isinstance(action, Discrete | MultiDiscrete) else mask_size(from_gymnasium(action))
 
 
 class _InfoMasks:
@@ -59,9 +62,7 @@ class _InfoMasks:
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)  # type: ignore[call-arg]
-        self._widths = {
-            agent: _width(env.action_space(agent)) for agent in env.possible_agents if _lacks_mask(env, agent)
-        }
+        self._widths = {agent: size for agent in env.possible_agents if (size := _missing_mask(env, agent)) is not None}
         self._observation_spaces: dict[str, gymnasium.Space[Any]] = {
             agent: Dict({OBSERVATION: env.observation_space(agent), ACTION_MASK: Box(0, 1, (width,), np.int8)})
             for agent, width in self._widths.items()
@@ -113,7 +114,3 @@ class _ParallelInfoMasks(_InfoMasks, BaseParallelWrapper):
 
     def _all_with_masks(self, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> dict[str, Any]:
         return {agent: self._with_mask(agent, value, infos.get(agent)) for agent, value in observations.items()}
-
-
-def _width(space: Discrete | MultiDiscrete) -> int:
-    return int(space.n) if isinstance(space, Discrete) else int(space.nvec.sum())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
-from league.environments.building import action_space, build, observation_space
+from league.environments.building import agent_interface, build
 from league.environments.stepping import (
     Batch,
     BatchedEnvironment,
@@ -28,7 +28,7 @@ from league.environments.stepping import (
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError
 from league.spaces import Leaf, inputs
-from league.spaces.conversion import from_gymnasium
+from league.spaces.arrays import environment_actions
 
 Given = TypeVar("Given")
 
@@ -66,11 +66,11 @@ class Lockstep:
         self._make, self._gives_states = make, states
         envs = [make() for _ in range(num_envs)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
-        spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.agents]
-        self._splits = [splitter(space) for space in spaces]
-        self._inputs = [inputs(space) for space in spaces]
+        spaces = [agent_interface(envs[0], agent) for agent in self.agents]
+        self._splits = [splitter(own.observation) for own in spaces]
+        self._inputs = [inputs(own.observation) for own in spaces]
         self._first_alike = [self._inputs.index(own) for own in self._inputs]
-        self._actions = [from_gymnasium(action_space(envs[0], agent)) for agent in self.agents]
+        self._actions = [own.action for own in spaces]
         self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
         self._seeds = np.zeros(num_envs, np.int64)
         self._crashes = CrashLimit(num_envs, crashes)
@@ -96,7 +96,8 @@ class Lockstep:
         moves: dict[int, list[tuple[int, Any]]] = defaultdict(list)
         for group, batch in self._pending.items():
             check_actions(batch, actions[group], self._actions[batch.agents[0]], self.agents)
-            rows = zip(batch.envs.tolist(), batch.agents.tolist(), plain_actions(actions[group]), strict=True)
+            own = environment_actions(actions[group], self._actions[batch.agents[0]])
+            rows = zip(batch.envs.tolist(), batch.agents.tolist(), own, strict=True)
             for env, agent, action in rows:
                 moves[env].append((agent, action))
         reports: Reports = {}
@@ -273,8 +274,3 @@ def _envs(numbers: Sequence[int]) -> Indices:
 
 def _must_act(report: Report) -> bool:
     return not (report[3] or report[4])
-
-
-def plain_actions(actions: NDArray) -> list[Any]:
-    """Discrete actions as Python integers, which environments use as list indices; other actions as arrays."""
-    return actions.tolist() if actions.ndim == 1 else list(actions)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.building import action_space, build, observation_space
+from league.environments.building import agent_interface, build
 from league.environments.episode_replay import EpisodeActions, StepActions
 from league.environments.stepping import (
     Batch,
@@ -25,7 +25,6 @@ from league.environments.stepping import (
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, one_line
 from league.spaces import inputs
-from league.spaces.conversion import from_gymnasium
 
 
 class VectorStepping:
@@ -52,14 +51,15 @@ class VectorStepping:
         self.num_envs = num_envs
         with closing(build(config)) as stock:
             self.agents: tuple[str, ...] = tuple(stock.possible_agents)
-            spaces = [inputs(from_gymnasium(observation_space(stock, agent))) for agent in self.agents]
-            self._actions = [from_gymnasium(action_space(stock, agent)) for agent in self.agents]
+            interfaces = [agent_interface(stock, agent) for agent in self.agents]
         if self._vector.possible_agents != self.agents:
             raise EnvironmentMismatch(
                 f"the vectorised environment has agents {', '.join(self._vector.possible_agents)}, the stock"
                 f" environment {', '.join(self.agents)}"
             )
-        self._first_alike = [spaces.index(own) for own in spaces]
+        self._actions = [spaces.action for spaces in interfaces]
+        observed = [inputs(spaces.observation) for spaces in interfaces]
+        self._first_alike = [observed.index(own) for own in observed]
         self._episodes = EpisodeActions(num_envs)
         self._plays = np.zeros(num_envs, dtype=bool)
         """Which environments have an episode."""

@@ -43,8 +43,8 @@ def to_environment(raw: NDArray, space: Space) -> NDArray:
         ConfigError: The action space is not supported.
     """
     match space:
-        case Discrete(start=start):
-            return raw.astype(np.int64) + start
+        case Discrete(start=start, dtype=dtype):
+            return (raw.astype(np.int64) + start).astype(dtype, copy=False)
         case MultiDiscrete(start=start, shape=shape, dtype=dtype):
             return (raw.reshape(-1, *shape) + np.asarray(start)).astype(dtype)
         case Box(shape=shape, dtype=dtype) if np.dtype(dtype).kind == "f":

@@ -15,7 +15,8 @@ from league.entry_points import import_entry_point
 from league.errors import ConfigError, EnvironmentMismatch
 from league.policies.draws import Generators
 from league.policies.policy import Actions, Arrays, MalformedAction
-from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, paths
+from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, beside_mask
+from league.spaces.arrays import nested
 
 INSTANCE = "instance"
 """The state of a bot that is a class: its instances, (k,) of objects; 0 before an agent's first action."""
@@ -40,7 +41,8 @@ class Bot:
         self._name = f"script:{entry_point}"
         if isinstance(action, DictSpace):
             raise EnvironmentMismatch(f"{self._name} cannot play: bots do not support dict actions")
-        self._paths, self._action = paths(observation), action
+        # A bot gets what is observed beside the mask, which has the same names.
+        self._observed, self._action = beside_mask(observation)[1], action
         self._bot = import_entry_point(self._name, entry_point)
         is_class = inspect.isclass(self._bot)
         if not callable(getattr(self._bot, "act", None) if is_class else self._bot):
@@ -96,18 +98,7 @@ class Bot:
 
     def _observation(self, arrays: Mapping[str, Any]) -> Any:
         """The observation without its action mask, as the environment returns it."""
-        nested: Any = {}
-        for name, path in self._paths.items():
-            if name == ACTION_MASK:
-                continue
-            own = path[1:] if ACTION_MASK in self._paths else path
-            if not own:
-                return arrays[name]
-            inner = nested
-            for key in own[:-1]:
-                inner = inner.setdefault(key, {})
-            inner[own[-1]] = arrays[name]
-        return nested
+        return nested(self._observed, arrays)
 
 
 def _arguments(name: str, act: Callable[..., Any], is_method: bool) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ from league.client.responses import Model
 from league.errors import InvalidInput
 from league.policies.policy import Actions, Arrays
 from league.refs import PolicyRef, check_slug
-from league.spaces import ACTION_MASK
+from league.spaces import ACTION_MASK, Space
+from league.spaces.arrays import nested
 
 
 class RemotePolicy:
@@ -23,15 +24,24 @@ class RemotePolicy:
         model: `LEAGUE`, or `LEAGUE.POLICY` if a version has several policies.
         version: A number or an alias; None for the current champion.
         timeout: Seconds allowed for one attempt.
+        observation: Observation space of the policy. None: dots in the names of arrays separate the keys of nested
+            Dicts, and beside a mask there is one more key, `observation`.
         options: Further arguments of `league.client.Client`.
     """
 
     def __init__(
-        self, base_url: str, model: str, version: int | str | None = None, timeout: float = 5.0, **options: Any
+        self,
+        base_url: str,
+        model: str,
+        version: int | str | None = None,
+        timeout: float = 5.0,
+        observation: Space | None = None,
+        **options: Any,
     ) -> None:
         if isinstance(version, str):
             check_slug("version", version)
         self._model = Model(PolicyRef.parse(model), version)
+        self._space = observation
         self._client = Client(base_url, timeout=timeout, **options)
 
     def act(
@@ -51,7 +61,7 @@ class RemotePolicy:
         rows = len(next(iter(observations.values())))
         # Explicit in both cases, because the default of the server depends on the league.
         request = BatchActionRequest.build(
-            [_observation(observations, row) for row in range(rows)],
+            [self._observation({name: array[row] for name, array in observations.items()}) for row in range(rows)],
             self._client.encoding,
             explore=explore,
             seed=_seeds(rng, rows) if explore else None,
@@ -60,6 +70,9 @@ class RemotePolicy:
         given = {name: np.ascontiguousarray(array) for name, array in (state or {}).items()}
         path = f"{self._model.path}/action{self._model.query}"
         return self._client.send(ApiCall(path, _read, to_json(request.body | {"state": given})))
+
+    def _observation(self, arrays: Arrays) -> Any:
+        return _by_names(arrays) if self._space is None else nested(self._space, arrays)
 
     def close(self) -> None:
         """Close the connections."""
@@ -84,15 +97,15 @@ def _seeds(rng: Sequence[np.random.Generator] | None, rows: int) -> list[int]:
     return [int(generator.integers(2**63)) for generator in rng]
 
 
-def _observation(observations: Arrays, row: int) -> Any:
-    """One row in the environment's format: leaves of a Dict are nested again by their names."""
-    if observations.keys() == {"observation"}:
-        return observations["observation"][row]
-    nested: dict[str, Any] = {}
-    for name, array in observations.items():
-        *outer, key = name.split(".") if ACTION_MASK in observations else name.split(".")[1:]
-        place = nested
+def _by_names(arrays: Arrays) -> Any:
+    """One observation in the environment's format: leaves of a Dict are nested again by their names."""
+    if arrays.keys() == {"observation"}:
+        return arrays["observation"]
+    value: dict[str, Any] = {}
+    for name, array in arrays.items():
+        *outer, key = name.split(".") if ACTION_MASK in arrays else name.split(".")[1:]
+        place = value
         for part in outer:
             place = place.setdefault(part, {})
-        place[key] = array[row]
-    return nested
+        place[key] = array
+    return value

@@ -33,6 +33,7 @@ from league.spaces import (
     Space,
     inputs,
 )
+from league.spaces.arrays import mask_size
 
 
 def script(name: str, observation: Space, action: Space) -> Policy:
@@ -154,21 +155,11 @@ def _playable(name: str, observation: Space, action: Space) -> Leaf:
     if isinstance(action, DictSpace):
         raise EnvironmentMismatch(f"script:{name} does not support {action.type} actions")
     mask = inputs(observation).get(ACTION_MASK)
-    if mask is not None and mask.shape != (_values(action),):
+    if mask is not None and mask.shape != (mask_size(action),):
         raise EnvironmentMismatch(
             f"script:{name} does not support a mask of shape {list(mask.shape)} for actions {action!r}"
         )
     return action
-
-
-def _values(action: Leaf) -> int | None:
-    """Size of the mask of an action space; None if it cannot be masked."""
-    match action:
-        case Discrete(n=n):
-            return n
-        case MultiDiscrete(nvec=nvec):
-            return int(np.sum(nvec))
-    return None
 
 
 def _masks(mask: NDArray, action: Leaf) -> list[NDArray]:

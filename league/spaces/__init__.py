@@ -2,11 +2,14 @@
 
 A value of a space is represented by one array per leaf, named after the ONNX input:
 
-| space                                              | names                                       |
-|----------------------------------------------------|---------------------------------------------|
-| a leaf (Box, Discrete, MultiDiscrete, MultiBinary) | `observation`                               |
-| Dict with `observation` and `action_mask`          | `observation` (or its leaves), `action_mask` |
-| any other Dict                                     | `observation.<key>`, nested keys dotted     |
+| space                                              | names                                                   |
+|----------------------------------------------------|---------------------------------------------------------|
+| a leaf (Box, Discrete, MultiDiscrete, MultiBinary) | `observation`                                           |
+| Dict with an action mask and one more key          | `observation` (or its leaves), `action_mask`            |
+| Dict with an action mask and several more keys     | `observation.<key>`, nested keys dotted, `action_mask`  |
+| Dict without an action mask                        | `observation.<key>`, nested keys dotted                 |
+
+The key `action_mask` of the outermost Dict is the action mask if the action space can have one.
 
 Arrays are in arrays.py and conversions in conversion.py, because the command line reads manifests without NumPy, and a
 serving replica handles arrays without Gymnasium.
@@ -67,10 +70,20 @@ class MultiBinary(_Space):
 
 
 class DictSpace(_Space):
-    """Named spaces."""
+    """Named spaces.
+
+    maskable: whether a key `action_mask` is the mask of the actions. Otherwise it is observed like any other.
+    """
 
     type: Literal["dict"] = "dict"
     spaces: dict[str, "Space"]
+    # Excluded by default, because digests and manifests of earlier versions do not contain it.
+    maskable: bool = Field(default=True, exclude_if=bool)
+
+    @property
+    def is_masked(self) -> bool:
+        """Whether values contain an action mask."""
+        return self.maskable and ACTION_MASK in self.spaces
 
 
 Leaf = Box | Discrete | MultiDiscrete | MultiBinary
@@ -79,41 +92,37 @@ Space = Annotated[Box | Discrete | MultiDiscrete | MultiBinary | DictSpace, Fiel
 
 def inputs(space: Space) -> dict[str, Leaf]:
     """Return the leaf of each ONNX input, in the order of the graph's inputs."""
-    return dict(_leaves(space))
+    return {name: leaf for name, _, leaf in leaf_paths(space)}
 
 
 def paths(space: Space) -> dict[str, tuple[str, ...]]:
     """Return the path of keys to the leaf of each ONNX input, in the order of `inputs`."""
-    if not isinstance(space, DictSpace):
-        return {OBSERVATION: ()}
     return {name: path for name, path, _ in leaf_paths(space)}
 
 
-def _leaves(space: Space) -> Iterator[tuple[str, Leaf]]:
-    if not isinstance(space, DictSpace):
-        yield OBSERVATION, space
-        return
-    for name, path, _ in leaf_paths(space):
-        leaf: Space = space
-        for key in path:
-            assert isinstance(leaf, DictSpace)
-            leaf = leaf.spaces[key]
-        assert not isinstance(leaf, DictSpace)
-        yield name, leaf
+def leaf_paths(space: Space) -> list[tuple[str, tuple[str, ...], Leaf]]:
+    """Return name, path of keys and space of each leaf, in the order of `inputs`."""
+    path, observed = beside_mask(space)
+    leaves = list(_walk(OBSERVATION, path, observed))
+    if isinstance(space, DictSpace) and space.is_masked:
+        leaves += _walk(ACTION_MASK, (ACTION_MASK,), space.spaces[ACTION_MASK])
+    return leaves
 
 
-def leaf_paths(space: DictSpace) -> list[tuple[str, tuple[str, ...], str]]:
-    """Return name, path of keys and dtype of each leaf, in the order of `inputs`."""
-    masked = OBSERVATION in space.spaces and ACTION_MASK in space.spaces
-    if not masked:
-        return list(_walk(OBSERVATION, (), space))
-    paths = list(_walk(OBSERVATION, (OBSERVATION,), space.spaces[OBSERVATION]))
-    return [*paths, *_walk(ACTION_MASK, (ACTION_MASK,), space.spaces[ACTION_MASK])]
+def beside_mask(space: Space) -> tuple[tuple[str, ...], Space]:
+    """Return what is observed beside the action mask, with its path: a Dict only if there is more than one key."""
+    if not (isinstance(space, DictSpace) and space.is_masked):
+        return (), space
+    parts = {key: part for key, part in space.spaces.items() if key != ACTION_MASK}
+    if len(parts) != 1:
+        return (), DictSpace(spaces=parts)
+    (key,) = parts
+    return (key,), parts[key]
 
 
-def _walk(name: str, path: tuple[str, ...], space: Space) -> Iterator[tuple[str, tuple[str, ...], str]]:
+def _walk(name: str, path: tuple[str, ...], space: Space) -> Iterator[tuple[str, tuple[str, ...], Leaf]]:
     if isinstance(space, DictSpace):
         for key, part in space.spaces.items():
             yield from _walk(f"{name}.{key}", (*path, key), part)
     else:
-        yield name, path, space.dtype
+        yield name, path, space

@@ -1,19 +1,31 @@
 """Arrays of a space's leaves: those of an environment's observation, and the validation of requests."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import IllegalMask, ObservationError
-from league.spaces import OBSERVATION, DictSpace, Discrete, Leaf, MultiBinary, MultiDiscrete, Space, leaf_paths
+from league.spaces import Discrete, Leaf, MultiBinary, MultiDiscrete, Space, leaf_paths, paths
 
 
 def tensors(space: Space, value: Any) -> dict[str, NDArray]:
     """Split an environment's observation into one array per ONNX input, without copying if possible."""
-    if not isinstance(space, DictSpace):
-        return {OBSERVATION: np.asarray(value, dtype=space.dtype)}
-    return {name: np.asarray(at_path(value, path), dtype=dtype) for name, path, dtype in leaf_paths(space)}
+    return {name: np.asarray(at_path(value, path), dtype=leaf.dtype) for name, path, leaf in leaf_paths(space)}
+
+
+def nested(space: Space, arrays: Mapping[str, Any]) -> Any:
+    """Return what `tensors` splits: values by ONNX input, in the structure of `space`."""
+    value: Any = {}
+    for name, path in paths(space).items():
+        if not path:
+            return arrays[name]
+        part = value
+        for key in path[:-1]:
+            part = part.setdefault(key, {})
+        part[path[-1]] = arrays[name]
+    return value
 
 
 def check(name: str, array: NDArray, leaf: Leaf) -> NDArray:
@@ -49,6 +61,24 @@ def check_mask(mask: NDArray) -> None:
         raise IllegalMask("action_mask contains values other than 0 and 1")
     if not mask.any(axis=-1).all():
         raise IllegalMask("action_mask allows no action: expected at least one 1")
+
+
+def mask_size(action: Space) -> int | None:
+    """Return the size of the mask of an action space; None if its actions cannot be masked."""
+    match action:
+        case Discrete(n=n):
+            return n
+        case MultiDiscrete(nvec=nvec):
+            return int(np.sum(nvec))
+    return None
+
+
+def environment_actions(actions: NDArray, space: Space) -> list[Any]:
+    """Return actions (k, …) one by one, as `sample` of Gymnasium's space returns them."""
+    if isinstance(space, Discrete):
+        return list(actions.astype(space.dtype, copy=False))
+    # An array also if the shape is (): `list` would return NumPy's scalars.
+    return [actions[row, ...] for row in range(len(actions))]
 
 
 def at_path(value: Any, path: tuple[str, ...]) -> Any:

@@ -7,16 +7,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import EnvironmentMismatch
-from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
+from league.spaces import ACTION_MASK, Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space, leaf_paths
+from league.spaces.arrays import mask_size
+
+MAX_CHOICES = 2**16
+"""Choices of a Discrete, or of all elements of a MultiDiscrete. Each is an input or an output of a network."""
 
 
 def from_gymnasium(space: gymnasium.Space[Any]) -> Space:
-    """Convert a Gymnasium space. Raises EnvironmentMismatch for unsupported kinds (Text, Graph, …)."""
+    """Convert a Gymnasium space. Raises EnvironmentMismatch for unsupported kinds (Text, Graph, …), and without values
+    or with too many choices.
+    """
+    converted = _converted(space)
+    if isinstance(converted, DictSpace):
+        _check_names(converted)
+    elif 0 in converted.shape:
+        raise EnvironmentMismatch(f"space {space} has no elements: expected at least one")
+    if (choices := mask_size(converted) or 0) > MAX_CHOICES:
+        raise EnvironmentMismatch(f"space {space} has {choices:,} choices: expected at most {MAX_CHOICES:,}")
+    return converted
+
+
+def _check_names(space: DictSpace) -> None:
+    """Raise EnvironmentMismatch for a Dict without keys, or one whose leaves do not have different names."""
+    if not space.spaces:
+        raise EnvironmentMismatch("a Dict without keys is not supported: remove it")
+    names = [name for name, *_ in leaf_paths(space)]
+    if len(set(names)) < len(names):
+        name = next(name for name in names if names.count(name) > 1)
+        raise EnvironmentMismatch(f"two parts of an observation would have the name {name!r}: rename a key")
+
+
+def _converted(space: gymnasium.Space[Any]) -> Space:
     match space:
         case gymnasium.spaces.Box():
             return Box(dtype=space.dtype.name, shape=space.shape, low=_bound(space.low), high=_bound(space.high))
         case gymnasium.spaces.Discrete():
-            return Discrete(n=int(space.n), start=int(space.start))
+            return Discrete(n=int(space.n), start=int(space.start), dtype=np.dtype(space.dtype).name)
         case gymnasium.spaces.MultiDiscrete():
             return MultiDiscrete(
                 nvec=space.nvec.tolist(),
@@ -27,10 +54,32 @@ def from_gymnasium(space: gymnasium.Space[Any]) -> Space:
         case gymnasium.spaces.MultiBinary():
             return MultiBinary(shape=space.shape)
         case gymnasium.spaces.Dict():
+            if not_text := [key for key in space.spaces if not isinstance(key, str)]:
+                raise EnvironmentMismatch(f"a Dict has the key {not_text[0]!r}: expected a string")
             return DictSpace(spaces={key: from_gymnasium(part) for key, part in space.spaces.items()})
     raise EnvironmentMismatch(
         f"space {space} is not supported: expected Box, Discrete, MultiDiscrete, MultiBinary or Dict"
     )
+
+
+def with_mask(observation: Space, action: Space) -> Space:
+    """Return the observation space of an agent with these actions.
+
+    A key `action_mask` is the action mask; of actions that cannot be masked it is an observation like any other.
+    Raises EnvironmentMismatch if it does not fit the actions.
+    """
+    if not (isinstance(observation, DictSpace) and ACTION_MASK in observation.spaces):
+        return observation
+    size, mask = mask_size(action), observation.spaces[ACTION_MASK]
+    if size is None:
+        return observation.model_copy(update={"maskable": False})
+    if isinstance(mask, DictSpace) or mask.shape != (size,):
+        form = "is a Dict" if isinstance(mask, DictSpace) else f"has the shape {list(mask.shape)}"
+        per = "action" if isinstance(action, Discrete) else "choice of each element, element by element"
+        raise EnvironmentMismatch(f"action_mask {form}, expected [{size}]: one number for each {per}")
+    if len(observation.spaces) == 1:
+        raise EnvironmentMismatch("observations contain only action_mask: expected at least one more key")
+    return observation
 
 
 def to_gymnasium(space: Space) -> gymnasium.Space[Any]:
@@ -43,7 +92,7 @@ def to_gymnasium(space: Space) -> gymnasium.Space[Any]:
                 dtype=np.dtype(space.dtype).type,
             )
         case Discrete():
-            return gymnasium.spaces.Discrete(space.n, start=space.start)
+            return gymnasium.spaces.Discrete(space.n, start=space.start, dtype=np.dtype(space.dtype).type)
         case MultiDiscrete():
             dtype = np.dtype(space.dtype).type
             return gymnasium.spaces.MultiDiscrete(space.nvec, dtype=dtype, start=space.start)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from league.policies.actions import bounds
-from league.spaces import ACTION_MASK, Box, DictSpace, Discrete, MultiDiscrete, Space
+from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space, inputs
+from league.spaces.arrays import nested
 from serve_app.inference_protocol.tensors import datatype_of
 from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.settings import ServeSettings
@@ -47,11 +48,10 @@ def infer_request(policy: LoadedPolicy) -> dict[str, Any] | None:
     }
 
 
-def observation(space: Space, is_mask: bool = False) -> Any:
+def observation(space: Space) -> Any:
     """An example value of a space as JSON, with every action legal."""
-    if isinstance(space, DictSpace):
-        return {key: observation(part, key == ACTION_MASK) for key, part in space.spaces.items()}
-    return _leaf(_zeros(space, space.shape, is_mask))
+    leaves = inputs(space).items()
+    return nested(space, {name: _leaf(_zeros(leaf, leaf.shape, name == ACTION_MASK)) for name, leaf in leaves})
 
 
 def _zeros(leaf: Any, shape: tuple[int, ...], is_mask: bool = False) -> NDArray:

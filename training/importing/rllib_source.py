@@ -20,8 +20,6 @@ from training.importing.source import Source
 from training.importing.torch_source import Examples, ModuleOriginal, converted
 
 OUTPUT = "action_dist_inputs"
-MASKED = ("observations", "observation")
-"""Keys of the observation beside a mask, as in RLlib's example modules and PettingZoo's environments."""
 
 
 class InferenceGraph(nn.Module):
@@ -85,9 +83,9 @@ def _observed(space: gymnasium.Space[Any], where: str) -> tuple[str | None, gymn
     if isinstance(space, gymnasium.spaces.Box):
         return None, space
     if isinstance(space, gymnasium.spaces.Dict) and ACTION_MASK in space.spaces:
-        for key in MASKED:
-            if isinstance(found := space.spaces.get(key), gymnasium.spaces.Box):
-                return key, found
+        others = [(key, part) for key, part in space.spaces.items() if key != ACTION_MASK]
+        if len(others) == 1 and isinstance(others[0][1], gymnasium.spaces.Box):
+            return others[0]
     raise EnvironmentMismatch(f"{where}: observations are {space}: expected Box, or Dict with a Box and an action_mask")
 
 

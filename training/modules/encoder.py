@@ -35,8 +35,8 @@ class RunningNormalization(nn.Module):
         super().__init__()
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         # Doubles: far from 0, float32 rounding would dominate the deviations.
-        self.register_buffer("mean", torch.zeros(*shape, dtype=torch.float64))
-        self.register_buffer("variance", torch.ones(*shape, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(shape, dtype=torch.float64))
+        self.register_buffer("variance", torch.ones(shape, dtype=torch.float64))
 
     def forward(self, values: Tensor) -> Tensor:
         """(B, *shape) → (B, *shape) float32."""
@@ -84,7 +84,7 @@ class ObservationFeatures(nn.Module):
         if convolutions and not any(isinstance(part, ImageEncoder) for part in self.parts):
             raise ConfigError("training.convolutions: no part of the observation is a Box of (height, width, channels)")
         with torch.no_grad():
-            example = {name: torch.as_tensor(part.sample())[None] for name, part in spaces.items()}
+            example = {name: torch.as_tensor(np.zeros((1, *part.shape), part.dtype)) for name, part in spaces.items()}
             self.width = self(example).shape[-1]
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
@@ -141,6 +141,13 @@ class ToFloat(nn.Module):
         return values.float()
 
 
+class Flat(nn.Flatten):
+    """(B, …) → (B, width); (B,) → (B, 1)."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        return super().forward(values) if values.ndim > 1 else values.unsqueeze(1)
+
+
 class ImageEncoder(nn.Module):
     """Images (B, height, width, channels) → convolutions → (B, width)."""
 
@@ -172,12 +179,12 @@ def _feature(space: gymnasium.Space, convolutions: Convolutions, normalize: bool
         case gymnasium.spaces.MultiDiscrete():
             return OneHot(space.start.ravel().tolist(), space.nvec.ravel().tolist())
         case gymnasium.spaces.MultiBinary():
-            return nn.Sequential(ToFloat(), nn.Flatten())
+            return nn.Sequential(ToFloat(), Flat())
         case gymnasium.spaces.Box():
             numbers = _box_feature(space, normalize)
             if convolutions and len(space.shape) == 3:
                 return ImageEncoder(numbers, space.shape, convolutions)
-            return nn.Sequential(numbers, nn.Flatten())
+            return nn.Sequential(numbers, Flat())
     raise ConfigError(f"training: unsupported observation space {space}")
 
 

@@ -340,6 +340,6 @@ def _flat_state(rows: Rows, head: str) -> NDArray:
     parts = [
         column.reshape(len(column), -1).astype(np.float32)
         for name, column in rows.items()
-        if name.startswith(f"{head}/") and not name.endswith(f"/{ACTION_MASK}")
+        if name.startswith(f"{head}/") and name != f"{head}/{ACTION_MASK}"
     ]
     return np.concatenate(parts, axis=1)

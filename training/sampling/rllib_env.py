@@ -19,7 +19,7 @@ from league.environments.building import build, interface
 from league.environments.lockstep import Lockstep
 from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch
-from league.spaces import Space, paths
+from league.spaces.arrays import nested
 from league.spaces.conversion import to_gymnasium
 from training.sampling.reset_seeds import ResetSeeds
 
@@ -87,7 +87,7 @@ class LeagueEnv(MultiAgentEnv):
         endings = list(turn.each_ending())
         for ending in endings:
             agent = self.possible_agents[ending.agent]
-            observations[agent] = _nested_value(self._observed[agent], ending.observation)
+            observations[agent] = nested(self._observed[agent], ending.observation)
             rewards[agent] = ending.reward
             infos[agent] = self._infos.of(agent)
             terminated[agent] = ending.terminated
@@ -110,9 +110,7 @@ class LeagueEnv(MultiAgentEnv):
         self.agents = list(rows)
         return (
             {
-                agent: _nested_value(
-                    self._observed[agent], {name: array[0] for name, array in batch.observations.items()}
-                )
+                agent: nested(self._observed[agent], {name: array[0] for name, array in batch.observations.items()})
                 for agent, batch in rows.items()
             },
             {agent: float(batch.rewards[0]) for agent, batch in rows.items()},
@@ -141,16 +139,3 @@ class InfoRecorder:
             return answer
 
         return keeping
-
-
-def _nested_value(space: Space, arrays: Mapping[str, Any]) -> Any:
-    """Return an observation in the structure of its space."""
-    value: Any = {}
-    for name, path in paths(space).items():
-        if not path:
-            return arrays[name]
-        part = value
-        for key in path[:-1]:
-            part = part.setdefault(key, {})
-        part[path[-1]] = arrays[name]
-    return value

@@ -12,7 +12,7 @@ import numpy as np
 
 from league.config.league import LeagueConfig
 from league.environments.adapters import EnvAdapter, Report, adapter_for
-from league.environments.building import action_space, build
+from league.environments.building import build
 from league.environments.conformance.findings import Episode, Examination, Trace
 from league.environments.conformance.observations import ObservationCheck, check_constant_observations
 from league.environments.conformance.openings import joined, measure_openings
@@ -59,8 +59,9 @@ class Examiner:
         self._env, self._config, self._found, self._budget = env, config, found, budget
         self._agents, self._sides = list(interface.agents), interface.sides
         self._most, self._must_end = (config.play.max_moves, True) if steps is None else (steps, False)
-        self._checks = [ObservationCheck(agent, env, found) for agent in env.possible_agents]
-        self._spaces = [action_space(env, agent) for agent in env.possible_agents]
+        normalizes = config.training.normalize_observations
+        self._checks = [ObservationCheck(agent, env, found, normalizes) for agent in env.possible_agents]
+        self._spaces = [interface.agents[agent].action for agent in env.possible_agents]
         self._actions = RandomActions(self._spaces)
         self.place = Place(0)
 

@@ -79,6 +79,9 @@ def examine(
                 "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
             )
     found.interface = interface
+    if not found.passed:
+        env.close()
+        return found
     examiner = Examiner(env, interface, config, found, steps, budget)
     try:
         examiner.examine(episodes, seed)

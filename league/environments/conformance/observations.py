@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.adapters import Observation
-from league.environments.building import action_space, observation_space
+from league.environments.building import agent_interface, observation_space
 from league.environments.conformance.findings import Examination, Trace
 from league.errors import EnvironmentMismatch
 from league.spaces import Box, Leaf, inputs
 from league.spaces.arrays import tensors
-from league.spaces.conversion import from_gymnasium
 
 ENOUGH_TURNS = 20
 """Minimum turns of an agent for the check that its observations change."""
@@ -21,17 +20,25 @@ ENOUGH_TURNS = 20
 
 REMEDY = "correct observation_space, or what reset and step return"
 
+LARGEST = 1e9
+"""Absolute value above which gradients overflow, in networks that take it as it is."""
+
 
 class ObservationCheck:
     """Splits an agent's observations into arrays, and checks them against its space."""
 
-    def __init__(self, agent: str, env: Any, found: Examination) -> None:
+    def __init__(self, agent: str, env: Any, found: Examination, normalizes: bool) -> None:
+        """normalizes: whether training scales floats by their running statistics."""
         self._agent, self._found = agent, found
         self._gymnasium = observation_space(env, agent)
-        self._space = from_gymnasium(self._gymnasium)
+        self._space = agent_interface(env, agent).observation
         self._leaves = inputs(self._space)
+        self._raw = {
+            name: leaf
+            for name, leaf in self._leaves.items()
+            if isinstance(leaf, Box) and not (normalizes and np.dtype(leaf.dtype).kind == "f")
+        }
         self._kept: tuple[Any, Observation] | None = None
-        action_space(env, agent)
 
     def __call__(self, value: Any) -> Observation:
         if self._kept is not None and _changed(*self._kept):
@@ -44,6 +51,8 @@ class ObservationCheck:
             shape, expected = list(arrays[name].shape), list(self._leaves[name].shape)
             text = f"observes {name} with shape {shape}, but its space has {expected}: {REMEDY}"
             self._found.add("fault", text, self._agent)
+        if not misshapen:
+            self._check_size(arrays)
         if not misshapen and not self._gymnasium.contains(value):
             self._found.add(
                 "note",
@@ -55,6 +64,14 @@ class ObservationCheck:
         copies = {name: np.array(array) for name, array in arrays.items()}
         self._kept = (arrays, copies)
         return copies
+
+    def _check_size(self, arrays: Observation) -> None:
+        for name, leaf in self._raw.items():
+            largest = np.abs(arrays[name].astype(np.float64)).max()
+            if LARGEST < largest < np.inf:
+                text = f"observes {largest:.3g} in {name}: training needs values of at most {LARGEST:g}: scale them"
+                is_float = np.dtype(leaf.dtype).kind == "f"
+                self._found.add("fault", text + (", or set training.normalize_observations" * is_float), self._agent)
 
     def _arrays(self, value: Any) -> Observation:
         """Split an observation. Raises EnvironmentMismatch if its structure is not that of the space."""

@@ -7,14 +7,14 @@ from math import ceil
 from statistics import median
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.adapters import EnvAdapter, Observation, Report
 from league.environments.conformance.random_actions import RandomActions
 from league.environments.conformance.time_budget import TimeBudget
-from league.spaces import ACTION_MASK
+from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space
+from league.spaces.arrays import environment_actions
 
 SEEDS = 20
 """Games of deterministic play that are compared."""
@@ -106,7 +106,7 @@ class _OutOfTimeError(Exception): ...
 
 
 def measure_openings(
-    adapter: EnvAdapter, spaces: Sequence[gymnasium.Space[Any]], seed: int, budget: TimeBudget, share: float
+    adapter: EnvAdapter, spaces: Sequence[Space], seed: int, budget: TimeBudget, share: float
 ) -> OpeningMeasurement | None:
     """Play deterministic games with different seeds and, if they repeat each other, random openings.
 
@@ -161,9 +161,7 @@ def _length(openings: Sequence[Sequence[bytes]], plies: int) -> OpeningLength:
 class _Games:
     """Plays games as long as the time allows."""
 
-    def __init__(
-        self, adapter: EnvAdapter, spaces: Sequence[gymnasium.Space[Any]], budget: TimeBudget, share: float
-    ) -> None:
+    def __init__(self, adapter: EnvAdapter, spaces: Sequence[Space], budget: TimeBudget, share: float) -> None:
         self._adapter, self._spaces, self._budget, self._share = adapter, spaces, budget, share
         self._actions = RandomActions(spaces)
         self._played = 0
@@ -219,16 +217,16 @@ def joined(observation: Observation) -> bytes:
     return b"".join(np.ascontiguousarray(array).tobytes() for array in observation.values())
 
 
-def _first(space: gymnasium.Space[Any], mask: NDArray[Any] | None) -> Any:
+def _first(space: Space, mask: NDArray[Any] | None) -> Any:
     """Return the first legal action, or the value of a Box that is nearest to 0."""
-    match space:
-        case gymnasium.spaces.Discrete():
-            return int(space.start) if mask is None else int(np.argmax(mask))
-        case gymnasium.spaces.MultiDiscrete():
-            if mask is None:
-                return np.zeros(space.shape, space.dtype)
-            parts = np.split(mask, np.cumsum(space.nvec)[:-1])
-            return np.array([np.argmax(part) for part in parts], space.dtype)
-        case gymnasium.spaces.Box():
-            return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
-    raise TypeError(f"{space}: expected Discrete, MultiDiscrete or Box")
+    if isinstance(space, Box):
+        # An infinite bound becomes NaN, which fmax and fmin ignore.
+        low, high = (np.array(bound, np.float64) for bound in (space.low, space.high))
+        action = np.fmin(np.fmax(np.zeros(space.shape), low), high)
+    else:
+        assert isinstance(space, Discrete | MultiDiscrete), "other actions are a fault, and no game is played"
+        choices = np.ravel(space.nvec if isinstance(space, MultiDiscrete) else space.n)
+        allowed = np.ones(choices.sum()) if mask is None else mask != 0
+        raw = np.array([part.argmax() for part in np.split(allowed, np.cumsum(choices)[:-1])])
+        action = np.asarray(space.start) + raw.reshape(space.shape)
+    return environment_actions(action[np.newaxis].astype(space.dtype), space)[0]

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for
-from league.environments.building import action_space, build, observation_space
+from league.environments.building import agent_interface, build
 from league.environments.vector.differences import EnvironmentsDiffer, RowNames, check_column, check_rows
 from league.environments.vector.random_actions import random_actions
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import ACTION_MASK, Space, inputs
-from league.spaces.arrays import tensors
-from league.spaces.conversion import from_gymnasium
+from league.spaces.arrays import environment_actions, tensors
 
 MAX_SEED = 2**31 - 1
 LONGEST_PHASE = 40
@@ -141,9 +140,8 @@ class DifferentialTest:
     def step(self, env_ids: NDArray[np.int64], actions: NDArray) -> None:
         """Step some copies of both. actions: as for VectorEnv.step. No call if `env_ids` is empty."""
         acting = self._must_act[env_ids]
-        # Discrete actions are Python integers for the stock environment, as in Lockstep.
-        plain = iter(actions.tolist() if actions.ndim == 1 else list(actions))
-        moves = [[(int(agent), next(plain)) for agent in np.flatnonzero(row)] for row in acting]
+        each = iter(environment_actions(actions, self._agents[0].action))
+        moves = [[(int(agent), next(each)) for agent in np.flatnonzero(row)] for row in acting]
         self._steps[env_ids] += 1
         self._call(env_ids, self._vector.step, actions, lambda row, env: self._stock[env].step(moves[row]))
         self.steps += len(env_ids)
@@ -259,11 +257,10 @@ def _agents(env: Any) -> list[_Agent]:
     spaces: list[Space] = []
     agents = []
     for name in env.possible_agents:
-        observation = from_gymnasium(observation_space(env, name))
-        if observation not in spaces:
-            spaces.append(observation)
-        action = from_gymnasium(action_space(env, name))
-        agents.append(_Agent(name, observation, action, spaces.index(observation)))
+        own = agent_interface(env, name)
+        if own.observation not in spaces:
+            spaces.append(own.observation)
+        agents.append(_Agent(name, own.observation, own.action, spaces.index(own.observation)))
     return agents
 
 

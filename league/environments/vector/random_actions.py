@@ -13,9 +13,8 @@ def random_actions(space: Space, count: int, mask: NDArray | None, rng: np.rando
     """Draw `count` actions from `space`, (count, …). mask: (count, n), or None if all actions are legal."""
     match space:
         case Discrete():
-            if mask is None:
-                return rng.integers(space.start, space.start + space.n, size=count)
-            return space.start + random_choices(mask, rng)
+            chosen = rng.integers(space.n, size=count) if mask is None else random_choices(mask, rng)
+            return (space.start + chosen).astype(space.dtype)
         case MultiDiscrete():
             choices = np.asarray(space.nvec).ravel()
             allowed = np.ones((count, choices.sum()), dtype=np.int8) if mask is None else mask
@@ -24,6 +23,9 @@ def random_actions(space: Space, count: int, mask: NDArray | None, rng: np.rando
             return (np.asarray(space.start) + chosen.reshape(count, *space.shape)).astype(space.dtype)
         case MultiBinary():
             return rng.integers(2, size=(count, *space.shape)).astype(space.dtype)
+        case Box(dtype=dtype) if np.dtype(dtype).kind != "f":
+            low, high = (np.array(bound, dtype) for bound in (space.low, space.high))
+            return rng.integers(low, high, (count, *space.shape), dtype, endpoint=True)
         case Box():
             return _in_box(space, count, rng)
     raise TypeError(f"random actions of a {type(space).__name__} are not supported")
@@ -38,9 +40,11 @@ def random_choices(mask: NDArray, rng: np.random.Generator) -> NDArray[np.int64]
 
 def _in_box(space: Box, count: int, rng: np.random.Generator) -> NDArray:
     low, high = (np.broadcast_to(np.array(bound, dtype=np.float64), space.shape) for bound in (space.low, space.high))
-    unbounded = ~(np.isfinite(low) & np.isfinite(high))
-    drawn = rng.uniform(np.where(unbounded, 0, low), np.where(unbounded, 0, high), (count, *space.shape))
+    bounded = np.isfinite(low) & np.isfinite(high)
+    share = rng.random((count, *space.shape))
+    # A weighted mean of the bounds: `high - low` may overflow.
+    drawn = np.where(bounded, low, 0) * (1 - share) + np.where(bounded, high, 0) * share
     at_bound = np.where(rng.random(drawn.shape) < 0.5, low, high)
     drawn = np.where(rng.random(drawn.shape) < AT_A_BOUND, at_bound, drawn)
-    drawn = np.where(unbounded, rng.normal(size=drawn.shape), drawn)
-    return drawn.astype(space.dtype)
+    near = np.clip(rng.normal(size=drawn.shape), np.nan_to_num(low, nan=-np.inf), np.nan_to_num(high, nan=np.inf))
+    return np.where(bounded, drawn, near).astype(space.dtype)

@@ -1,0 +1,206 @@
+"""Which keys of a Dict observation are the mask, and which are observed, for all APIs."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from ray.rllib.env.multi_agent_env import MultiAgentEnv
+
+from league.config.environment import EnvironmentConfig
+from league.config.league import LeagueConfig
+from league.environments.building import interface
+from league.environments.conformance.examination import examine
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import each_agent_alone
+from league.errors import EnvironmentMismatch, IllegalAction
+from league.spaces import inputs
+
+BOX = spaces.Box(-1, 1, (2,), np.float32)
+DISCRETE, MULTI = spaces.Discrete(3), spaces.MultiDiscrete([2, 3])
+OBSERVATIONS = {
+    "obs": spaces.Dict({"obs": BOX, "action_mask": spaces.Box(0, 1, (3,), np.int8)}),
+    "nested": spaces.Dict({"real": spaces.Dict({"a": BOX, "b": BOX}), "action_mask": spaces.MultiBinary(3)}),
+    "secret": spaces.Dict({"observation": BOX, "secret": BOX, "action_mask": spaces.Box(0, 1, (3,), np.float32)}),
+    "multi": spaces.Dict({"observations": BOX, "action_mask": spaces.MultiDiscrete([2] * 5)}),
+    "joint": spaces.Dict({"observation": BOX, "action_mask": spaces.MultiBinary((2, 3))}),
+    "short": spaces.Dict({"observation": BOX, "action_mask": spaces.MultiBinary(2)}),
+    "parts": spaces.Dict({"observation": BOX, "action_mask": spaces.Dict({"a": spaces.MultiBinary(3)})}),
+    "only": spaces.Dict({"action_mask": spaces.MultiBinary(3)}),
+}
+ACTIONS = {"multi": MULTI, "joint": MULTI}
+AGENTS = ["ann", "bob"]
+
+
+class Masked:
+    """A game of five moves. The mask forbids the second action, or the second value of each element."""
+
+    def __init__(self, space: str, continuous: bool = False) -> None:
+        self.metadata: dict[str, Any] = {"name": "masked", "is_parallelizable": True}
+        self.possible_agents, self.agents, self.render_mode = AGENTS, AGENTS, None
+        self.observed = OBSERVATIONS[space]
+        self.acted = spaces.Box(-1, 1, (3,), np.float32) if continuous else ACTIONS.get(space, DISCRETE)
+        self.observation_spaces, self.action_spaces = (
+            dict.fromkeys(AGENTS, each) for each in (self.observed, self.acted)
+        )
+
+    def observation_space(self, agent: str) -> Any:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        return self.action_spaces[agent]
+
+    def value(self, space: Any = None, key: str = "") -> Any:
+        space = space or self.observed
+        if isinstance(space, spaces.Dict):
+            return {key: self.value(part, key) for key, part in space.spaces.items()}
+        if key == "action_mask":
+            choices = [3] if space.shape == (3,) else [2, 3]
+            mask = np.concatenate([np.arange(n) != 1 for n in choices])
+            return np.resize(mask, space.shape).astype(space.dtype)
+        return self.rng.uniform(-1, 1, space.shape).astype(space.dtype)
+
+    def begin(self, seed: int | None) -> None:
+        self.agents, self.turn, self.rng = list(AGENTS), 0, np.random.default_rng(seed)
+
+    def move(self, action: Any) -> None:
+        self.turn += 1
+        if isinstance(self.acted, spaces.Discrete | spaces.MultiDiscrete):
+            assert 1 not in np.ravel(action), f"illegal action {action}"
+
+
+class ParallelMasked(Masked, ParallelEnv):
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.begin(seed)
+        return {agent: self.value() for agent in AGENTS}, {agent: {} for agent in AGENTS}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        for action in actions.values():
+            self.move(action)
+        over = self.turn >= 10
+        self.agents = [] if over else AGENTS
+        values = {agent: self.value() for agent in AGENTS}, dict.fromkeys(AGENTS, 1.0)
+        return *values, dict.fromkeys(AGENTS, over), dict.fromkeys(AGENTS, False), {agent: {} for agent in AGENTS}
+
+
+class TurnMasked(Masked, AECEnv):
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        self.begin(seed)
+        self.rewards, self._cumulative_rewards = dict.fromkeys(AGENTS, 1.0), dict.fromkeys(AGENTS, 0.0)
+        self.terminations, self.truncations = dict.fromkeys(AGENTS, False), dict.fromkeys(AGENTS, False)
+        self.infos: dict[str, Any] = {agent: {} for agent in AGENTS}
+        self.agent_selection, self.last_value = AGENTS[0], self.value()
+
+    def observe(self, agent: str) -> Any:
+        return self.last_value
+
+    def step(self, action: Any) -> None:
+        if self.terminations[self.agent_selection]:
+            self._was_dead_step(action)
+            return
+        self.move(action)
+        self._cumulative_rewards[self.agent_selection] = 0.0
+        self.terminations = dict.fromkeys(AGENTS, self.turn >= 10)
+        self.last_value, self.agent_selection = self.value(), AGENTS[self.turn % 2]
+        self._accumulate_rewards()
+
+
+class RLlibMasked(Masked, MultiAgentEnv):
+    def __init__(self, **kwargs: Any) -> None:
+        MultiAgentEnv.__init__(self)
+        Masked.__init__(self, **kwargs)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.begin(seed)
+        return {agent: self.value() for agent in AGENTS}, {}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        for action in actions.values():
+            self.move(action)
+        values = {agent: self.value() for agent in AGENTS}, dict.fromkeys(AGENTS, 1.0)
+        return *values, {"__all__": self.turn >= 10}, {"__all__": False}, {}
+
+
+APIS = ("ParallelMasked", "TurnMasked", "RLlibMasked")
+
+
+def league(api: str, space: str, **kwargs: Any) -> LeagueConfig:
+    environment = {"entry_point": f"{__name__}:{api}", "kwargs": {"space": space, **kwargs}}
+    return LeagueConfig.from_mapping({"league": "masked", "environment": environment})
+
+
+def illegal(space: str) -> NDArray:
+    return np.array([1]) if space not in ACTIONS else np.array([[0, 1]])
+
+
+@pytest.mark.parametrize("api", APIS)
+@pytest.mark.parametrize(
+    ("space", "names"),
+    [
+        ("obs", ["observation", "action_mask"]),
+        ("nested", ["observation.a", "observation.b", "action_mask"]),
+        ("secret", ["observation.observation", "observation.secret", "action_mask"]),
+        ("multi", ["observation", "action_mask"]),
+    ],
+)
+def test_the_mask_counts_whatever_the_other_keys_are_called_and_all_are_observed(
+    api: str, space: str, names: list[str]
+) -> None:
+    config = league(api, space)
+    found = examine(config, episodes=1)
+    assert found.passed, found.findings
+    assert list(inputs(interface(config).agents["ann"].observation)) == names
+    stepping = stock_stepping(config.environment, 1)
+    turn = stepping.start(each_agent_alone([0], 2))
+    assert list(turn.batches[0].observations) == names
+    with pytest.raises(IllegalAction, match="action_mask is"):
+        stepping.step({group: illegal(space) for group in turn.batches})
+
+
+@pytest.mark.parametrize(
+    ("space", "reason"),
+    [
+        ("joint", r"agent ann: action_mask has the shape \[2, 3\], expected \[5\]: one number for each choice of"),
+        ("short", r"agent ann: action_mask has the shape \[2\], expected \[3\]: one number for each action"),
+        ("parts", r"agent ann: action_mask is a Dict, expected \[3\]"),
+        ("only", "agent ann: observations contain only action_mask: expected at least one more key"),
+    ],
+)
+def test_a_mask_that_does_not_fit_is_refused_with_both_sizes(space: str, reason: str) -> None:
+    with pytest.raises(EnvironmentMismatch, match=reason):
+        interface(league("ParallelMasked", space))
+
+
+def test_with_actions_that_cannot_be_masked_the_key_is_observed_like_any_other() -> None:
+    config = league("ParallelMasked", "obs", continuous=True)
+    assert examine(config, episodes=1).passed
+    observation = interface(config).agents["ann"].observation
+    assert sorted(inputs(observation)) == ["observation.action_mask", "observation.obs"]
+    assert type(observation).model_validate_json(observation.model_dump_json()) == observation
+
+
+class InfoMasked(ParallelMasked):
+    """Reports its masks in infos only."""
+
+    def __init__(self) -> None:
+        super().__init__("obs")
+        self.observed = spaces.Dict({"obs": BOX, "secret": BOX})
+        self.observation_spaces = dict.fromkeys(AGENTS, self.observed)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed)[0], self.infos()
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        return *super().step(actions)[:-1], self.infos()
+
+    def infos(self) -> dict[str, Any]:
+        return {agent: {"action_mask": np.array([1, 0, 1])} for agent in AGENTS}
+
+
+def test_a_mask_in_infos_joins_observations_with_several_keys() -> None:
+    config = EnvironmentConfig(entry_point=f"{__name__}:InfoMasked")
+    assert examine(LeagueConfig(league="x", environment=config), episodes=1).passed
+    turn = stock_stepping(config, 1).start(each_agent_alone([0], 2))
+    assert list(turn.batches[0].observations) == ["observation.obs", "observation.secret", "action_mask"]
