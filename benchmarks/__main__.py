@@ -8,6 +8,7 @@ HERE = Path(__file__).parent
 ORDER = (
     "stepping",
     "equality",
+    "spaces",
     "sampling",
     "replay",
     "phases",

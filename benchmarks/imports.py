@@ -110,7 +110,8 @@ def _compare(model: ForeignModel, version: VersionRow, registry: Registry, url: 
         name: np.concatenate([batch.observations[name] for batch in played])[:observations]
         for name in played[0].observations
     }
-    with RemotePolicy(url, version.league, version.number, timeout=60) as endpoint:
+    space = row.interface.of_policy(policy).observation
+    with RemotePolicy(url, version.league, version.number, timeout=60, observation=space) as endpoint:
         answers = [_answer(part, model, graph, endpoint) for part in _parts(together)]
     expected, by_graph, by_endpoint = map(np.concatenate, zip(*answers, strict=True))
     return Compared(

@@ -1,0 +1,25 @@
+"""Generated spaces: what `check-env` accepts is trained, exported and served."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from benchmarks.spaces import Case, Pipeline, pipeline
+
+CASES, PARTS = 100, 5
+PUBLISHED = 25
+"""Every so many cases are exported and served too, which takes five times as long as the rest."""
+
+
+@pytest.fixture(scope="module")
+def line() -> Iterator[Pipeline]:
+    with pipeline() as line:
+        yield line
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_accepted_spaces_do_not_fail_later(line: Pipeline, part: int) -> None:
+    outcomes = [line.outcome(Case.of(seed), published=seed % PUBLISHED == 0) for seed in range(part, CASES, PARTS)]
+    assert [outcome for outcome in outcomes if outcome.failure] == []
+    refused = [outcome for outcome in outcomes if outcome.refusal]
+    assert 0 < len(refused) < 0.5 * len(outcomes)
