@@ -1,8 +1,23 @@
 """Layers of a policy network."""
 
+from collections.abc import Sequence
+from typing import Literal
+
 from pydantic import Field
 
 from league.config.base import Part
+
+Channels = Literal["first", "last"]
+"""The axis of the channels of images: (channels, height, width) or (height, width, channels)."""
+
+
+def channels_of(shape: Sequence[int]) -> Channels:
+    """Return the axis of the channels of images with a shape: the first one if both others are at least twice as long.
+
+    Boards have few rows and many planes, so a first axis that is only a little shorter are rows.
+    """
+    first, *others = shape
+    return "first" if 2 * first <= min(others) else "last"
 
 
 class ConvolutionConfig(Part):

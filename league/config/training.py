@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from league.config.base import Part
-from league.config.network import ConvolutionConfig
+from league.config.network import Channels, ConvolutionConfig
 from league.config.opponents import OpponentsConfig
 
 DEFAULT_STEPS = 1_000_000
@@ -57,7 +57,10 @@ class TrainingSettings(Part):
     grad_clip: float = Field(default=0.5, gt=0)
     """Maximum global norm of the gradient."""
     convolutions: tuple[ConvolutionConfig, ...] = ()
-    """Convolutions for image-like parts of the observation, (height, width, channels). Other parts are flattened."""
+    """Convolutions for image-like parts of the observation, with three axes. Other parts are flattened."""
+    channels: Channels | None = None
+    """The axis of the channels of images, (height, width, channels) or (channels, height, width). null: `first` if the
+    first axis is at most half as long as both others, else `last`."""
     hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
     """Widths of the hidden layers."""
     normalize_observations: bool = False

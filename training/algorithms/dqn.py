@@ -40,6 +40,7 @@ def module_spec(settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
     model_config = {
         "hidden": settings.hidden,
         "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
+        "channels": settings.channels,
         "normalize": settings.normalize_observations,
         "dueling": settings.dueling,
         "noisy": settings.noisy,

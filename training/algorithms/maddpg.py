@@ -69,6 +69,7 @@ def module_spec(settings: MADDPGConfig, interface: Interface) -> MultiRLModuleSp
     model_config = {
         "hidden": settings.hidden,
         "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
+        "channels": settings.channels,
         "normalize": settings.normalize_observations,
     }
     return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, Actor, model_config))

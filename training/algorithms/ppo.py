@@ -133,6 +133,7 @@ def module_spec(settings: PPOConfig, interface: Interface) -> MultiRLModuleSpec:
     model_config = {
         "hidden": settings.hidden,
         "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
+        "channels": settings.channels,
         "recurrence": settings.recurrence and settings.recurrence.width,
         "normalize": settings.normalize_observations,
     }

@@ -39,6 +39,7 @@ def module_spec(settings: QMIXConfig, interface: Interface) -> MultiRLModuleSpec
     model_config = {
         "hidden": settings.hidden,
         "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
+        "channels": settings.channels,
         "normalize": settings.normalize_observations,
         "recurrence": settings.recurrence and settings.recurrence.width,
     }

@@ -178,6 +178,7 @@ class MADDPGLearner(OffPolicyLearner):
             self.settings.hidden,
             layers,
             self.settings.normalize_observations,
+            self.settings.channels,
         )
 
 

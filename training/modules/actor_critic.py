@@ -25,7 +25,8 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
 
     Observations are dictionaries ONNX input name → tensor (B, …) in the environment's dtype; `action_mask` (B, d) of 0
     and 1 is optional. `observation_space` is the Dict of those names. model_config: `hidden`, widths of the encoder;
-    `convolutions`, (filters, kernel, stride) each; `recurrence`, width of the LSTM or None; `normalize`.
+    `convolutions`, (filters, kernel, stride) each; `channels`, their axis in images, or None; `recurrence`, width
+    of the LSTM or None; `normalize`.
 
     Inference takes one step: (B, …) and, if recurrent, the state (B, width) under Columns.STATE_IN. A recurrent
     `forward_train` takes concatenated sequences, their lengths (S,) under Columns.SEQ_LENS and initial states (S,
@@ -36,7 +37,11 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
         config = self.model_config
         self.distribution = torch_distribution(self.action_space)
         self.encoder = Encoder(
-            self.observation_space, config["hidden"], config.get("convolutions", ()), config.get("normalize", False)
+            self.observation_space,
+            config["hidden"],
+            config.get("convolutions", ()),
+            config.get("normalize", False),
+            config.get("channels"),
         )
         width = self.encoder.width
         self.recurrent = LSTMLayer(width, config["recurrence"]) if config.get("recurrence") else None

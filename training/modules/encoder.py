@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from league.config.network import Channels, channels_of
 from league.errors import ConfigError
 from league.spaces import ACTION_MASK
 
@@ -70,19 +71,25 @@ Convolutions = Sequence[tuple[int, int, int]]
 class ObservationFeatures(nn.Module):
     """Concatenates all parts of an observation except the action mask: ONNX input name → (B, …), to (B, width) float32.
 
-    A Box of shape (height, width, channels) passes through the convolutions, each followed by ReLU; others are
-    flattened. normalize: scale boxes of floats by running statistics instead of their bounds. Raises ConfigError if the
-    convolutions do not fit.
+    A Box with three axes is an image. It passes through the convolutions, each followed by ReLU; others are flattened.
+    channels: the axis of its channels; None: see `channels_of`. normalize: scale boxes of floats by running statistics
+    instead of their bounds. Raises ConfigError if the convolutions do not fit.
     """
 
-    def __init__(self, space: gymnasium.spaces.Dict, convolutions: Convolutions = (), normalize: bool = False) -> None:
+    def __init__(
+        self,
+        space: gymnasium.spaces.Dict,
+        convolutions: Convolutions = (),
+        normalize: bool = False,
+        channels: Channels | None = None,
+    ) -> None:
         super().__init__()
         spaces = {name: part for name, part in sorted(space.spaces.items()) if name != ACTION_MASK}
         self.names = tuple(spaces)
         # A list, since names may contain dots, which torch's ModuleDict rejects.
-        self.parts = nn.ModuleList(_feature(part, convolutions, normalize) for part in spaces.values())
+        self.parts = nn.ModuleList(_feature(part, convolutions, normalize, channels) for part in spaces.values())
         if convolutions and not any(isinstance(part, ImageEncoder) for part in self.parts):
-            raise ConfigError("training.convolutions: no part of the observation is a Box of (height, width, channels)")
+            raise ConfigError("training.convolutions: no part of the observation is a Box with three axes")
         with torch.no_grad():
             example = {name: torch.as_tensor(np.zeros((1, *part.shape), part.dtype)) for name, part in spaces.items()}
             self.width = self(example).shape[-1]
@@ -149,12 +156,14 @@ class Flat(nn.Flatten):
 
 
 class ImageEncoder(nn.Module):
-    """Images (B, height, width, channels) → convolutions → (B, width)."""
+    """Images (B, height, width, channels) or (B, channels, height, width) → convolutions → (B, width)."""
 
-    def __init__(self, numbers: nn.Module, shape: tuple[int, ...], convolutions: Convolutions) -> None:
+    def __init__(
+        self, numbers: nn.Module, shape: tuple[int, ...], convolutions: Convolutions, channels_axis: Channels
+    ) -> None:
         super().__init__()
-        self.numbers = numbers
-        height, width, channels = shape
+        self.numbers, self._is_first = numbers, channels_axis == "first"
+        height, width, channels = (*shape[1:], shape[0]) if self._is_first else shape
         layers: list[nn.Module] = []
         for filters, kernel, stride in convolutions:
             if min(height, width) < kernel:
@@ -162,17 +171,21 @@ class ImageEncoder(nn.Module):
             layer = nn.Conv2d(channels, filters, kernel, stride)
             nn.init.orthogonal_(layer.weight, 2**0.5)
             nn.init.zeros_(layer.get_parameter("bias"))
-            # Observations have their channels last; this layout avoids moving them in memory.
-            layer.weight.data = layer.weight.data.to(memory_format=torch.channels_last)
+            if not self._is_first:
+                # This layout avoids moving the observations in memory.
+                layer.weight.data = layer.weight.data.to(memory_format=torch.channels_last)
             layers += [layer, nn.ReLU()]
             height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, filters
         self.convolutions = nn.Sequential(*layers, nn.Flatten())
 
     def forward(self, values: Tensor) -> Tensor:
-        return self.convolutions(self.numbers(values).permute(0, 3, 1, 2))
+        numbers = self.numbers(values)
+        return self.convolutions(numbers if self._is_first else numbers.permute(0, 3, 1, 2))
 
 
-def _feature(space: gymnasium.Space, convolutions: Convolutions, normalize: bool) -> nn.Module:
+def _feature(
+    space: gymnasium.Space, convolutions: Convolutions, normalize: bool, channels: Channels | None
+) -> nn.Module:
     match space:
         case gymnasium.spaces.Discrete():
             return OneHot([int(space.start)], [int(space.n)])
@@ -183,7 +196,7 @@ def _feature(space: gymnasium.Space, convolutions: Convolutions, normalize: bool
         case gymnasium.spaces.Box():
             numbers = _box_feature(space, normalize)
             if convolutions and len(space.shape) == 3:
-                return ImageEncoder(numbers, space.shape, convolutions)
+                return ImageEncoder(numbers, space.shape, convolutions, channels or channels_of(space.shape))
             return nn.Sequential(numbers, Flat())
     raise ConfigError(f"training: unsupported observation space {space}")
 
@@ -213,9 +226,10 @@ class Encoder(nn.Module):
         hidden: Sequence[int],
         convolutions: Convolutions = (),
         normalize: bool = False,
+        channels: Channels | None = None,
     ) -> None:
         super().__init__()
-        self.features = ObservationFeatures(space, convolutions, normalize)
+        self.features = ObservationFeatures(space, convolutions, normalize, channels)
         layers: list[nn.Module] = []
         self.width = self.features.width
         for width in hidden:

@@ -18,6 +18,7 @@ import torch
 from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
+from league.config.network import Channels
 from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchGaussian, torch_distribution
 from training.modules.encoder import Convolutions, Encoder, ObservationFeatures, linear
@@ -131,7 +132,7 @@ class Actor(PolicyModule):
     the graph, so that a version explores as it did when it was created.
     Choices: masked logits. Sampling from them equals a straight-through Gumbel-softmax at any temperature.
 
-    model_config: `hidden`, `convolutions`, `normalize` of the encoder.
+    model_config: `hidden`, `convolutions`, `channels`, `normalize` of the encoder.
     """
 
     deviation: Tensor
@@ -142,7 +143,11 @@ class Actor(PolicyModule):
         self.distribution = torch_distribution(self.action_space)
         self.relaxed = critic_actions(self.action_space)
         self.encoder = Encoder(
-            self.observation_space, config["hidden"], config.get("convolutions", ()), config.get("normalize", False)
+            self.observation_space,
+            config["hidden"],
+            config.get("convolutions", ()),
+            config.get("normalize", False),
+            config.get("channels"),
         )
         # Initial actions are in the middle of the bounds, where tanh is steepest, or nearly uniform.
         self.head = linear(self.encoder.width, self.distribution.outputs, gain=0.01)
@@ -200,6 +205,7 @@ class Critic(nn.Module):
         hidden: Sequence[int],
         convolutions: Convolutions = (),
         normalize: bool = False,
+        channels: Channels | None = None,
     ) -> None:
         """Args:
         observations: The spaces of the k agents' observations, Dicts ONNX input name → part.
@@ -207,9 +213,10 @@ class Critic(nn.Module):
         hidden: Widths of the layers, each followed by ReLU.
         convolutions: See ObservationFeatures.
         normalize: See ObservationFeatures.
+        channels: See ObservationFeatures.
         """
         super().__init__()
-        observed = [ObservationFeatures(space, convolutions, normalize) for space in observations]
+        observed = [ObservationFeatures(space, convolutions, normalize, channels) for space in observations]
         self.observed = nn.ModuleList(observed)
         layers: list[nn.Module] = []
         width = sum(part.width for part in observed) + sum(critic_actions(space).width for space in actions)

@@ -46,7 +46,8 @@ def _scaled_noise(noise: Tensor) -> Tensor:
 class QNetwork(PolicyModule):
     """Encoder, optional GRU and heads.
 
-    model_config: `hidden`, `convolutions`, `normalize` of the encoder; `recurrence`, width of the GRU or None;
+    model_config: `hidden`, `convolutions`, `channels`, `normalize` of the encoder; `recurrence`, width of the GRU, or
+    None;
     `dueling`, `noisy`; `atoms`, (number, low, high) of C51's returns, or None.
 
     ACTION_DIST_INPUTS are values, MASKED_LOGIT for illegal actions: their mode is the greedy legal action. With
@@ -58,7 +59,11 @@ class QNetwork(PolicyModule):
         self.actions = int(self.action_space.n)
         self.distribution = TorchCategorical(self.actions)
         self.encoder = Encoder(
-            self.observation_space, config["hidden"], config.get("convolutions", ()), config.get("normalize", False)
+            self.observation_space,
+            config["hidden"],
+            config.get("convolutions", ()),
+            config.get("normalize", False),
+            config.get("channels"),
         )
         self.noisy, self.dueling = bool(config.get("noisy")), bool(config.get("dueling"))
         atoms = config.get("atoms")

@@ -24,7 +24,8 @@ Observations = dict[str, Tensor]
 class AgentNetwork(PolicyModule):
     """Encoder, optional GRU and head: values of one agent's actions given its own observations and actions.
 
-    model_config: `hidden`, `convolutions`, `normalize` of the encoder; `recurrence`, width of the GRU or None.
+    model_config: `hidden`, `convolutions`, `channels`, `normalize` of the encoder; `recurrence`, width of the GRU, or
+    None.
 
     ACTION_DIST_INPUTS are values, MASKED_LOGIT for illegal actions; with exploration, the log-probabilities of ε-greedy
     actions. The GRU's input is the encoded observation and the one-hot previous action, as in the appendix of the QMIX
@@ -36,7 +37,11 @@ class AgentNetwork(PolicyModule):
         self.actions = int(self.action_space.n)
         self.distribution = TorchCategorical(self.actions)
         self.encoder = Encoder(
-            self.observation_space, config["hidden"], config.get("convolutions", ()), config.get("normalize", False)
+            self.observation_space,
+            config["hidden"],
+            config.get("convolutions", ()),
+            config.get("normalize", False),
+            config.get("channels"),
         )
         width = self.encoder.width
         recurrence = config.get("recurrence")

@@ -11,7 +11,7 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 
 NETWORK_SETTINGS = (
-    *("algorithm", "convolutions", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
+    *("algorithm", "convolutions", "channels", "hidden", "recurrence", "normalize_observations", "shared_encoder"),
     *("dueling", "noisy", "distributional"),
     *("mixer", "mixing_width", "groups", "critic"),
 )

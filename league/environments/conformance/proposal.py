@@ -17,6 +17,7 @@ import yaml
 from league.conditions import action_selection, describe_selection
 from league.config.base import JSON
 from league.config.league import LeagueConfig
+from league.config.network import channels_of
 from league.environments.conformance.examination import examine
 from league.environments.conformance.findings import Examination
 from league.errors import ConfigError
@@ -189,7 +190,12 @@ def _training(found: Examination, interface: Interface, is_team: bool) -> Iterat
         yield _Line("  entropy: 0.05", "exploration; less makes the policy decide sooner")
     leaves = [leaf for spaces in interface.agents.values() for leaf in _observed(spaces.observation)]
     if convolutions := _convolutions(leaves):
-        yield _Line(f"  convolutions: {_inline(convolutions)}", "for observations (height, width, channels)")
+        axes = {channels_of(shape) for shape in _images(leaves)}
+        yield _Line(f"  convolutions: {_inline(convolutions)}", "for images in the observations")
+        if len(axes) == 1:
+            channels = axes.pop()
+            order = "(channels, height, width)" if channels == "first" else "(height, width, channels)"
+            yield _Line(f"  channels: {channels}", f"the images are {order}")
     yield _Line("  hidden: [256, 256]", "widths of the hidden layers")
     if any(map(_is_wide, leaves)):
         yield _Line("  normalize_observations: true", "the bounds of observations are wide or infinite")
@@ -243,9 +249,14 @@ def _observed(space: Any) -> list[Leaf]:
     return [leaf for name, leaf in inputs(space).items() if name != ACTION_MASK]
 
 
+def _images(leaves: list[Leaf]) -> list[tuple[int, ...]]:
+    """The shapes of the image-like parts of the observations."""
+    return [leaf.shape for leaf in leaves if isinstance(leaf, Box) and len(leaf.shape) == 3]
+
+
 def _convolutions(leaves: list[Leaf]) -> list[dict[str, int]]:
     """Convolutions that fit the smallest image-like part of the observations; empty without one."""
-    sizes = [min(leaf.shape[:2]) for leaf in leaves if isinstance(leaf, Box) and len(leaf.shape) == 3]
+    sizes = [min(shape[1:] if channels_of(shape) == "first" else shape[:2]) for shape in _images(leaves)]
     if not sizes or min(sizes) < SMALL_BOARD:
         return []
     return IMAGE_CONVOLUTIONS if min(sizes) >= IMAGE else BOARD_CONVOLUTIONS

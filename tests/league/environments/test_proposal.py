@@ -55,6 +55,14 @@ def test_the_network_fits_the_observations() -> None:
     assert len(training(examined(), spaces(shape=(84, 84, 3)), spaces(shape=(8, 8, 3)))["convolutions"]) == 1
 
 
+def test_images_with_their_channels_first_get_convolutions_over_the_other_axes() -> None:
+    settings = training(examined(), spaces(shape=(4, 84, 84), low=0, high=255))
+    assert (settings["channels"], len(settings["convolutions"])) == ("first", 3)
+    assert training(examined(), spaces(shape=(84, 84, 4), low=0, high=255))["channels"] == "last"
+    mixed = training(examined(), spaces(shape=(84, 84, 3)), spaces(shape=(3, 84, 84)))
+    assert ("channels" in mixed, len(mixed["convolutions"])) == (False, 3)
+
+
 @pytest.mark.parametrize(
     ("low", "high", "expected"),
     [(-1, 1, None), (None, None, True), (0, 1000, True), (0, None, True), ([0, 0, 0, None], 1, True)],

@@ -3,6 +3,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
+from league.config.network import Channels, channels_of
 from league.errors import ConfigError
 from training.modules.encoder import ObservationFeatures
 
@@ -76,6 +77,35 @@ def test_strides_reduce_the_width() -> None:
     assert features.width == 32 * 9 * 9
     image = torch.randint(0, 256, (2, 84, 84, 4), dtype=torch.uint8)
     assert features({"observation": image}).shape == (2, features.width)
+
+
+@pytest.mark.parametrize("channels", [None, "first"])
+def test_channels_first_and_last_give_the_same_features(channels: Channels | None) -> None:
+    layers = [(16, 8, 4), (32, 4, 2)]
+    last = ObservationFeatures(spaces.Dict(observation=spaces.Box(0, 255, (84, 60, 4), np.uint8)), layers)
+    space = spaces.Dict(observation=spaces.Box(0, 255, (4, 84, 60), np.uint8))
+    first = ObservationFeatures(space, layers, channels=channels)
+    first.load_state_dict(last.state_dict())
+    image = torch.randint(0, 256, (2, 84, 60, 4), dtype=torch.uint8)
+    features = first({"observation": image.permute(0, 3, 1, 2)})
+    assert torch.allclose(features, last({"observation": image}), atol=1e-5)
+
+
+def test_the_setting_decides_where_the_shape_misleads() -> None:
+    space = spaces.Dict(observation=spaces.Box(0, 1, (2, 6, 7), np.float32))
+    assert ObservationFeatures(space, [(5, 2, 1)]).width == 5 * 5 * 6
+    assert ObservationFeatures(space, [(5, 2, 1)], channels="last").width == 5 * 1 * 5
+
+
+@pytest.mark.parametrize(
+    ("shape", "channels"),
+    [
+        *(((3, 84, 84), "first"), ((1, 28, 28), "first"), ((2, 6, 7), "first"), ((17, 40, 40), "first")),
+        *(((84, 84, 3), "last"), ((6, 7, 2), "last"), ((8, 8, 111), "last"), ((3, 3, 2), "last"), ((6, 7, 20), "last")),
+    ],
+)
+def test_the_axis_of_channels_is_seen_in_the_shape(shape: tuple[int, ...], channels: Channels) -> None:
+    assert channels_of(shape) == channels
 
 
 @pytest.mark.parametrize(
