@@ -14,6 +14,7 @@ import orjson
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
+from starlette.routing import Match
 
 from league.errors import (
     ArtifactCorrupt,
@@ -42,7 +43,7 @@ class MalformedBody(InvalidInput, code="malformed_body"):
 
 
 class UnsupportedMediaType(InvalidInput, code="unsupported_media_type"):
-    """The Content-Type of the body is not JSON."""
+    """The Content-Type of the body is not JSON, or its Content-Encoding is not supported."""
 
 
 class CrossSiteRequest(Forbidden, code="cross_site"):
@@ -125,13 +126,18 @@ class ErrorHandlers:
     async def http_error(self, request: Request, error: Exception) -> Response:
         """Handle an error of Starlette's router."""
         assert isinstance(error, HTTPException)
-        message = {
-            404: f"no route matches {request.url.path[:200]}",
-            405: f"method {request.method} is not allowed for {request.url.path[:200]}",
-        }.get(error.status_code, error.detail)
+        path, headers = request.url.path[:200], error.headers
+        message = f"no route matches {path}" if error.status_code == 404 else error.detail
+        if error.status_code == 405:
+            methods = _methods(request)
+            expected = " or ".join(method for method in methods if method != "HEAD")
+            message, headers = (
+                f"{request.method} is not allowed for {path}: use {expected}",
+                {"allow": ", ".join(methods)},
+            )
         code = CODES.get(error.status_code, "http_error")
         self._count(request.scope["path"], code)
-        return error_response(request.scope["path"], error.status_code, code, message, error.headers)
+        return error_response(request.scope["path"], error.status_code, code, message, headers)
 
     async def internal_error(self, request: Request, error: Exception) -> Response:
         """Handle a bug. The traceback goes to the log, not to the client."""
@@ -139,6 +145,12 @@ class ErrorHandlers:
         self._count(request.scope["path"], "internal_error")
         message, headers = "internal server error; see the server log", {"x-content-type-options": "nosniff"}
         return error_response(request.scope["path"], 500, "internal_error", message, headers)
+
+
+def _methods(request: Request) -> list[str]:
+    """The methods of all routes that match the path of a request, of which the router names those of the first."""
+    routes = (route for route in request.app.routes if route.matches(request.scope)[0] is Match.PARTIAL)
+    return sorted({method for route in routes for method in route.methods})
 
 
 def error_response(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:

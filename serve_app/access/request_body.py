@@ -1,5 +1,10 @@
-"""Reads request bodies without buffering more than the limit."""
+"""Reads request bodies, compressed or not, without buffering more than the limit.
 
+The limit applies to the bytes that arrive, and to those that they decompress to; decompression stops there.
+"""
+
+import asyncio
+import zlib
 from typing import Any
 
 import orjson
@@ -11,6 +16,8 @@ from serve_app.codecs.observation_codec import json_type
 
 JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")
 """Media types accepted as JSON. The last is curl's default."""
+WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
+"""Content-Encoding → zlib's `wbits`, which select the format."""
 MAX_CHANGE_BODY = 64 * 1024
 """Limit of bodies that are not inference requests: they hold names, numbers and a reason."""
 BODY_READ = "league.body_is_read"
@@ -26,13 +33,17 @@ async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
 
 
 async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
-    """Read a body of at most `limit` bytes.
+    """Read a body of at most `limit` bytes, and decode its Content-Encoding.
 
-    Raises BodyTooLarge as early as possible, and MalformedBody if the connection closes before the body is complete.
+    Raises BodyTooLarge as early as possible, MalformedBody if the connection closes before the body is complete or the
+    body cannot be decompressed, and UnsupportedMediaType.
     """
+    encoding = b""
     for name, value in scope["headers"]:
         if name == b"content-length" and int(value) > limit:
             raise _too_large(limit)
+        if name == b"content-encoding":
+            encoding = _known_encoding(value)
     message = await receive()
     if message["type"] == "http.disconnect":
         raise _incomplete()
@@ -42,7 +53,12 @@ async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
     if len(body) > limit:
         raise _too_large(limit)
     scope[BODY_READ] = True
-    return body
+    return await decompressed(body, encoding, limit) if encoding else body
+
+
+async def decompressed(body: bytes, encoding: bytes, limit: int) -> bytes:
+    """Decompress a body, with a key of WINDOW_BITS. Raises MalformedBody or BodyTooLarge."""
+    return await asyncio.to_thread(_inflate, body, WINDOW_BITS[encoding], limit)
 
 
 def parse_json_object(body: bytes) -> dict[str, Any]:
@@ -67,6 +83,30 @@ async def _read_rest(body: bytes, receive: Receive, limit: int) -> bytes:
         size += len(parts[-1])
         more = message.get("more_body", False)
     return b"".join(parts)
+
+
+def _known_encoding(value: bytes) -> bytes:
+    """The Content-Encoding, empty if the body is not compressed. Raises UnsupportedMediaType."""
+    encoding = value.strip().lower()
+    if encoding in (b"", b"identity"):
+        return b""
+    if encoding not in WINDOW_BITS:
+        given = encoding.decode("latin-1")[:64]
+        raise UnsupportedMediaType(f"the Content-Encoding is {given!r}, expected gzip, deflate or identity")
+    return encoding
+
+
+def _inflate(body: bytes, window_bits: int, limit: int) -> bytes:
+    inflater = zlib.decompressobj(window_bits)
+    try:
+        inflated = inflater.decompress(body, limit + 1)
+    except zlib.error as error:
+        raise MalformedBody(f"the body cannot be decompressed: {error}") from None
+    if len(inflated) > limit:
+        raise BodyTooLarge(f"the decompressed body is larger than {limit} bytes")
+    if not inflater.eof or inflater.unused_data:
+        raise MalformedBody("the compressed body is truncated or followed by other data")
+    return inflated
 
 
 def _check_type(value: bytes) -> None:

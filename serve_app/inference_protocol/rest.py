@@ -24,7 +24,7 @@ from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
-from serve_app.inference_protocol.rest_codec import compressed, decompressed, read_request, write_response
+from serve_app.inference_protocol.rest_codec import compressed, read_request, write_response
 from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.settings import ServeSettings
 
@@ -104,8 +104,8 @@ class RestRoutes:
     async def _index(self, request: Request) -> Response:
         body = await read_bytes(request.scope, request.receive, MAX_CHANGE_BODY)
         options = parse_json_object(body) if body else {}
-        only_ready = options.pop("ready", False)
-        if options or type(only_ready) is not bool:
+        only_ready = False if (ready := options.pop("ready", None)) is None else ready
+        if any(value is not None for value in options.values()) or type(only_ready) is not bool:
             raise InvalidInput('the body must be {"ready": true}, {"ready": false} or empty')
         return _json(await self._catalogue.index(only_ready))
 
@@ -125,11 +125,9 @@ class InferRoute:
             await self._handle(scope, receive, send)
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        header_length, encoding, accepted = _headers(scope)
-        limit, turn = self._settings.max_body, self._access.backlog.turn
-        body = await read_bytes(scope, receive, limit)
-        if encoding:
-            body = await decompressed(body, encoding, limit)
+        header_length, accepted = _headers(scope)
+        turn = self._access.backlog.turn
+        body = await read_bytes(scope, receive, self._settings.max_body)
         if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
             self._access.admit_body(scope.get(KEY), len(body))
         model, version = scope["path_params"]["model"], scope["path_params"].get("version", "")
@@ -159,19 +157,17 @@ class InferRoute:
         await send({"type": "http.response.body", "body": response})
 
 
-def _headers(scope: Scope) -> tuple[int | None, bytes, bytes]:
-    """Inference-Header-Content-Length, Content-Encoding and Accept-Encoding. Raises InvalidInput."""
-    header_length, encoding, accepted = None, b"", b""
+def _headers(scope: Scope) -> tuple[int | None, bytes]:
+    """Inference-Header-Content-Length and Accept-Encoding. Raises InvalidInput."""
+    header_length, accepted = None, b""
     for name, value in scope["headers"]:
         if name == HEADER_LENGTH:
             if not value.isdigit() or len(value) > LENGTH_DIGITS:
                 raise InvalidInput("Inference-Header-Content-Length must be a number of bytes")
             header_length = int(value)
-        elif name == b"content-encoding":
-            encoding = value
         elif name == b"accept-encoding":
             accepted = value
-    return header_length, encoding, accepted
+    return header_length, accepted
 
 
 def _named(request: Request) -> tuple[str, str]:

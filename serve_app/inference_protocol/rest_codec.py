@@ -3,7 +3,7 @@
     Inference-Header-Content-Length: length of the JSON         (absent without binary tensors)
     {"inputs": [{…, "parameters": {"binary_data_size": size}}, {…, "data": [ … ]}], "outputs": […]}  bytes  bytes …
 
-The size limit applies to the decompressed body; decompression stops there. Classification and shared memory are not
+An optional field may be null, as serialisers of Java and C# write it. Classification and shared memory are not
 supported.
 """
 
@@ -14,30 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import orjson
 
-from league.errors import BodyTooLarge, InvalidInput
-from serve_app.access.errors import MalformedBody, UnsupportedMediaType
-from serve_app.access.request_body import parse_json_object
+from league.errors import InvalidInput
+from serve_app.access.errors import MalformedBody
+from serve_app.access.request_body import WINDOW_BITS, parse_json_object
 from serve_app.codecs.observation_codec import json_type
 from serve_app.inference_protocol.inference import InferRequest, InferResponse
 from serve_app.inference_protocol.tensors import RequestTensor, datatype_of, to_bytes
 
-WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
-"""zlib's `wbits`, which select the format."""
 LEVEL = 1
 """The fastest level."""
 MIN_COMPRESSED_BYTES = 1024
 """Smaller responses are not compressed."""
-
-
-async def decompressed(body: bytes, encoding: bytes, limit: int) -> bytes:
-    """Decode a body's Content-Encoding. Raises UnsupportedMediaType, MalformedBody or BodyTooLarge."""
-    encoding = encoding.strip().lower()
-    if encoding in (b"", b"identity"):
-        return body
-    if encoding not in WINDOW_BITS:
-        given = encoding.decode("latin-1")[:64]
-        raise UnsupportedMediaType(f"the Content-Encoding is {given!r}, expected gzip, deflate or identity")
-    return await asyncio.to_thread(_inflate, body, WINDOW_BITS[encoding], limit)
 
 
 async def compressed(body: bytes, accepted: bytes) -> tuple[bytes, bytes | None]:
@@ -55,19 +42,6 @@ def _choose_encoding(accepted: bytes) -> bytes | None:
         if name.strip() in (b"gzip", b"deflate") and quality.replace(b" ", b"").strip(b"0.") != b"q=":
             return name.strip()
     return None
-
-
-def _inflate(body: bytes, window_bits: int, limit: int) -> bytes:
-    inflater = zlib.decompressobj(window_bits)
-    try:
-        inflated = inflater.decompress(body, limit + 1)
-    except zlib.error as error:
-        raise MalformedBody(f"the body cannot be decompressed: {error}") from None
-    if len(inflated) > limit:
-        raise BodyTooLarge(f"the decompressed body is larger than {limit} bytes")
-    if not inflater.eof or inflater.unused_data:
-        raise MalformedBody("the compressed body is truncated or followed by other data")
-    return inflated
 
 
 def _deflate(body: bytes, window_bits: int) -> bytes:
@@ -103,18 +77,18 @@ def read_request(model: str, version: str, body: bytes, header_length: int | Non
         name = _string(output, "name", "an output")
         names.append(name)
         own = _parameters(output, "an output")
-        if "binary_data" in own:
+        if own.get("binary_data") is not None:
             binary[name] = _flag(own, "binary_data")
     request = InferRequest(
         model=model,
         version=version,
-        id=_string(document, "id", "the request") if "id" in document else "",
+        id="" if document.get("id") is None else _string(document, "id", "the request"),
         inputs=_tensors(_list(document, "inputs", required=True), rest),
         outputs=names,
         size=len(body),
         is_sequence=bool(parameters.get(SEQUENCE)),
     )
-    is_binary = "binary_data_output" in parameters and _flag(parameters, "binary_data_output")
+    is_binary = parameters.get("binary_data_output") is not None and _flag(parameters, "binary_data_output")
     return RestRequest(request, is_binary, binary)
 
 
@@ -194,6 +168,6 @@ def _parameters(document: dict[str, Any], of: str) -> dict[str, Any]:
     if type(parameters) is not dict:
         raise InvalidInput(f"the parameters of {of} are {json_type(parameters)}, expected an object")
     for name in UNSUPPORTED:
-        if name in parameters:
+        if parameters.get(name) is not None:
             raise InvalidInput(f"{of} requests {name}, which this server does not support")
     return parameters

@@ -1,7 +1,9 @@
 """The action route: responses and errors."""
 
 import asyncio
+import gzip
 import json
+import zlib
 from collections.abc import AsyncIterator
 from typing import Any
 from urllib.parse import quote
@@ -20,8 +22,10 @@ from serve_app.app import Replica
 from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards, rejected
 from tests.support.leagues.served_leagues import promote
 from tests.support.policies.graphs import masked_mlp
-from tests.support.servers.replicas import LOCALHOST, QUICK
+from tests.support.servers.replicas import LOCALHOST, QUICK, READ_ONLY
 from tests.support.waiting import until
+
+ACTION = "/v1/policies/board/action"
 
 
 def test_one_observation_gets_the_action_of_the_champion(read_only_client: TestClient, storage: Storage) -> None:
@@ -52,6 +56,45 @@ def test_a_version_can_be_selected_by_number(read_only_client: TestClient, versi
     arrays = {name: np.array([board[name] for board in batch], np.int8) for name in BOARD}
     reply = act(read_only_client, version=version, observations=batch)
     assert (reply["version"], reply["actions"]) == (version, policy.act(arrays).actions.tolist())
+
+
+@pytest.mark.parametrize(("encoding", "compress"), [("gzip", gzip.compress), ("deflate", zlib.compress)])
+def test_a_compressed_body_is_accepted(read_only_client: TestClient, encoding: str, compress: Any) -> None:
+    body = json.dumps({"observation": BOARD}).encode()
+    reply = read_only_client.post(ACTION, content=compress(body), headers={"content-encoding": encoding})
+    assert reply.json() == act(read_only_client, observation=BOARD)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "body", "status", "message"),
+    [
+        ("br", b"{}", 415, "the Content-Encoding is 'br', expected gzip, deflate or identity"),
+        ("gzip", b"{}", 400, "the body cannot be decompressed"),
+        ("gzip", gzip.compress(bytes(READ_ONLY.max_body + 1)), 413, "the decompressed body is larger than 65536 bytes"),
+    ],
+)
+def test_a_body_that_cannot_be_decompressed_is_rejected(
+    read_only_client: TestClient, encoding: str, body: bytes, status: int, message: str
+) -> None:
+    reply = read_only_client.post(ACTION, content=body, headers={"content-encoding": encoding})
+    assert (reply.status_code, message in reply.json()["message"]) == (status, True), reply.text
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "allowed", "expected"),
+    [
+        ("GET", ACTION, "POST", "POST"),
+        ("DELETE", "/v1/leagues/board/traffic", "GET, HEAD, POST", "GET or POST"),
+    ],
+)
+def test_another_method_is_refused_with_those_that_are_allowed(
+    client: TestClient, registry: Registry, method: str, path: str, allowed: str, expected: str
+) -> None:
+    client.headers["x-api-key"] = registry.keys.create("all", ["act", "read", "promote"])[1]
+    until(lambda: client.request(method, path).status_code != 401)
+    reply = client.request(method, path)
+    assert (reply.status_code, reply.headers["allow"]) == (405, allowed)
+    assert reply.json()["message"] == f"{method} is not allowed for {path}: use {expected}"
 
 
 def test_an_alias_selects_a_version(client: TestClient, registry: Registry) -> None:

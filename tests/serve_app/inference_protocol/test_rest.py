@@ -316,6 +316,22 @@ def test_the_index_can_be_limited_to_loaded_models(client: TestClient) -> None:
     error_of(client.post("/v2/repository/index", content=b"["))
 
 
+def test_an_optional_field_may_be_null(client: TestClient) -> None:
+    """Serialisers of Java and C# write fields without a value."""
+    unset = {"sequence_id": None, "binary_data_output": None, "classification": None}
+    tensor = VECTOR | {"parameters": {"binary_data_size": None, "shared_memory_region": None}}
+    output = {"name": "action", "datatype": None, "shape": None, "data": None, "parameters": {"binary_data": None}}
+    expected = infer(client, {"inputs": [VECTOR]}).json()
+    for body in (
+        {"id": None, "parameters": None, "outputs": None, "inputs": [VECTOR | {"parameters": None}]},
+        {"id": None, "parameters": unset, "outputs": [output, {"name": "action_dist_inputs"}], "inputs": [tensor]},
+    ):
+        reply = infer(client, body)
+        assert (reply.status_code, reply.json()) == (200, expected)
+    assert client.post("/v2/repository/index", json={"ready": None, "name": None}).status_code == 200
+    assert "the id of the request is a number" in error_of(infer(client, {"id": 1, "inputs": [VECTOR]}))
+
+
 @pytest.mark.parametrize(
     ("encoding", "compress"),
     [("gzip", gzip.compress), ("x-gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)],

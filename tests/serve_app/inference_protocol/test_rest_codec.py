@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from league.errors import BodyTooLarge
 from serve_app.access.errors import MalformedBody
-from serve_app.inference_protocol.rest_codec import MIN_COMPRESSED_BYTES, compressed, decompressed
+from serve_app.access.request_body import decompressed
+from serve_app.inference_protocol.rest_codec import MIN_COMPRESSED_BYTES, compressed
 
 
 @settings(deadline=None)
