@@ -10,6 +10,8 @@ from pathlib import Path
 
 from league.errors import ArtifactCorrupt, StorageError
 
+FULL = 2**20
+"""Free bytes below which a disk is considered full."""
 DISK_FULL_OR_READ_ONLY = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
@@ -25,6 +27,13 @@ def disk_errors(path: Path, only: tuple[int, ...] | None = None, action: str = "
         if only is not None and error.errno not in only:
             raise
         raise StorageError(f"{error.filename or path} cannot be {action}: {error.strerror or error}") from error
+
+
+def full_disk(path: Path) -> str | None:
+    """Return that the disk of a file is full, or None if it is not."""
+    directory = next((parent for parent in path.absolute().parents if parent.is_dir()), Path("/"))
+    free = shutil.disk_usage(directory).free
+    return f"the disk of {directory} is full: {free:,} bytes are free" if free < FULL else None
 
 
 @contextmanager

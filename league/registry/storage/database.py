@@ -45,7 +45,7 @@ from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from league.errors import ConfigError, DeadlineExceeded, InvalidInput, StorageError, one_line
-from league.files import disk_errors
+from league.files import disk_errors, full_disk
 from league.registry.storage.listener import Listener
 from league.registry.storage.migrations import HEAD, KNOWN
 from league.registry.storage.tables import Base
@@ -354,6 +354,9 @@ def translate_errors(engine: Engine) -> Iterator[None]:
             raise
         where = engine.url.render_as_string(hide_password=True)
         reason = one_line(error.orig or error)
+        if getattr(error.orig, "sqlite_errorname", "").startswith(("SQLITE_FULL", "SQLITE_IOERR")):
+            # SQLite also reports the failure to extend a file as `disk I/O error`.
+            reason = full_disk(Path(engine.url.database or "")) or reason
         kind = Deadlock if getattr(error.orig, "sqlstate", None) in DEADLOCKS else StorageError
         raise kind(f"the database {where} cannot be used: {reason}") from error
 

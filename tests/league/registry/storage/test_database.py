@@ -14,6 +14,7 @@ from league.registry.storage.database import Database
 from league.settings import Storage
 from tests.support.leagues.registries import registered
 from tests.support.servers import postgresql
+from tests.support.small_disk import fill, small_disk
 
 
 def slugs(registry: Registry) -> list[str]:
@@ -105,3 +106,20 @@ def test_a_transaction_does_not_wait_long_for_a_lock(server: str) -> None:
         with pytest.raises(StorageError, match="lock timeout"), database.write() as second:
             second.execute(lock)
     database.close()
+
+
+def test_a_full_disk_is_called_so(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk") as disk:
+        storage = Storage(disk, f"sqlite:///{disk}/league.db", disk / "artifacts")
+        registry = Registry.open(storage)
+        registry.keys.create("first", ["act"])
+        fill(disk)
+        with pytest.raises(StorageError, match="the disk of .*/disk is full: 0 bytes are free"):
+            for number in range(100):
+                registry.keys.create(f"key-{number}", ["act"])
+        registry.close()
+        for path in disk.glob("league.db-*"):
+            path.unlink()
+        fill(disk)
+        with pytest.raises(StorageError, match="the disk of .*/disk is full"):
+            Registry.open(storage)
