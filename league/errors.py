@@ -198,6 +198,10 @@ class BoundExceeded(LeagueError, code="bound_exceeded"):
     """The returns in a block differ by more than `gate.return_bound`."""
 
 
+class OutOfSpace(LeagueError, code="out_of_space"):
+    """The recorded games of a schedule have reached their limit, or their disk is nearly full."""
+
+
 class GameCrashed(LeagueError, code="game_crashed"):
     """The environment of a game raised an exception in a reset or after a legal action."""
 

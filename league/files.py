@@ -31,9 +31,13 @@ def disk_errors(path: Path, only: tuple[int, ...] | None = None, action: str = "
 
 def full_disk(path: Path) -> str | None:
     """Return that the disk of a file is full, or None if it is not."""
-    directory = next((parent for parent in path.absolute().parents if parent.is_dir()), Path("/"))
-    free = shutil.disk_usage(directory).free
-    return f"the disk of {directory} is full: {free:,} bytes are free" if free < FULL else None
+    free = free_space(path)
+    return f"the disk of {path.parent} is full: {free:,} bytes are free" if free < FULL else None
+
+
+def free_space(path: Path) -> int:
+    """Return the free bytes of the disk of a file, which need not exist."""
+    return shutil.disk_usage(next(parent for parent in path.absolute().parents if parent.is_dir())).free
 
 
 @contextmanager

@@ -4,13 +4,15 @@ from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, TypeVarTuple
 
 from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
 from league.conditions import Conditions
-from league.errors import InvalidInput, NotFound, UnknownMatch
+from league.errors import InvalidInput, NotFound, OutOfSpace, UnknownMatch
+from league.files import free_space
 from league.registry import leagues
 from league.registry.registry import Registry
 from league.registry.storage import tables
@@ -30,6 +32,10 @@ from league.results.records import (
 from league.results.scoring import admit
 
 Columns = TypeVarTuple("Columns")
+RESERVE = 256 * 2**20
+"""Bytes of the disk with an SQLite database that games must leave free, for promotions and acknowledgements."""
+MOST_BYTES = 4 * 2**30
+"""Size of the recorded games of a schedule."""
 STRIDE = 1000
 """Matches per query when iterating over a schedule."""
 
@@ -39,6 +45,8 @@ class Ledger:
 
     def __init__(self, registry: Registry) -> None:
         self._database = registry.database
+        self._sizes: dict[str, int] = {}
+        """Schedule → size of its recorded games in bytes, if this object has added some."""
 
     def open(self, schedule: Schedule) -> Schedule:
         """Store a schedule unless its id exists; returns the stored one. Raises UnknownLeague."""
@@ -81,8 +89,9 @@ class Ledger:
     def extend(self, matches: Sequence[Match]) -> int:
         """Store matches, all or none; returns the number of new ones.
 
-        Raises LedgerConflict if one contradicts its schedule.
+        Raises LedgerConflict if one contradicts its schedule, or OutOfSpace.
         """
+        self._require_space()
         with self._database.write() as session:
             schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
             for schedule in schedules.values():
@@ -90,7 +99,32 @@ class Ledger:
                 for match, seed in zip(own, schedule.seeds_at([match.position for match in own]), strict=True):
                     admit(match, schedule, seed)
             now = datetime.now(UTC)
-            return insert(session, tables.MatchTable, [row(match, now) for match in matches])
+            rows = [row(match, now) for match in matches]
+            for name in schedules:
+                self._add_size(session, name, sum(len(each["moves"]) for each in rows if each["schedule"] == name))
+            return insert(session, tables.MatchTable, rows)
+
+    def _require_space(self) -> None:
+        """Raise OutOfSpace if the disk with the database is nearly full."""
+        file = self._database.engine.url.database
+        if self._database.is_sqlite and file and (free := free_space(Path(file))) < RESERVE:
+            raise OutOfSpace(
+                f"{free // 2**20} MB are free on the disk of {file}: games are recorded only if they leave "
+                f"{RESERVE // 2**20} MB; what was played so far is kept"
+            )
+
+    def _add_size(self, session: Session, schedule: str, size: int) -> None:
+        """Count the size of new games of a schedule. Raises OutOfSpace."""
+        if schedule not in self._sizes:
+            moves = tables.MatchTable.moves
+            recorded = select(func.coalesce(func.sum(func.length(moves)), 0)).filter_by(schedule=schedule)
+            self._sizes[schedule] = int(session.scalar(recorded) or 0)
+        if self._sizes[schedule] + size > MOST_BYTES:
+            raise OutOfSpace(
+                f"the recorded games of schedule {schedule} would exceed {MOST_BYTES // 2**20:,} MB: "
+                "what was played so far is kept"
+            )
+        self._sizes[schedule] += size
 
     def matches(self, *, league: str, schedule: str | None = None, after: int | None = None) -> list[Match]:
         """Return the matches of a league, or of one of its schedules, in schedule order.

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.errors import InvalidInput, LedgerConflict, NotFound, UnknownLeague
+from league.errors import InvalidInput, LedgerConflict, NotFound, OutOfSpace, UnknownLeague
 from league.registry.registry import Registry
 from league.results import ledger as ledger_module
 from league.results.ledger import Ledger
@@ -29,6 +29,7 @@ from league.results.records import (
 from league.settings import Storage
 from tests.support.leagues.ledger_matches import SCHEDULE, game, play_match
 from tests.support.leagues.registries import LEAGUE, registered
+from tests.support.small_disk import small_disk
 
 
 @pytest.fixture
@@ -83,6 +84,32 @@ def test_several_matches_are_stored_together_or_not_at_all(ledger: Ledger) -> No
     with pytest.raises(LedgerConflict):
         ledger.extend([play_match(SCHEDULE, 3), broken])
     assert ledger.positions(SCHEDULE.id) == {0, 1, 2}
+
+
+def test_the_size_of_a_schedule_is_limited(ledger: Ledger, storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    ledger.open(SCHEDULE)
+    size = len(dump_games(play_match(SCHEDULE, 0).games))
+    monkeypatch.setattr(ledger_module, "MOST_BYTES", 3 * size + size // 2)
+    ledger.extend([play_match(SCHEDULE, position) for position in range(2)])
+    again = Ledger(Registry.open(storage))  # after a restart
+    assert again.append(play_match(SCHEDULE, 2))
+    with pytest.raises(OutOfSpace, match="recorded games of schedule"):
+        again.append(play_match(SCHEDULE, 3))
+    assert ledger.positions(SCHEDULE.id) == {0, 1, 2}
+    other = replace(SCHEDULE, id="of another evaluation")
+    ledger.open(other)
+    assert ledger.append(play_match(other, 0))
+
+
+def test_games_leave_space_on_the_disk_of_the_database(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", megabytes=2) as disk:
+        registry = registered(Registry.open(Storage(disk, f"sqlite:///{disk}/league.db", disk / "artifacts")))
+        ledger = Ledger(registry)
+        ledger.open(SCHEDULE)
+        with pytest.raises(OutOfSpace, match=r"[01] MB are free on the disk of .*: games are recorded only"):
+            ledger.append(play_match(SCHEDULE, 0))
+        registry.keys.create("other-changes-go-on", ["act"])
+        registry.close()
 
 
 def test_results_are_sums_over_blocks(ledger: Ledger) -> None:

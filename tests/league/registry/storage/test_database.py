@@ -114,12 +114,11 @@ def test_a_full_disk_is_called_so(tmp_path: Path) -> None:
         registry = Registry.open(storage)
         registry.keys.create("first", ["act"])
         fill(disk)
-        with pytest.raises(StorageError, match="the disk of .*/disk is full: 0 bytes are free"):
-            for number in range(100):
-                registry.keys.create(f"key-{number}", ["act"])
+        with pytest.raises(StorageError, match=r"the disk of .*/disk is full: 0 bytes are free"):
+            registry.keys.create("a-second", ["act"])
         registry.close()
         for path in disk.glob("league.db-*"):
             path.unlink()
         fill(disk)
-        with pytest.raises(StorageError, match="the disk of .*/disk is full"):
+        with pytest.raises(StorageError, match=r"the disk of .*/disk is full"):
             Registry.open(storage)
