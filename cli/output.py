@@ -23,14 +23,17 @@ if TYPE_CHECKING:
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
-CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Terminal control characters. They are removed because names, reasons and notes are untrusted."""
+CONTROL = re.compile(
+    r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufff9-\ufffb\ud800-\udfff]"
+)
+"""Characters that control a terminal, the direction of text or lines. They are replaced, because names, reasons and
+notes are untrusted: text after them could look like another one."""
 
 
 def emit(document: Any) -> None:
     """Print one JSON document and nothing else."""
     text = orjson.dumps(document, option=orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY).decode()
-    print(text, file=_documents, flush=True)
+    print(CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text), file=_documents, flush=True)
 
 
 _documents: TextIO | None = None
@@ -173,7 +176,7 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
     """Return a function that shows what is done now: beside a spinner in a terminal, in plain lines elsewhere."""
     if errors.is_terminal:
         with errors.status(Text(title)) as status:
-            yield lambda doing: status.update(Text(f"{title}: {doing}"))
+            yield lambda doing: status.update(Text(text(f"{title}: {doing}")))
         return
     next_line = time.monotonic() + SECONDS_PER_LINE
 
@@ -196,7 +199,7 @@ class GameProgress:
 
         self._quiet, self._has_bar = quiet, console.is_terminal and not quiet
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
@@ -232,14 +235,14 @@ class GameProgress:
         from evaluation.results import VerdictReport
 
         if isinstance(event, VerdictReport):
-            console.print(f"  {verdict(event)}", markup=False, soft_wrap=True)
+            say(f"  {verdict(event)}")
             return
         note = _note(event)
-        self._bar.update(self._task, description=event.what, completed=event.played, total=event.of, note=note)
+        self._bar.update(self._task, description=text(event.what), completed=event.played, total=event.of, note=note)
         if not self._has_bar and time.monotonic() >= self._next_line:
             self._next_line = time.monotonic() + SECONDS_PER_LINE
             line = f"{event.what}: {event.played}/{event.of} matches  {note}"
-            console.print(line.rstrip(), markup=False, soft_wrap=True)
+            say(line.rstrip())
 
 
 def _note(event: "Games") -> str:

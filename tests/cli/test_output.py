@@ -1,3 +1,4 @@
+import json
 from io import StringIO
 
 import pytest
@@ -32,3 +33,28 @@ def test_quiet_progress_prints_nothing(printed: StringIO) -> None:
     with output.GameProgress(quiet=True) as listener:
         listener(Progress("a against b", 8, 16))
     assert printed.getvalue() == ""
+
+
+UNTRUSTED = "safe\u202eevil\u2066\u200f\x1b[2J\x9b31m\u2028\r[bold]"
+"""Reverses the direction of text, clears a terminal, changes its colour, returns to the start of a line; has markup."""
+SHOWN = "safe�evil���[2J�31m��[bold]"
+
+
+def test_text_of_others_controls_neither_the_terminal_nor_the_direction_of_text(
+    printed: StringIO, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(output, "errors", output.console)
+    output.say(UNTRUSTED)
+    output.complain(UNTRUSTED)
+    output.table(("name",), [(UNTRUSTED,)])
+    with output.GameProgress(quiet=False) as listener:
+        monkeypatch.setattr(output, "SECONDS_PER_LINE", 0.0)
+        listener(Progress(UNTRUSTED, 1, 2))
+        listener(Progress(UNTRUSTED, 2, 2))
+    shown = printed.getvalue()
+    assert shown.count(SHOWN) >= 4
+    assert not output.CONTROL.search(shown)
+    output.emit({"name": UNTRUSTED})
+    written = capsys.readouterr().out
+    assert not output.CONTROL.search(written)
+    assert json.loads(written) == {"name": UNTRUSTED}

@@ -1,4 +1,7 @@
-"""Digests of a checkpoint that is not published yet: RLlib unpickles it, so it is verified before it is read."""
+"""Digests of a checkpoint that is not published yet: RLlib unpickles it, so it is verified before it is read.
+
+The digests are beside the files: they detect damage, and no one who can write to the directory.
+"""
 
 import json
 import shutil
