@@ -88,6 +88,12 @@ def check(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
 
     if missing := sorted(given.keys() - mapping.inputs.keys() - mapping.state.keys()):
         refuse(f"input {missing[0]} of the graph is not in the mapping")
+    for name, (_, shape) in given.items():
+        if shape[:1] not in ((), (None,)):
+            refuse(
+                f"input {name} has a fixed batch size of {shape[0]}: export it with a dynamic one, in PyTorch with"
+                f" dynamic_shapes={{'{name}': {{0: torch.export.Dim('batch')}}}}"
+            )
     for name, own in mapping.inputs.items():
         if name not in given:
             refuse(f"inputs.{name}: the graph has the inputs {', '.join(given)}")

@@ -49,6 +49,11 @@ def open_sources(
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such file or directory")
+    if mapping is not None and kind is not None:
+        raise InvalidInput(
+            f"--mapping {mapping}: --{kind} determines the inputs and outputs of a model itself; remove --mapping, or"
+            " export the model to ONNX"
+        )
     if modules and kind != "rllib":
         raise InvalidInput("--policy: only checkpoints of RLlib contain several modules; it requires --rllib")
     if unknown := [policy for policy in modules or () if policy not in interface.policy_ids]:

@@ -55,7 +55,8 @@ def rllib_source(path: Path, module_id: str, spaces: AgentInterface, origin: dic
         known = ", ".join(sorted(each.name for each in modules.iterdir() if each.is_dir()))
         raise ConfigError(f"{path}: there is no module {module_id!r}; known: {known}; use --policy NAME=MODULE")
     try:
-        module = RLModule.from_checkpoint(modules / module_id)
+        # RLlib takes a relative path for a URI.
+        module = RLModule.from_checkpoint((modules / module_id).resolve())
     except Exception as error:
         raise ConfigError(f"{modules / module_id}: the module cannot be restored: {one_line(error)}") from error
     where = f"{path}, module {module_id}"

@@ -70,8 +70,9 @@ class Chosen(nn.Module):
 class PredictOriginal:
     """The model as Stable-Baselines3 runs it: `predict(…, deterministic=True)`."""
 
-    def __init__(self, model: Any, graph: nn.Module, kind: Kind, spaces: AgentInterface) -> None:
-        self._model, self._graph, self._kind, self._spaces = model, graph, kind, spaces
+    def __init__(self, model: Any, graph: nn.Module, mapping: GraphMapping, spaces: AgentInterface) -> None:
+        self._model, self._graph, self._kind, self._spaces = model, graph, mapping.kind, spaces
+        self._transpose = mapping.inputs[OBSERVATION].transpose
 
     def initial_state(self, rows: int) -> State:  # noqa: ARG002
         """Return no state."""
@@ -79,8 +80,10 @@ class PredictOriginal:
 
     def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
         """Call `predict`. With a mask, which Stable-Baselines3 does not know, the best legal logit decides."""
-        shape = self._model.observation_space.shape
-        seen = observations[OBSERVATION].reshape(-1, *shape)
+        seen = observations[OBSERVATION]
+        if self._transpose:
+            seen = seen.transpose(0, *(axis + 1 for axis in self._transpose))
+        seen = np.ascontiguousarray(seen).reshape(-1, *self._model.observation_space.shape)
         logits = None
         if self._kind != "gaussian" and self._kind != "action":
             with torch.no_grad():
@@ -123,8 +126,9 @@ def sb3_source(path: Path, spaces: AgentInterface, origin: dict[str, Any]) -> So
         graph, kind = Chosen(policy), "action"
     else:
         graph, kind = Logits(policy), "gaussian" if isinstance(spaces.action, Box) else "logits"
+    transpose = _transpose(observed[OBSERVATION].shape, space.shape)
     mapping = GraphMapping(
-        inputs={OBSERVATION: InputMapping(name=OBSERVATION)},
+        inputs={OBSERVATION: InputMapping(name=OBSERVATION, transpose=transpose)},
         output=OUTPUT,
         kind=kind,
         units="environment" if kind == "gaussian" else "normalized",
@@ -132,7 +136,17 @@ def sb3_source(path: Path, spaces: AgentInterface, origin: dict[str, Any]) -> So
     examples: Examples = {OBSERVATION: (space.shape, torch.float32)}
     onnx_model = converted(graph.eval(), examples, OUTPUT, str(path))
     check(onnx_model, mapping, spaces, str(path))
-    return Source(onnx_model, mapping, PredictOriginal(model, graph, kind, spaces), origin)
+    return Source(onnx_model, mapping, PredictOriginal(model, graph, mapping, spaces), origin)
+
+
+def _transpose(shape: tuple[int, ...], expected: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the order of axes in which a model that was trained on images (height, width, channels) expects them.
+
+    Stable-Baselines3 transposes such images for its policies (`VecTransposeImage`).
+    """
+    channels_first = (2, 0, 1)
+    is_image = len(shape) == 3 and shape != expected
+    return channels_first if is_image and tuple(shape[axis] for axis in channels_first) == expected else ()
 
 
 def _load(path: Path) -> Any:

@@ -138,3 +138,12 @@ def test_what_cannot_be_matched_is_named() -> None:
     model = onnx.load_from_string(foreign(6, 7, shape=(2, 3)))
     with pytest.raises(EnvironmentMismatch, match=r"outputs are policy_head float32 \[7\]"):
         inferred(model, AgentInterface(observation=masked(5), action=DISCRETE), "test")
+
+
+def test_a_fixed_batch_size_is_refused() -> None:
+    spaces = AgentInterface(observation=masked(5), action=DISCRETE)
+    for size in (1, 32):
+        model = onnx.load_from_string(foreign(6, 5, shape=(2, 3)))
+        model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = size
+        with pytest.raises(EnvironmentMismatch, match=rf"^model.onnx: input planes has a fixed batch size of {size}: "):
+            adapt(model, inferred(model, spaces, "model.onnx"), spaces, "model.onnx")

@@ -181,6 +181,22 @@ def test_a_module_of_rllib(tmp_path: Path, action: gymnasium.Space[Any]) -> None
         open_sources(tmp_path, interface(action), kind="rllib", trust=True)
 
 
+def test_a_checkpoint_of_rllib_with_a_relative_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = DefaultPPOTorchRLModule(
+        observation_space=SEEN, action_space=FIVE, model_config=asdict(DefaultModelConfig()), inference_only=True
+    )
+    module.save_to_path(tmp_path / "checkpoint" / MODULES / "shared")
+    monkeypatch.chdir(tmp_path)
+    sources, _ = open_sources(Path("checkpoint"), interface(FIVE), kind="rllib", trust=True)
+    assert_equal_actions(sources["shared"], FIVE)
+
+
+@pytest.mark.parametrize("kind", ["rllib", "sb3"])
+def test_a_mapping_is_not_ignored(tmp_path: Path, kind: SourceKind) -> None:
+    with pytest.raises(InvalidInput, match=rf"--mapping names.yaml: --{kind} determines the inputs and outputs"):
+        open_sources(tmp_path, interface(FIVE), kind=kind, mapping=Path("names.yaml"), trust=True)
+
+
 def test_a_directory_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="learner_group/learner/rl_module is missing"):
         open_sources(tmp_path, interface(FIVE), kind="rllib", trust=True)
@@ -189,8 +205,8 @@ def test_a_directory_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
 class SpacesOnly(gymnasium.Env[Any, Any]):
     """An environment that only defines spaces."""
 
-    def __init__(self, action: gymnasium.Space[Any]) -> None:
-        self.observation_space, self.action_space = SEEN, action
+    def __init__(self, action: gymnasium.Space[Any], observation: gymnasium.Space[Any] = SEEN) -> None:
+        self.observation_space, self.action_space = observation, action
 
 
 @pytest.mark.slow
@@ -205,6 +221,31 @@ def test_a_file_of_stable_baselines(tmp_path: Path, algorithm: str, action: gymn
     getattr(library, algorithm)("MlpPolicy", SpacesOnly(action), **options).save(tmp_path / "model.zip")
     sources, _ = open_sources(tmp_path / "model.zip", interface(action), kind="sb3", trust=True)
     assert_equal_actions(sources["shared"], action)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [(40, 36, 3), (3, 40, 36)])
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_an_image_policy_of_stable_baselines(tmp_path: Path, algorithm: str, shape: tuple[int, ...]) -> None:
+    """Stable-Baselines3 transposes images to (channels, height, width), and scales them to [0, 1]."""
+    library = pytest.importorskip("stable_baselines3")
+    torch.manual_seed(0)
+    pixels = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+    options = {"buffer_size": 10} if algorithm == "DQN" else {}
+    model = getattr(library, algorithm)("CnnPolicy", SpacesOnly(FIVE, pixels), **options)
+    model.save(tmp_path / "model.zip")
+    spaces = AgentInterface(observation=from_gymnasium(pixels), action=from_gymnasium(FIVE))
+    of_images = Interface(agents={"agent": spaces}, policies={"agent": "shared"}, sides={"agent": ("agent",)})
+    sources, _ = open_sources(tmp_path / "model.zip", of_images, kind="sb3", trust=True)
+    source = sources["shared"]
+    images = np.random.default_rng(0).integers(0, 256, (ROWS, *shape), dtype=np.uint8)
+    images[::2] //= 16
+    answer = OnnxPolicy(adapt(source.model, source.mapping, spaces, "test")).distribution({"observation": images})
+    assert answer.dist_inputs is not None
+    expected, logits, _ = source.original.act({"observation": images}, {})
+    assert np.array_equal(expected, model.predict(images, deterministic=True)[0])
+    assert excused(answer.actions, expected, known_logits(logits, expected, spaces), spaces.action).all()
+    assert np.allclose(answer.dist_inputs, logits, atol=1e-4)
 
 
 def test_other_files_are_not_of_stable_baselines(tmp_path: Path) -> None:
