@@ -235,7 +235,9 @@ class GameProgress:
         from evaluation.results import VerdictReport
 
         if isinstance(event, VerdictReport):
-            say(f"  {verdict(event)}")
+            for line in (f"  {verdict(event)}", f"    {event.reason}", event.remedy and f"    {event.remedy}"):
+                if line:
+                    say(line)
             return
         note = _note(event)
         self._bar.update(self._task, description=text(event.what), completed=event.played, total=event.of, note=note)
@@ -272,11 +274,10 @@ def verdict(report: "VerdictReport") -> str:
     exploiters = "".join(
         f"; {wording.against_exploiter(each, report.opponent, report.model)}" for each in report.exploiters
     )
-    note = f": {report.note}" if report.note else ""
     exploiters += "" if report.exploitability is None else f"; {_exploitability(report.exploitability, report.model)}"
     who = f"{short_verdict(report.verdict)}: {report.candidate} against {report.opponent}"
     forfeits = "".join(f"; {ref} forfeited {lost}" for ref, lost in report.forfeits.items())
-    return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{note}{forfeits}"
+    return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{forfeits}"
 
 
 def _exploitability(test: "ExploitabilityReport", model: str) -> str:

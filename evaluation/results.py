@@ -311,6 +311,8 @@ class VerdictReport(Document):
     promoted: whether this verdict made the candidate champion.
     note: why it did not although the opponent was beaten, or why it is void.
     forfeits: contestant → its forfeits in the counted games, if any.
+    reason, remedy: what decided, with the scores of candidate and champion, and what would have to change for a
+    promotion, in sentences. remedy is None after a promotion and while the verdict is open.
     """
 
     verdict: str
@@ -335,6 +337,8 @@ class VerdictReport(Document):
     difference: Difference | None = None
     note: str | None = None
     forfeits: dict[str, Forfeits] = field(default_factory=dict)
+    reason: str = ""
+    remedy: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,9 @@ def verify(
         emit(found.to_json())
         return
     say(f"{found.outcome}: {found.matches} matches follow the schedule, {found.numbers} recorded numbers reproduced.")
+    say(found.reason)
+    if found.remedy:
+        say(found.remedy)
     if found.replayed:
         say(f"{counted(found.replayed, 'game')} replayed with identical results.")
     if not found.is_current:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 
 from evaluation.gating import verdicts
-from evaluation.gating.anchors import rolled_back
+from evaluation.gating.opponents import rolled_back
 from evaluation.gating.trained_exploiters import Trainer, check_exploiters
 from evaluation.gating.verdict_report import confirmation
 from evaluation.matches import tournament

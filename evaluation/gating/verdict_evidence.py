@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from evaluation.gating.gate import Decision
 from evaluation.gating.verdict_report import (
     anchor_report,
     confirmation,
     difference_of_returns,
+    explained,
     exploitability_report,
     exploiter_report,
     gate_of,
@@ -34,7 +34,7 @@ from league.registry.storage.rows import AliasEvent, VerdictRow
 class VerdictEvidence(Document):
     """A verdict with its evidence.
 
-    outcome: as in a VerdictReport, or `open`. reason: one sentence.
+    outcome: as in a VerdictReport, or `open`. reason, remedy: as in a VerdictReport.
     hypotheses: elo0 and elo1 in the unit of `model`, or two mean differences of returns.
     curve: LLR after each block; the test decides at `bounds`.
     counts: blocks per cell, worst for the candidate first.
@@ -49,6 +49,7 @@ class VerdictEvidence(Document):
     outcome: str
     promoted: bool
     reason: str
+    remedy: str | None
     opened_at: str
     closed_at: str | None
     model: str
@@ -78,13 +79,15 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
     seen = gate_result(registry, verdict)
     decision = seen.champion
     promoted = any(event.verdict == verdict.id for event in events)
+    explanation = explained(registry, verdict, verdict.outcome, seen, promoted, (verdict.evidence or {}).get("note"))
     return VerdictEvidence(
         verdict=verdict.id,
         candidate=candidate,
         opponent=verdict.champion,
         outcome=verdict.outcome or OPEN,
         promoted=promoted,
-        reason=_reason(verdict, gate.requires_gain, decision, promoted),
+        reason=explanation.reason,
+        remedy=explanation.remedy,
         opened_at=iso_timestamp(verdict.opened_at),
         closed_at=iso_timestamp(verdict.closed_at) if verdict.closed_at else None,
         model=gate.model,
@@ -98,23 +101,3 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
         exploitability=exploitability_report(seen.exploitability, candidate),
         confirmation=confirmation(registry, verdict),
     )
-
-
-def _reason(verdict: VerdictRow, requires_gain: bool, decision: Decision, promoted: bool) -> str:
-    """Why the verdict has its outcome, in one sentence."""
-    passed, failed = ("Stronger", "Not stronger") if requires_gain else ("Not inferior", "Inferior")
-    note = (verdict.evidence or {}).get("note")
-    llr, lower, upper = (f"{value:.2f}".replace("-", "−") for value in (decision.llr, *decision.bounds))
-    after = f"after {decision.games} games, the LLR was {llr}"
-    match verdict.outcome:
-        case None:
-            return f"Undecided: {after}, between {lower} and {upper}."
-        case "promote" if promoted:
-            return f"{passed}: {after}, above the bound of {upper}."
-        case "promote":
-            return f"{passed} ({after}), but not promoted: {note or 'no reason was recorded'}."
-        case "inconclusive":
-            return note or f"Inconclusive: {after}, between {lower} and {upper}, at the maximum number of games."
-        case "reject" if note is None and decision.llr <= decision.bounds[0]:
-            return f"{failed}: {after}, below the bound of {lower}."
-    return note or f"{str(verdict.outcome).capitalize()}: {after}."

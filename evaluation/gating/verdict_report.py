@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from evaluation.gating.explanation import Explanation, explain
 from evaluation.gating.exploitability import exploitability_bound
 from evaluation.gating.gate import Decision, cell_counts, decide_matches
 from evaluation.gating.gate_result import (
@@ -115,13 +116,15 @@ def report_of(
     registry: Registry, verdict: VerdictRow, outcome: str, seen: GateResult, note: str | None
 ) -> VerdictReport:
     """Report of a verdict that ends with this gate result."""
+    promoted = is_applied(registry, verdict)
+    explanation = explained(registry, verdict, outcome, seen, promoted, note)
     return VerdictReport(
         verdict=verdict.id,
         candidate=verdict.candidate_ref,
         opponent=verdict.champion,
         outcome=outcome,
         **gate_statistics(seen.champion),
-        promoted=is_applied(registry, verdict),
+        promoted=promoted,
         alpha=verdict.alpha,
         model=gate_of(verdict).model,
         anchors=tuple(map(anchor_report, seen.anchors)),
@@ -130,6 +133,8 @@ def report_of(
         difference=difference_of_returns(registry, verdict, seen.champion.blocks),
         note=note,
         forfeits=forfeits_of_all(_counted(registry, verdict, seen)),
+        reason=explanation.reason,
+        remedy=explanation.remedy,
     )
 
 
@@ -139,6 +144,26 @@ def _counted(registry: Registry, verdict: VerdictRow, seen: GateResult) -> Itera
     for companion in seen.companions:
         games = companion.decision.games
         yield from _matches(registry, verdict, companion.test.schedule)[: games // GAMES_PER_BLOCK]
+
+
+def explained(
+    registry: Registry, verdict: VerdictRow, outcome: str | None, seen: GateResult, promoted: bool, note: str | None
+) -> Explanation:
+    """Explain a verdict with this gate result. outcome: None while it is open. note: as in a VerdictReport."""
+    absolute = [each.test.ref for each in seen.companions if isinstance(each, AnchorResult)]
+    scores = {ref: score for ref in absolute if (score := _champion_score(registry, verdict, ref)) is not None}
+    return explain(
+        verdict, gate_of(verdict), seen, outcome=outcome, promoted=promoted, note=note, champion_scores=scores
+    )
+
+
+def _champion_score(registry: Registry, verdict: VerdictRow, opponent: str) -> float | None:
+    """Mean score of the champion against an opponent in all games under the verdict's conditions; None without any."""
+    ledger = Ledger(registry)
+    conditions = ledger.schedule(verdict.schedule).conditions
+    blocks = ledger.results(verdict.league, conditions, between=(verdict.champion, opponent))
+    points = sum(block.scores[block.contestants.index(verdict.champion)] for block in blocks)
+    return points / sum(block.games for block in blocks) if blocks else None
 
 
 OUTCOMES = {"promote": "not inferior", "reject": "inferior", "inconclusive": "inconclusive", None: "open"}

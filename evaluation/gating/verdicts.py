@@ -14,10 +14,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from evaluation.gating.anchors import resolve_anchors
-from evaluation.gating.exploiters import recent_exploiters
 from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
 from evaluation.gating.gate_result import AnchorResult, GateResult, PairedResult
+from evaluation.gating.opponents import recent_exploiters, resolve_anchors
 from evaluation.gating.sequential_tests import SequentialTest, sequential_test
 from evaluation.gating.trained_exploiters import Trainer, prepared_test
 from evaluation.gating.verdict_report import confirmation, gate_of, gate_result, is_applied, report_of

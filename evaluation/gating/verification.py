@@ -38,6 +38,7 @@ class Verification(Document):
 
     matches: matches in the ledger. numbers: recomputed fields of the evidence. replayed: replayed games.
     is_current: whether its games count today: neither the league's game nor the selection of actions has changed since.
+    reason, remedy: as in a VerdictReport.
     """
 
     verdict: str
@@ -46,6 +47,8 @@ class Verification(Document):
     numbers: int
     replayed: int
     is_current: bool
+    reason: str
+    remedy: str | None
 
 
 def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verification:
@@ -69,7 +72,10 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     # A verdict can be voided for reasons outside its games, at any point.
     outcome = VOID if row.outcome == VOID else str(seen.outcome)
     note = seen.note if outcome not in (VOID, "promote") else row.evidence.get("note")
-    computed = report_of(registry, row, outcome, seen, note).to_json()
+    report = report_of(registry, row, outcome, seen, note)
+    computed = report.to_json()
+    # Sentences, in the words of the release that wrote them.
+    del computed["reason"], computed["remedy"]
     _omit_later_fields(computed, row.evidence)
     if row.outcome == VOID:
         # A voided verdict keeps its evidence, which is empty if it was open.
@@ -84,7 +90,9 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     replayed = _replay(registry, row, matches, replays)
     conditions = Ledger(registry).schedule(row.schedule).conditions
     is_current = conditions == registry.leagues.get(row.league).conditions
-    return Verification(row.id, row.outcome, len(matches), len(computed), replayed, is_current)
+    return Verification(
+        row.id, row.outcome, len(matches), len(computed), replayed, is_current, report.reason, report.remedy
+    )
 
 
 def _omit_later_fields(computed: dict[str, Any], recorded: dict[str, Any]) -> None:

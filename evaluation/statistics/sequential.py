@@ -298,12 +298,9 @@ def elo_estimate(counts: ArrayLike, model: Model, confidence: float = 0.95) -> E
     Raises:
         ValueError: For invalid counts.
     """
-    cells = np.maximum(_cells(counts), EMPTY_CELL)
-    if cells.ndim != 1:
-        raise ValueError(f"expected one series of counts, got an array of shape {cells.shape}")
-    number, grid = cells.sum(), _grid(cells.shape[0])
-    mean = float(cells @ grid / number)
-    sigma = math.sqrt(float(cells @ (grid - mean) ** 2 / number))
+    cells = _cells(counts)
+    mean, sigma = _moments(cells)
+    number = np.maximum(cells, EMPTY_CELL).sum()
     half = float(ndtri(0.5 + confidence / 2)) * sigma / math.sqrt(number)
     scores = np.array([mean, mean - half, mean + half])
     if model == "logistic":
@@ -311,6 +308,37 @@ def elo_estimate(counts: ArrayLike, model: Model, confidence: float = 0.95) -> E
     else:
         elos = (scores - 0.5) / (sigma * math.sqrt(_games(cells.shape[0]))) * ELO_PER_EFFECT
     return EloEstimate(*(float(x) for x in elos))
+
+
+def score_at(elo: float, counts: ArrayLike, model: Model) -> float:
+    """Expected score of a block at an Elo difference.
+
+    Args:
+        elo: Elo difference in the unit of `model`.
+        counts: Blocks per cell, worst first, shape `(2n + 1,)`, whose deviation `normalized` assumes.
+        model: Unit of `elo`.
+
+    Returns:
+        A score in [0, 1].
+
+    Raises:
+        ValueError: For invalid counts.
+    """
+    if model == "logistic":
+        return score_of(elo)
+    cells = _cells(counts)
+    effect = elo / ELO_PER_EFFECT * math.sqrt(_games(cells.shape[-1]))
+    return min(max(0.5 + effect * _moments(cells)[1], 0.0), 1.0)
+
+
+def _moments(cells: Floats) -> tuple[float, float]:
+    """Mean and standard deviation of the block scores of one series."""
+    if cells.ndim != 1:
+        raise ValueError(f"expected one series of counts, got an array of shape {cells.shape}")
+    shares, grid = np.maximum(cells, EMPTY_CELL), _grid(cells.shape[0])
+    shares = shares / shares.sum()
+    mean = float(shares @ grid)
+    return mean, math.sqrt(float(shares @ (grid - mean) ** 2))
 
 
 def expected_games(elo0: float, elo1: float, elo: float, alpha: float, beta: float) -> float:
@@ -401,7 +429,8 @@ def _tilt(observed: Floats, phi: Floats) -> Floats:
         moment, slope = (observed * ratio).sum(axis=1), -(observed * ratio**2).sum(axis=1)
         low, high = np.where(moment > 0, theta, low), np.where(moment > 0, high, theta)
         a, b = 1 + theta * first, 1 + theta * last
-        step = theta - moment * a * b / (slope * a * b + moment * (first * b + last * a))
+        with np.errstate(divide="ignore", invalid="ignore"):  # then the step is a bisection
+            step = theta - moment * a * b / (slope * a * b + moment * (first * b + last * a))
         step = np.where((step > low) & (step < high), step, (low + high) / 2)
         room = np.minimum(step - poles[0], poles[1] - step)
         is_close = np.abs(step - theta) <= TOLERANCE * room

@@ -30,7 +30,7 @@ from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 5
+FORMAT = 6
 """Version of the document format. A new format invalidates all snapshots."""
 
 

@@ -211,10 +211,13 @@ class Ledger:
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
-    def results(self, league: str, conditions: Conditions | None = None) -> list[BlockResult]:
-        """Return the matches of a league without moves, in schedule order; those played under `conditions` if given.
+    def results(
+        self, league: str, conditions: Conditions | None = None, between: tuple[str, str] | None = None
+    ) -> list[BlockResult]:
+        """Return the matches of a league without moves, in schedule order.
 
-        Excludes purged schedules, and cross-play in one team, which does not show who is stronger.
+        conditions, between: only those played under these conditions, and between these two contestants. Excludes
+        purged schedules, and cross-play in one team, which does not show who is stronger.
         """
         match = tables.MatchTable
         columns = match.schedule, match.position, match.games, match.scores, match.returns
@@ -224,7 +227,10 @@ class Ledger:
                 for known in _schedules(session, league)
                 if conditions in (None, known.conditions) and known.scoring != "team"
             }
-            found = session.execute(_in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None)))
+            query = _in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None))
+            if between is not None:
+                query = query.where(tuple_(match.first, match.second).in_([between, between[::-1]]))
+            found = session.execute(query)
             return [
                 _result(each, schedules[each.schedule].contestants_at(each.position))
                 for each in found

@@ -44,6 +44,7 @@ export function Verdict({ league, verdict }) {
     <${Await} result=${found}>${loaded && html`
       <div class="head"><h2 id="heading"><span class="ref">${loaded.candidate}</span> against <span class="ref">${loaded.opponent}</span></h2> <${Outcome} value=${loaded.outcome} /></div>
       ${loaded.reason && html`<p class="lead">${loaded.reason}</p>`}
+      ${loaded.remedy && html`<p>${loaded.remedy}</p>`}
       ${loaded.earlier_game && html`<div class="notice" role="status"><p><strong>The game of this league has changed since.</strong> These games count in no current rating.</p>
         <a href=${query(leaguePath(league), { game: loaded.earlier_game })}>Show the results of that game</a></div>`}
       <${Evidence} verdict=${loaded} />
@@ -100,9 +101,10 @@ function Counts({ counts }) {
 
 function Anchors({ anchors }) {
   return html`<h3>Non-inferiority tests</h3>
-    <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], [html`<${Term} name="LLR" />`, "number"], ["Elo", "number"], ["95 % interval"]]}>
+    <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], [html`<${Term} name="LLR" />`, "number"], ["Score", "number"], ["Champion’s score", "number"], ["Elo", "number"], ["95 % interval"]]}>
       ${anchors.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td>${each.outcome}</td><td class="number">${each.margin}</td>
-        <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${signed(each.elo)}</td><td class="nowrap">${interval(each.interval)}</td></tr>`)}
+        <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${percent(each.score)}</td><td class="number">${percent(each.champion_score)}</td>
+        <td class="number">${signed(each.elo)}</td><td class="nowrap">${interval(each.interval)}</td></tr>`)}
     <//>`;
 }
 

@@ -11,8 +11,8 @@ from scipy.stats import binomtest
 from sqlalchemy import delete
 
 from benchmarks.simulations.exploiter_gates import against_anchor
-from evaluation.gating.anchors import earlier_champions, resolve_anchors
 from evaluation.gating.nightly import nightly
+from evaluation.gating.opponents import earlier_champions, resolve_anchors
 from evaluation.gating.verification import verify
 from evaluation.matches.tournament import evaluate
 from evaluation.results import VerdictReport

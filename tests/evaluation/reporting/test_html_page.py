@@ -243,7 +243,7 @@ def test_optional_fields_of_a_verdict_are_shown(report: LeagueReport) -> None:
     )
     (_, text), *_ = PageParser(render_page(replace(report, verdicts=(verdict,)))).all("article", "verdict")
     assert "spends α = 0.00014" in text
-    assert "script:one_ply inferior 30 −3 [−2.9, +2.9] 84" in text
+    assert "script:one_ply inferior 30 0.400 – −3 [−2.9, +2.9] 84" in text
     assert "Confirmation match: +31 Elo [+4, +59], score 0.544, 400 games, returns differ by +1.5 [" in text
     assert "[−∞, +70]" in text
 

@@ -125,7 +125,7 @@ def test_further_evidence_of_a_verdict_is_included(tmp_path: Path) -> None:
         )
         registry.verdicts.void(verdict.id, "somebody stopped it")
         (reported,) = league_report(registry, LEAGUE).verdicts
-        assert (reported.outcome, reported.reason) == ("void", "somebody stopped it")
+        assert (reported.outcome, reported.reason) == ("void", "Void: somebody stopped it.")
         assert (reported.anchors, reported.confirmation) == ((), None)
         assert (reported.curve, reported.score, reported.elo) == ((), None, None)
 

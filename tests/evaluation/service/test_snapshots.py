@@ -116,11 +116,14 @@ def test_a_verdict_is_recomputed_until_it_is_closed_and_when_voided(registry: Re
     registry.verdicts.close(verdict.id, "inconclusive", {"note": "nobody has played"})
     refresh(registry, LEAGUE)
     closed = snapshot(registry, part)
-    assert (closed.document["outcome"], closed.document["reason"]) == ("inconclusive", "nobody has played")
+    assert (closed.document["outcome"], closed.document["reason"]) == (
+        "inconclusive",
+        "Inconclusive: nobody has played.",
+    )
     void(registry, verdict.id, actor="ada", reason="a mistake")
     refresh(registry, LEAGUE)
     voided = snapshot(registry, part).document
-    assert (voided["outcome"], voided["reason"]) == ("void", "voided by ada: a mistake")
+    assert (voided["outcome"], voided["reason"]) == ("void", "Void: voided by ada: a mistake.")
 
 
 def test_purged_games_are_ignored(registry: Registry) -> None:

@@ -1,7 +1,7 @@
-"""Anchors of a gate: named contestants and former champions against which a candidate must not be inferior.
+"""Opponents of a candidate besides the champion: anchors, and exploiters of recent champions.
 
 A candidate that beats the champion may lose to earlier champions. In a cycle such as rock, paper, scissors, beating
-the current champion is not progress.
+the current champion is not progress. And it may have given up what made the champion hard to exploit.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 from league.config.gate import AnchorConfig
 from league.errors import UnknownAlias
 from league.policies.loading import check_eligible, pinned
-from league.refs import of_league
+from league.refs import ScriptRef, of_league, parse_ref
 from league.registry.registry import Registry
-from league.registry.storage.rows import LeagueRow
+from league.registry.storage.rows import LeagueRow, VersionRow
 
 
 def resolve_anchors(registry: Registry, league: LeagueRow, candidate: int, champion: str) -> list[AnchorConfig]:
@@ -56,3 +56,21 @@ def rolled_back(registry: Registry, league: str) -> set[int]:
     """Return the former champions that a person replaced with their predecessors."""
     events = registry.aliases.history(league)
     return {event.previous for event in events if event.kind == "rollback" and event.previous is not None}
+
+
+def recent_exploiters(registry: Registry, league: LeagueRow, champion: str) -> list[VersionRow]:
+    """Return the newest exploiter of each of the last `gate.exploited_champions` champions, the current one's first.
+
+    Champions without an exploiter, retired exploiters and those trained in another environment are left out.
+    champion: the opponent of the verdict; a script has no exploiters.
+    """
+    number = league.config.gate.exploited_champions
+    if isinstance(parse_ref(champion), ScriptRef) or not number:
+        return []
+    targets = [champion, *earlier_champions(registry, league, number - 1)]
+    newest = {
+        each.exploits: each
+        for each in registry.versions.exploiters(league.slug, targets)
+        if each.manifest.environment_digest == league.environment_digest
+    }
+    return [newest[target] for target in targets if target in newest]
