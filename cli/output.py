@@ -20,6 +20,7 @@ from league.refs import short_verdict
 if TYPE_CHECKING:
     from evaluation.results import Difference, ExploitabilityReport, Listener, Standing, VerdictReport
     from evaluation.results import Progress as Games
+    from league.registry.registry import Registry
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
@@ -60,6 +61,15 @@ def say(sentence: str = "") -> None:
 def complain(sentence: str) -> None:
     """Print an error or a warning to stderr."""
     errors.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
+
+
+def warn_of_changed_game(registry: "Registry", league: str) -> None:
+    """Say if the results of a league are of its game before a change that no command has registered yet."""
+    if (change := registry.leagues.unregistered_change(league)) is not None:
+        complain(
+            f"{league}: {change}. These results are of the game before. The next `league evaluate`, `league nightly` or"
+            " `league train` registers the change, and results of the new game count from then on."
+        )
 
 
 GAP = 2

@@ -38,6 +38,11 @@ class EnvironmentCode:
     libraries: dict[str, str]
     files: dict[str, str] = field(default_factory=dict, compare=False)
 
+    @property
+    def exists(self) -> bool:
+        """Whether the entry point was found."""
+        return bool(self.files or self.libraries)
+
 
 def module_in(folder: str, name: str) -> ModuleSpec | None:
     """Find a module or package in a folder, without importing it; None if the folder does not contain it."""

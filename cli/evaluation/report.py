@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from cli.options import LeagueName, open_registry
-from cli.output import console, counted, emit, say
+from cli.output import console, counted, emit, say, warn_of_changed_game
 from league.errors import ConfigError
 from league.refs import check_slug
 
@@ -42,5 +42,7 @@ def report(
     write(found, out)
     counts = (found.games, "game"), (len(found.verdicts), "verdict"), (len(found.upsets), "upset")
     say(f"{out}: {', '.join(counted(number, noun) for number, noun in counts)}.")
+    if found.games:
+        warn_of_changed_game(registry, league)
     for sentence in found.left_out:
         say(sentence)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli.options import Actor, AsJson, LeagueName, open_registry
-from cli.output import elo, emit, say, table
+from cli.output import elo, emit, say, table, warn_of_changed_game
 from league.refs import (
     CheckpointRef,
     check_slug,
@@ -54,6 +54,8 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
         prose=("note",),
         optional=("role", "parent", "note"),
     )
+    if rated:
+        warn_of_changed_game(registry, league)
 
 
 def _role(row: "VersionRow") -> str | None:

@@ -73,6 +73,10 @@ class EnvironmentConfig(Part):
         """The folder in which entry points are searched first: that of the league."""
         return self._folder
 
+    def has_code(self) -> bool:
+        """Return whether the code of the environment is on this machine."""
+        return environment_code(self.resolved_entry_point, self.folder).exists
+
     def code(self) -> JSON:
         """Return what identifies the environment's code: revision or source digest, and the versions of libraries."""
         found = environment_code(self.resolved_entry_point, self.folder)

@@ -1,6 +1,7 @@
 """Registered leagues. The row of a league is the lock that serialises all changes to the league."""
 
 import difflib
+import json
 import logging
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -10,14 +11,22 @@ from pydantic import ValidationError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from league.conditions import ActionSelection, action_selection, default_selection, game_changes
+from league.conditions import ActionSelection, Conditions, action_selection, default_selection, game_changes
 from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface, digest
 from league.refs import check_new
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert, upsert
 from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, require_active
-from league.registry.storage.tables import READY, ApiKeyTable, EarlierGameTable, LeagueTable, MatchTable, VersionTable
+from league.registry.storage.tables import (
+    READY,
+    ApiKeyTable,
+    EarlierGameTable,
+    LeagueTable,
+    MatchTable,
+    ScheduleTable,
+    VersionTable,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,11 +78,13 @@ class LeagueRepository(Repository):
                 earlier = {"game": known.game, "replaced_at": datetime.now(UTC)}
                 upsert(session, EarlierGameTable, {"league": known.slug, "digest": known.game_digest}, earlier)
             if changes and _has_results(session, known.slug):
+                is_back = _has_results(session, known.slug, Conditions(digest(game), now))
                 logger.warning(
-                    "league %s: %s. Earlier results can be viewed, but no longer count in ratings, payoffs and"
-                    " verdicts.",
+                    "league %s: %s. %s results can be viewed, but no longer count in ratings, payoffs and verdicts.%s",
                     known.slug,
                     "; ".join(changes),
+                    "Later" if is_back else "Earlier",
+                    " The results from when the league last had this game count again." if is_back else "",
                 )
             for name, value in values.items():
                 setattr(known, name, value)
@@ -90,6 +101,16 @@ class LeagueRepository(Repository):
         with self._database.read() as session:
             row = session.get(LeagueTable, league) or _unknown(session, league)
             return [detached(EarlierGameRow, each) for each in session.scalars(query) if each.digest != row.game_digest]
+
+    def unregistered_change(self, league: str) -> str | None:
+        """Describe how the game of a league has changed since it was registered, whose results still count.
+
+        None if it has not, or if the code of its environment is not on this machine. Raises UnknownLeague.
+        """
+        row = self.get(league)
+        if not row.config.environment.has_code() or row.config.game_digest() == row.game_digest:
+            return None
+        return _describe_changes(row.game, row.config.game())
 
     def follow_code(self, league: str, describe: "Callable[[LeagueConfig], Interface]") -> LeagueRow:
         """Return one league, registered again if the code of its environment has changed.
@@ -181,8 +202,14 @@ def _has_versions(session: Session, league: str) -> bool:
     return session.scalar(ready.limit(1)) is not None
 
 
-def _has_results(session: Session, league: str) -> bool:
-    return session.scalar(select(MatchTable.position).filter_by(league=league).limit(1)) is not None
+def _has_results(session: Session, league: str, conditions: Conditions | None = None) -> bool:
+    """Whether a league has matches, played under `conditions` if given."""
+    played = select(MatchTable.position).where(MatchTable.schedule == ScheduleTable.id)
+    query = select(ScheduleTable.document).filter_by(league=league).where(played.exists())
+    if conditions is None:
+        return session.scalar(query.limit(1)) is not None
+    schedules = map(json.loads, session.scalars(query.where(ScheduleTable.document.contains(conditions.game_digest))))
+    return any((each.get("game_digest"), each.get("actions", "greedy")) == conditions for each in schedules)
 
 
 def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:

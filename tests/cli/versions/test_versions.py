@@ -1,6 +1,9 @@
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+
 from evaluation.service.snapshots import refresh
+from league.config.league import LeagueConfig
 from league.registry.registry import Registry
 from tests.support.command import League
 from tests.support.databases import on_both_databases
@@ -34,6 +37,17 @@ def test_ratings_that_a_server_has_computed_are_the_same(league: League, registr
     assert registry.snapshots.current("tictactoe", "leaderboard") is None
     newer = league("versions", "tictactoe", "--json").json["versions"]
     assert all(new["games"] > old["games"] for new, old in zip(newer, computed["versions"], strict=True))
+
+
+def test_ratings_from_before_a_change_of_the_code_are_shown_as_such(
+    league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    league("evaluate", "tictactoe", "--blocks", "4", "--workers", "0")
+    assert league("versions", "tictactoe").err == ""
+    changed = registry.leagues.get("tictactoe").game | {"environment.source": "1" * 64}
+    monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
+    found = league("versions", "tictactoe")
+    assert "→ 111111111111. These results are of the game before." in found.err
 
 
 def test_notes_are_added_shown_and_removed(league: League, registry: Registry) -> None:

@@ -2,6 +2,7 @@ import logging
 
 import pytest
 
+from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.errors import InterfaceChanged, InvalidReference, LeagueArchived, UnknownLeague
 from league.interface import Interface
@@ -96,6 +97,36 @@ def test_a_change_of_the_action_selection_is_reported_once_it_concerns_results(
     first, second = caplog.messages
     assert "how versions select actions has changed: greedy → sampled. Earlier results can be viewed" in first
     assert "opening_plies 0 → 4; how versions select actions has changed: sampled → greedy. Earlier" in second
+
+
+def test_results_count_again_when_the_game_is_back(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
+    """The message says so, unless there are none, or the selection of actions is another one."""
+    ledger = Ledger(registry)
+    ledger.open(SCHEDULE)
+    ledger.append(play_match(SCHEDULE, 0))
+    registry.leagues.register(config(revision="2"), interface())
+    registry.leagues.register(config(), interface())
+    changed, back = caplog.messages
+    assert changed.endswith("Earlier results can be viewed, but no longer count in ratings, payoffs and verdicts.")
+    assert back.endswith("The results from when the league last had this game count again.")
+    assert "Later results can be viewed, but no longer count" in back
+    registry.leagues.register(config(revision="2"), interface())
+    assert "Earlier results" in caplog.messages[-1], "no games were played with revision 2"
+    registry.leagues.register(config(), interface().model_copy(update={"hidden_information": True}))
+    assert "Earlier results" in caplog.messages[-1], "sampled games were never played"
+
+
+def test_a_change_of_the_game_is_described_before_it_is_registered(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert registry.leagues.unregistered_change(LEAGUE) is None
+    changed = config(revision="2").game()
+    with monkeypatch.context() as patch:
+        patch.setattr(LeagueConfig, "game", lambda self: changed)
+        assert "the game has changed: " in str(registry.leagues.unregistered_change(LEAGUE))
+        patch.setattr(EnvironmentConfig, "has_code", lambda self: False)
+        assert registry.leagues.unregistered_change(LEAGUE) is None, "its code is on another machine"
+    assert registry.leagues.unregistered_change(LEAGUE) is None
 
 
 def test_the_action_selections_of_all_leagues_are_read(registry: Registry) -> None:
