@@ -19,7 +19,9 @@ from ray.serve import Application
 from ray.serve.handle import DeploymentHandle
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.routing import Route, WebSocketRoute
+from starlette.responses import RedirectResponse
+from starlette.routing import Match, Route, Router, WebSocketRoute
+from starlette.types import Receive, Scope, Send
 
 from league.errors import ConfigError
 from league.ray_cluster import check_deployed_stack
@@ -132,7 +134,7 @@ class PolicyServer(ray_serve.AsgiReplica):
     def build(self) -> Starlette:
         """The application of this replica."""
         application = self._replica.application()
-        serve_bypass.install(application)
+        serve_bypass.install(application, self._replica.settings.root_path)
         uvicorn_http.install(self._replica.events.end)
         uvicorn_websocket.install(self._replica.settings.max_body, self._replica.settings.max_incomplete)
         grpc_handlers.install(self._replica.inference_service)
@@ -249,7 +251,7 @@ class Replica:
         open_inference = RestRoutes(
             self.inference, self.catalogue, self.watcher, self.access, self.settings, self.replica
         )
-        return Starlette(
+        application = Starlette(
             routes=[
                 Route("/v1/policies/{model}/action", self.action, methods=["POST"]),
                 WebSocketRoute("/v1/policies/{model}/stream", self.stream),
@@ -270,6 +272,8 @@ class Replica:
             exception_handlers=self.errors.handlers(),
             lifespan=self._running,
         )
+        _redirect_slashes(application.router)
+        return application
 
     def _league_routes(self) -> list[Route]:
         leagues = LeagueRoutes(self.models)
@@ -328,6 +332,24 @@ class Replica:
             self.models.close()
             self.connection.close()
             self.registry.close()
+
+
+def _redirect_slashes(router: Router) -> None:
+    """Redirect `/docs/` to `/docs` by a relative reference. Starlette's own URLs lack the path prefix of a proxy."""
+    not_found = router.default
+
+    async def default(scope: Scope, receive: Receive, send: Send) -> None:
+        path, raw = scope["path"], scope["raw_path"].decode("latin-1")
+        without = {**scope, "path": path.removesuffix("/")}
+        if raw.endswith("/") and any(route.matches(without)[0] is not Match.NONE for route in router.routes):
+            query = scope["query_string"].decode("latin-1")
+            url = f"../{raw[:-1].rpartition('/')[2]}{'?' * bool(query)}{query}"
+            await RedirectResponse(url)(scope, receive, send)
+        else:
+            await not_found(scope, receive, send)
+
+    router.redirect_slashes = False
+    router.default = default
 
 
 def _access_log(registry: Registry, settings: ServeSettings, replica: str) -> AccessLog | None:

@@ -1,11 +1,15 @@
 """Settings of the service. Limits of Ray Serve itself are in deploy.yaml."""
 
+import re
 from ipaddress import ip_address
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from league.registry.replicas import LIVENESS_TIMEOUT
+
+OWN_PATHS = frozenset(("docs", "leagues", "metrics", "openapi.json", "pages", "v1", "v2"))
+"""First segments of this server's paths."""
 
 
 def is_exposed(host: str) -> bool:
@@ -23,6 +27,9 @@ class ServeSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    root_path: str = ""
+    """Path below which a proxy serves this server, such as `/ai`. The proxy may leave it in the paths of requests, or
+    remove it."""
     max_body: int = Field(default=4 * 2**20, ge=1024)
     """Larger request bodies are refused with 413, and larger messages close their stream with 1009. A replica may hold
     `max_in_flight` bodies at once, and HAProxy retries a request on another replica only if it fits into
@@ -96,6 +103,15 @@ class ServeSettings(BaseModel):
     """Evaluations of one league that may be queued or running; further ones are refused with 429."""
     inline: float = Field(default=0.001, gt=0)
     """Inference that takes longer runs in a thread, so that it delays neither other requests nor health checks."""
+
+    @field_validator("root_path")
+    @classmethod
+    def _is_a_prefix(cls, path: str) -> str:
+        if not re.fullmatch(r"(/[\w.~-]+)*", path, re.ASCII):
+            raise ValueError(f"expected a path like /ai without a slash at its end, got {path!r}")
+        if path.split("/")[1:2] and path.split("/")[1] in OWN_PATHS:
+            raise ValueError(f"{path!r} begins like a path of this server: {', '.join(sorted(OWN_PATHS))}")
+        return path
 
     @model_validator(mode="after")
     def _in_proportion(self) -> Self:

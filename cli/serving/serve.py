@@ -26,6 +26,10 @@ def serve(
         int | None,
         typer.Option(min=1, help="Start up to this number of server processes under load. Default: no more."),
     ] = None,
+    root_path: Annotated[
+        str | None,
+        typer.Option(help="Path below which a proxy serves this server, such as /ai. Default: from deploy.yaml."),
+    ] = None,
     address: Annotated[
         str | None, typer.Option(help="Running Ray cluster. Default: start Ray on this machine.")
     ] = None,
@@ -54,6 +58,7 @@ def serve(
         replicas=replicas,
         max_replicas=max_replicas,
         insecure=insecure,
+        root_path=root_path,
         address=address,
         on_ready=lambda url, logs: say(
             f"Serving the leagues of {storage.home} on {url}\n{hints(open_registry(), url)}\n"

@@ -92,6 +92,7 @@ Document = dict[str, Any]
 def document(settings: ServeSettings, served: Iterable[LoadedVersion]) -> Document:
     """The OpenAPI document. `served`: versions whose policies get examples."""
     described = deepcopy(_source())
+    described["servers"] = [{"url": settings.root_path or "/"}]
     described["info"]["version"] = installed("policy-league")
     schemas = described["components"]["schemas"]
     schemas["ActionRequest"]["properties"]["observations"]["maxItems"] = settings.max_batch

@@ -1,6 +1,7 @@
 // JSON requests to the server, with retries and the API key that the user entered. The key is kept in sessionStorage only.
 
 import { heard } from "./connection.js";
+import { ROOT } from "./router.js";
 
 const MAX_ATTEMPTS = 4;
 const NOT_READY_TIMEOUT = 60000; // milliseconds; `not_ready` is retried until the evaluation service has finished
@@ -15,11 +16,13 @@ export class ApiError extends Error {
   }
 }
 
+const KEY = `key${ROOT}`; // other servers of the same origin, below other prefixes, have keys of their own
+
 export const key = {
-  get: () => sessionStorage.getItem("key"),
+  get: () => sessionStorage.getItem(KEY),
   set(text) {
-    if (text) sessionStorage.setItem("key", text);
-    else sessionStorage.removeItem("key");
+    if (text) sessionStorage.setItem(KEY, text);
+    else sessionStorage.removeItem(KEY);
     promptDeclined = false;
   },
 };
@@ -81,7 +84,7 @@ async function send(path, options, apiKey) {
   const signal = options.signal ? AbortSignal.any([options.signal, late.signal]) : late.signal;
   let response;
   try {
-    response = await fetch(path, { ...options, headers, signal, cache: "no-store", redirect: "error" });
+    response = await fetch(ROOT + path, { ...options, headers, signal, cache: "no-store", redirect: "error" });
   } catch (error) {
     if (options.signal?.aborted) throw error;
     throw new ApiError(0, "network", "The server is not responding.");

@@ -8,7 +8,7 @@ import { League } from "./league.js";
 import { Leagues } from "./leagues.js";
 import { Dialog, Form, Notifications, sentence } from "./components.js";
 import { clock } from "./format.js";
-import { followLinks, matchRoute, useAddress } from "./router.js";
+import { followLinks, matchRoute, ROOT, useAddress } from "./router.js";
 
 const THEMES = ["system", "light", "dark"];
 /** The filled part of the theme icon. */
@@ -36,8 +36,8 @@ function App() {
   return html`
     <a class="skip-link" href="#main" onClick=${(event) => { event.preventDefault(); main.current.focus(); }}>Skip to content</a>
     <header class="header">
-      <a class="brand" href="/"><img src="/pages/logo.svg" alt="" width="24" height="24" /><span>Policy League</span></a>
-      <nav aria-label="Documentation"><a href="/docs">API</a></nav>
+      <a class="brand" href="${ROOT}/"><img src="${ROOT}/pages/logo.svg" alt="" width="24" height="24" /><span>Policy League</span></a>
+      <nav aria-label="Documentation"><a href="${ROOT}/docs">API</a></nav>
       <${Theme} />
       <${KeyButton} isPrompting=${!!prompt} onClick=${() => setPrompt({ message: "", done: () => {}, reloads: true })} />
       <${ServerNotice} />
@@ -98,5 +98,7 @@ function Theme() {
     <svg viewBox="0 0 16 16" width="16" height="16" aria-hidden="true"><circle cx="8" cy="8" r="6.5" /><path d=${ICONS[theme]} /></svg></button>`;
 }
 
+const icon = document.querySelector("link[rel=icon]");
+icon.href = icon.href; // absolute: browsers resolve it again when the address changes
 followLinks();
 render(html`<${App} />`, document.getElementById("app"));

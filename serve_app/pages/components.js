@@ -3,9 +3,10 @@
 import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { count, dateTime, fullDateTime, OUTCOMES, plural, STATES, timeAgo } from "./format.js";
 import { useTicks } from "./data.js";
+import { ROOT } from "./router.js";
 
 /** The page path of a league, or of something in it. */
-export const leaguePath = (league, ...parts) => ["/leagues", league, ...parts].map((part, index) => (index ? encodeURIComponent(part) : part)).join("/");
+export const leaguePath = (league, ...parts) => [`${ROOT}/leagues`, league, ...parts].map((part, index) => (index ? encodeURIComponent(part) : part)).join("/");
 
 /** Set the document title; without a `name` it stays unchanged. */
 export function useTitle(name, ...parts) {

@@ -1,6 +1,7 @@
 // Whether the server responds: one check for all pages.
 
 import { useEffect, useState } from "./vendor/preact-htm.js";
+import { ROOT } from "./router.js";
 
 const BACK = "league:back";
 const CHECK_INTERVAL = 1000; // milliseconds
@@ -45,7 +46,7 @@ export function onBack(handler) {
 async function responds() {
   const before = heardAt;
   for (const timeout of CHECK_TIMEOUTS) {
-    await fetch("/v1/health/live", { signal: AbortSignal.timeout(timeout), cache: "no-store" }).then(({ status }) => heard(status), () => {});
+    await fetch(`${ROOT}/v1/health/live`, { signal: AbortSignal.timeout(timeout), cache: "no-store" }).then(({ status }) => heard(status), () => {});
     if (heardAt > before) return true;
   }
   return false;

@@ -14,7 +14,7 @@ import { Nights } from "./nights.js";
 import { Payoff } from "./payoff.js";
 import { Play } from "./play.js";
 import { Promotions } from "./promotion.js";
-import { matchRoute } from "./router.js";
+import { matchRoute, ROOT } from "./router.js";
 import { Run, Runs } from "./runs.js";
 import { Leaderboard } from "./leaderboard.js";
 import { Traffic } from "./traffic.js";
@@ -57,7 +57,7 @@ export function League({ path }) {
 function NotFound({ path }) {
   useTitle("Not found");
   return html`<div class="title"><h1>Page not found</h1></div>
-    <${EmptyState}>There is no page at <code>${path}</code>. <a href="/">Show all leagues</a><//>`;
+    <${EmptyState}>There is no page at <code>${path}</code>. <a href="${ROOT}/">Show all leagues</a><//>`;
 }
 
 function KnownLeague({ league, route, parameters }) {
@@ -67,12 +67,12 @@ function KnownLeague({ league, route, parameters }) {
   useTitle(route.name, league);
   if (about.error?.status === 404 || about.error?.status === 400) {
     return html`<div class="title"><h1>League <q>${league}</q> not found</h1></div>
-      <${EmptyState}>${sentence(about.error.message)} <a href="/">Show all leagues</a><//>`;
+      <${EmptyState}>${sentence(about.error.message)} <a href="${ROOT}/">Show all leagues</a><//>`;
   }
   const Page = route.page;
   return html`<${LeagueState.Provider} value=${state}>
     <div class="title">
-      <p class="crumbs"><a href="/">Leagues</a></p>
+      <p class="crumbs"><a href="${ROOT}/">Leagues</a></p>
       <h1>${league}</h1>
       ${about.data && html`<${TrafficBadges} about=${about.data} />`}
       ${about.data && html`<${Promotions} league=${league} champion=${about.data.champion} />`}

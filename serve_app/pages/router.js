@@ -2,6 +2,9 @@
 
 import { useLayoutEffect, useState } from "./vendor/preact-htm.js";
 
+/** The path below which the server is: empty, or the prefix of a proxy (`/ai`). */
+export const ROOT = new URL("..", import.meta.url).pathname.slice(0, -1);
+
 const NAVIGATED = "league:navigated";
 
 /** Navigate to another address. `replace`: replace the current history entry. */
@@ -12,7 +15,7 @@ export function navigate(address, { replace = false } = {}) {
   dispatchEvent(new Event(NAVIGATED));
 }
 
-/** {path, parameters, fragment} of the current address; updated on navigation. */
+/** {path, parameters, fragment} of the current address, the path without ROOT; updated on navigation. */
 export function useAddress() {
   const [address, setAddress] = useState(currentAddress);
   // A layout effect: an effect would run after the page is visible, and miss a navigation before.
@@ -26,7 +29,7 @@ export function useAddress() {
 }
 
 function currentAddress() {
-  return { path: location.pathname, parameters: new URLSearchParams(location.search), fragment: location.hash.slice(1) };
+  return { path: location.pathname.slice(ROOT.length), parameters: new URLSearchParams(location.search), fragment: location.hash.slice(1) };
 }
 
 /** Handle clicks on links to these pages. The browser handles other links, downloads and clicks that open a new tab. */
@@ -35,7 +38,7 @@ export function followLinks() {
     const link = event.target.closest?.("a[href]");
     if (!link || event.defaultPrevented || event.button || event.metaKey || event.ctrlKey || event.shiftKey || event.altKey) return;
     if (link.origin !== location.origin || link.target || link.hasAttribute("download")) return;
-    if (!(link.pathname === "/" || link.pathname.startsWith("/leagues")) || link.getAttribute("href").startsWith("#")) return;
+    if (!(link.pathname === `${ROOT}/` || link.pathname.startsWith(`${ROOT}/leagues`)) || link.getAttribute("href").startsWith("#")) return;
     event.preventDefault();
     navigate(link.href);
   });

@@ -69,7 +69,8 @@ class EvaluationRoutes:
 
         row = await self._models.change(submit, request.scope[DEADLINE])
         evaluation_client.notify()
-        return JSONResponse(documents.evaluation_document(row), 202, {"location": f"{request.url.path}/{row.id}"})
+        location = f"{self._settings.root_path}{request.url.path}/{row.id}"
+        return JSONResponse(documents.evaluation_document(row), 202, {"location": location})
 
     async def page(self, request: Request) -> JSONResponse:
         """A page of a league's evaluations, without results. Raises UnknownLeague or InvalidInput."""

@@ -6,18 +6,18 @@
 
 None of them requires a key. The OpenAPI document contains examples of policies only if the presented key may read all
 leagues. Pages load nothing from other origins, run only their own scripts, and cannot be framed. Browsers revalidate
-their copies by ETag.
+their copies by ETag. All references are relative, so that the pages work below any prefix that a proxy adds to paths.
 """
 
 from __future__ import annotations
 
 import asyncio
 import gzip
+import re
 from base64 import b64encode
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from re import DOTALL, findall
 
 import orjson
 from starlette.exceptions import HTTPException
@@ -69,7 +69,8 @@ class DocsRoutes:
 
 def _content_security_policy(page: bytes) -> str:
     """A Content-Security-Policy that permits only the page's own script and requests to its own server."""
-    scripts = [b64encode(sha256(code).digest()).decode() for code in findall(rb"<script>(.*?)</script>", page, DOTALL)]
+    codes = re.findall(rb"<script>(.*?)</script>", page, re.DOTALL)
+    scripts = [b64encode(sha256(code).digest()).decode() for code in codes]
     allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
@@ -95,6 +96,8 @@ HEADERS = {
     "cache-control": "no-cache",
     "vary": "accept-encoding",
 }
+MAX_DEPTH = 8
+"""Slashes after the first one in the path of a page."""
 MIN_COMPRESSED_BYTES = 1024
 """Smaller files are not compressed."""
 
@@ -109,9 +112,8 @@ class StaticFile:
     etag: str
 
     @classmethod
-    def read(cls, path: Path) -> StaticFile:
-        """Read and compress a file."""
-        plain = path.read_bytes()
+    def of(cls, path: Path, plain: bytes) -> StaticFile:
+        """Compress the content of a file."""
         zipped = gzip.compress(plain, mtime=0) if len(plain) >= MIN_COMPRESSED_BYTES else None
         return cls(plain, zipped, MEDIA_TYPES[path.suffix], f'W/"{sha256(plain).hexdigest()[:24]}"')
 
@@ -130,7 +132,8 @@ class PageRoutes:
 
     def __init__(self) -> None:
         paths = (path for path in FILES.rglob("*") if path.suffix in MEDIA_TYPES)
-        self._files = {path.relative_to(FILES).as_posix(): StaticFile.read(path) for path in paths}
+        self._files = {path.relative_to(FILES).as_posix(): StaticFile.of(path, path.read_bytes()) for path in paths}
+        self._documents = [StaticFile.of(FILES / DOCUMENT, _document(depth)) for depth in range(MAX_DEPTH + 1)]
 
     def routes(self) -> list[Route]:
         """The routes, which are not part of the API."""
@@ -139,8 +142,11 @@ class PageRoutes:
         return [Route(path, endpoint, include_in_schema=False) for path, endpoint in places]
 
     async def document(self, request: Request) -> Response:
-        """The HTML document, the same for every page: its script renders what the address names."""
-        return self._files[DOCUMENT].response(request)
+        """The HTML document, which differs by the depth of the path only: its script renders what the address names."""
+        depth = request.scope["raw_path"].count(b"/") - 1  # as the browser counts: an encoded slash does not separate
+        if depth > MAX_DEPTH:
+            raise HTTPException(404)
+        return self._documents[depth].response(request)
 
     async def file(self, request: Request) -> Response:
         """A static file."""
@@ -148,3 +154,8 @@ class PageRoutes:
         if found is None:
             raise HTTPException(404)
         return found.response(request)
+
+
+def _document(depth: int) -> bytes:
+    """The document for paths with this number of slashes after the first one. Its references start with a slash."""
+    return re.sub(rb'(href|src)="/', rb'\1="' + (b"../" * depth or b"./"), (FILES / DOCUMENT).read_bytes())

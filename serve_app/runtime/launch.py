@@ -51,6 +51,7 @@ def serve_forever(
     replicas: int | None = None,
     max_replicas: int | None = None,
     insecure: bool = False,
+    root_path: str | None = None,
     address: str | None = None,
     deploy: Path = DEPLOY_YAML,
     on_ready: Callable[[str, Path], None] | None = None,
@@ -67,6 +68,7 @@ def serve_forever(
         replicas: Number of replicas, or the minimum if `max_replicas` is larger; None for that of `deploy`.
         max_replicas: Maximum number of replicas, which then follows the load; None for `replicas`, or that of `deploy`.
         insecure: Accept requests without an API key, even from other machines.
+        root_path: The path below which a proxy serves the server; None for that of `deploy`.
         address: A running Ray cluster to serve on, whose nodes have the environment that deploy.yaml lists, as has this
             process. None starts a Ray on the loopback interface.
         deploy: The deploy.yaml.
@@ -82,7 +84,7 @@ def serve_forever(
     """
     if "ray" in sys.modules:
         raise RuntimeError("serve_forever must set Ray's environment before ray is imported")
-    document = load_document(deploy, host, port, grpc_port, replicas, max_replicas, insecure)
+    document = load_document(deploy, host, port, grpc_port, replicas, max_replicas, insecure, root_path)
     _check_exposure(document, storage)
     storage.export()
     try:
@@ -105,6 +107,7 @@ def running(
     replicas: int | None = None,
     max_replicas: int | None = None,
     insecure: bool = False,
+    root_path: str | None = None,
     deploy: Path = DEPLOY_YAML,
     timeout: float = START_TIMEOUT,
 ) -> Iterator[str]:
@@ -118,6 +121,7 @@ def running(
         replicas: As for `serve_forever`.
         max_replicas: As for `serve_forever`.
         insecure: Accept requests without an API key.
+        root_path: As for `serve_forever`.
         deploy: The deploy.yaml.
         timeout: Seconds until every replica must answer.
 
@@ -138,6 +142,7 @@ def running(
         "replicas": replicas,
         "max_replicas": max_replicas,
         "insecure": insecure,
+        "root_path": root_path,
     }
     order = json.dumps({"deploy": str(deploy), "arguments": arguments})
     with tempfile.TemporaryFile() as log:
@@ -156,6 +161,7 @@ def load_document(
     replicas: int | None,
     max_replicas: int | None,
     insecure: bool,
+    root_path: str | None = None,
 ) -> dict[str, Any]:
     """deploy.yaml with the caller's overrides. Raises ConfigError."""
     try:
@@ -167,6 +173,8 @@ def load_document(
         _set_replicas(application["deployments"][0], replicas, max_replicas)
         if insecure:
             application["args"] = application.get("args", {}) | {"require_keys": "never"}
+        if root_path is not None:
+            application["args"] = application.get("args", {}) | {"root_path": root_path}
     except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
         reason = one_line(error)
         raise ConfigError(

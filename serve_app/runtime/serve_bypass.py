@@ -21,12 +21,13 @@ EVENT_STREAM_PATH = re.compile("/v1/leagues/[^/]+/(evaluations/[^/]+/)?events")
 """Paths of event streams."""
 PROTOCOLS = ("http", "websocket")
 _application: ASGIApp | None = None
+_root_path = ""
 
 
-def install(application: ASGIApp) -> None:
-    """Send requests that bypass Serve in this process to `application`."""
-    global _application
-    _application = application
+def install(application: ASGIApp, root_path: str = "") -> None:
+    """Send requests that bypass Serve in this process to `application`, and remove `root_path` from all paths."""
+    global _application, _root_path
+    _application, _root_path = application, root_path
 
 
 def middlewares() -> list[Middleware]:
@@ -42,6 +43,8 @@ class ServeBypass:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch a request."""
+        if _root_path and scope["type"] in PROTOCOLS:
+            scope = _below_root(scope)
         if _application is not None and scope["type"] in PROTOCOLS and _bypasses_serve(scope["path"]):
             await _application(scope, receive, send)
         else:
@@ -51,6 +54,14 @@ class ServeBypass:
 def is_event_stream(path: str) -> bool:
     """Whether a path is that of an event stream, which has no end of its own."""
     return path.endswith("/events") and EVENT_STREAM_PATH.fullmatch(path) is not None
+
+
+def _below_root(scope: Scope) -> Scope:
+    """A request without the root path, which a proxy may have removed."""
+    path, raw = scope["path"], scope["raw_path"]
+    if not (raw + b"/").startswith(_root_path.encode() + b"/"):
+        return scope
+    return {**scope, "path": path[len(_root_path) :] or "/", "raw_path": raw[len(_root_path) :] or b"/"}
 
 
 def _bypasses_serve(path: str) -> bool:

@@ -3,6 +3,7 @@
 import hashlib
 import re
 from pathlib import Path
+from urllib.parse import urljoin
 
 import pytest
 from starlette.testclient import TestClient
@@ -15,11 +16,42 @@ PAGE_FILES = [path for path in FILES.iterdir() if path.suffix in MEDIA_TYPES]
 SCRIPTS = [path for path in PAGE_FILES if path.suffix == ".js"]
 
 
-@pytest.mark.parametrize("path", ["/", "/leagues", "/leagues/board", "/leagues/nowhere/verdicts/%3Cb%3E"])
-def test_all_pages_are_the_same_document(read_only_client: TestClient, path: str) -> None:
-    reply = read_only_client.get(path)
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/",
+        "/leagues",
+        "/leagues/",
+        "/leagues/board",
+        "/leagues/nowhere/verdicts/%3Cb%3E",
+        "/leagues/a%2F..%2Fb",
+        "/leagues/b/matches/s/0/1",
+    ],
+)
+@pytest.mark.parametrize("prefix", ["", "/ai", "/very/long"])
+def test_all_pages_are_the_same_document_whose_references_hold_below_any_prefix(
+    read_only_client: TestClient, path: str, prefix: str
+) -> None:
+    reply = read_only_client.get(path)  # as a proxy sends it that has removed the prefix
     assert (reply.status_code, reply.headers["content-type"]) == (200, "text/html; charset=utf-8")
-    assert reply.text == (FILES / "index.html").read_text()
+    document = (FILES / "index.html").read_text()
+    shown = re.sub(
+        r'(?<=href="|.src=")[^"]+', lambda found: urljoin(f"http://host{prefix}{path}", found[0]), reply.text
+    )
+    assert shown == re.sub(r'(?<=href="|.src=")/', f"http://host{prefix}/", document)
+
+
+def test_a_path_with_too_many_slashes_is_no_page(read_only_client: TestClient) -> None:
+    assert read_only_client.get("/leagues" + "/a" * 20).status_code == 404
+
+
+@pytest.mark.parametrize(("path", "target"), [("/docs/", "/docs"), ("/v1/leagues/?limit=1", "/v1/leagues?limit=1")])
+def test_redirects_are_relative(read_only_client: TestClient, path: str, target: str) -> None:
+    reply = read_only_client.get(path, follow_redirects=False)
+    assert reply.status_code == 307
+    assert urljoin(f"https://host/ai{path}", reply.headers["location"]) == f"https://host/ai{target}"
+    assert read_only_client.get(path).status_code == 200
+    assert read_only_client.get("/nothing/").status_code == 404
 
 
 def test_the_content_security_policy_allows_own_resources_only(read_only_client: TestClient) -> None:

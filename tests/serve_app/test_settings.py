@@ -18,6 +18,11 @@ from serve_app.settings import ServeSettings
         ({"poll": 10}, "poll_slowest must be at least poll"),
         ({"max_body": 1}, "max_body"),
         ({"max_bodies": 1}, "max_bodies"),
+        ({"root_path": "ai"}, "expected a path like /ai"),
+        ({"root_path": "/ai/"}, "expected a path like /ai"),
+        ({"root_path": "/ai?x"}, "expected a path like /ai"),
+        ({"root_path": "/leagues"}, "begins like a path of this server"),
+        ({"root_path": "/v1/ai"}, "begins like a path of this server"),
     ],
 )
 def test_inconsistent_settings_are_rejected(setting: dict[str, Any], message: str) -> None:

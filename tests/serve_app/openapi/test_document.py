@@ -18,6 +18,7 @@ from serve_app.access.permissions import for_request
 from serve_app.app import Replica
 from serve_app.openapi.document import document
 from serve_app.runtime import haproxy_script
+from serve_app.settings import OWN_PATHS
 from tests.support.servers.replicas import QUICK
 
 ROOT = Path(__file__).parents[3]
@@ -59,6 +60,19 @@ def test_it_describes_exactly_the_routes(openapi: dict[str, Any], registry: Regi
         methods = {"GET"} if isinstance(route, WebSocketRoute) else (route.methods or set()) - {"HEAD"}
         routes |= {(route.path, method) for method in methods}
     assert {(path, method) for path, method, _ in operations(openapi)} == routes
+
+
+def test_its_server_is_below_the_root_path(openapi: dict[str, Any]) -> None:
+    assert openapi["servers"] == [{"url": "/"}]
+    assert document(QUICK.model_copy(update={"root_path": "/ai"}), [])["servers"] == [{"url": "/ai"}]
+
+
+def test_settings_know_the_first_segments_of_all_paths(registry: Registry) -> None:
+    routes = Replica(registry, QUICK, "replica-1").application().routes
+    assert {route.path.split("/")[1] for route in routes if isinstance(route, Route | WebSocketRoute)} == {
+        "",
+        *OWN_PATHS,
+    }
 
 
 def test_it_names_the_required_scope_of_each_operation(openapi: dict[str, Any]) -> None:
