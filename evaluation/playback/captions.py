@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,8 @@ class Line:
     """One agent or a group of agents.
 
     color: number of the contestant. chances: (action, probability), most probable first; for a group, the share of each
-    action. value: return so far; for a group, the mean.
+    action. value: return so far; for a group, the mean. shade: colour of the agents in the pictures, if the environment
+    declares it.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Line:
     chances: tuple[tuple[str, float], ...]
     value: float
     acted: bool
+    shade: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +54,15 @@ class Caption:
 class Captions:
     """Generates the captions of one game. An agent's last action stays until its next."""
 
-    def __init__(self, title: str, interface: Interface, controllers: Mapping[str, str]) -> None:
-        """controllers: agent → reference of who controls it."""
+    def __init__(
+        self,
+        title: str,
+        interface: Interface,
+        controllers: Mapping[str, str],
+        shades: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """controllers: agent → reference of who controls it. shades: agent → its colour in the pictures."""
+        self._shades = shades
         self._title, self._interface, self._controllers = title, interface, controllers
         self._last: dict[str, Move] = {}
         self._colors = {ref: number for number, ref in enumerate(dict.fromkeys(controllers.values()))}
@@ -81,6 +91,7 @@ class Captions:
         moves = [self._last[agent] for agent in agents if agent in self._last]
         space = self._interface.agents[agents[0]].action
         ref = self._controllers[agents[0]]
+        shades = {self._shades.get(agent) for agent in agents}
         return Line(
             name=name,
             ref=ref,
@@ -89,6 +100,7 @@ class Captions:
             chances=_named(chances(moves[0], space)) if len(agents) == 1 and moves else _shares(moves),
             value=sum(step.returns[agent] for agent in agents) / len(agents),
             acted=not acting.isdisjoint(agents),
+            shade=shades.pop() if len(shades) == 1 else None,
         )
 
 

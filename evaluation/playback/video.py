@@ -8,7 +8,7 @@ import tempfile
 import time
 from base64 import b64encode
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -18,10 +18,11 @@ from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont, ImageSequence
 from PIL.TiffImagePlugin import AppendingTiffWriter
 
 from evaluation.playback.captions import Caption, Captions, Line
+from evaluation.playback.environment_hooks import environment_hooks
 from evaluation.playback.replay import GameSource
 from league.config.environment import EnvironmentConfig
 from league.environments.building import build
@@ -62,7 +63,7 @@ ACTION = 54
 BACKGROUND, PANEL, RULE = (17, 20, 24), (25, 29, 35), (48, 54, 63)
 TEXT, DIM = (233, 236, 239), (139, 147, 158)
 COLORS = ((88, 166, 255), (255, 166, 77), (99, 201, 133), (219, 124, 214), (240, 98, 104), (240, 214, 98))
-"""One per contestant."""
+"""One per contestant, unless the environment declares colours of agents."""
 
 
 class FrameComposer:
@@ -110,7 +111,7 @@ class FrameComposer:
 
     def _line(self, draw: ImageDraw.ImageDraw, top: int, line: Line) -> None:
         width, middle = self._size[0], top + ROW // 2
-        color = COLORS[line.color % len(COLORS)]
+        color = _color(line)
         bright = TEXT if line.acted else DIM
         action_at, value_at = self._action_at, width - MARGIN
         draw.ellipse((MARGIN, middle - 5, MARGIN + 10, middle + 5), color if line.acted else PANEL, color, 2)
@@ -138,10 +139,18 @@ class FrameComposer:
             left = span[0] + cell * place
             right = left + cell - 10
             draw.text((left, middle - 3), action, TEXT if line.acted else DIM, _font(13), "lm")
-            draw.text((right, middle - 3), f"{chance:.0%}", DIM, _font(13), "rm")
+            draw.text((right, middle - 3), f"{100 * chance:.0f} %", DIM, _font(13), "rm")
             draw.rectangle((left, middle + 8, right, middle + 10), RULE)
             if (filled := round((right - left) * chance)) > 0:
                 draw.rectangle((left, middle + 8, left + filled, middle + 10), color)
+
+
+def _color(line: Line) -> tuple[int, int, int]:
+    """The colour of the agents in the picture, or one of the contestant."""
+    with suppress(ValueError):  # a colour that Pillow does not know
+        if line.shade is not None:
+            return ImageColor.getrgb(line.shade)[:3]
+    return COLORS[line.color % len(COLORS)]
 
 
 def _fitted(width: int, height: int) -> tuple[int, int]:
@@ -219,7 +228,9 @@ def write_video(
         raise ConfigError(f"--out {out}: expected a name that ends in {' or '.join(FORMATS)}")
     _require(source, "rgb_array")
     environment = stock_stepping(source.config.environment, 1, render_mode="rgb_array")
-    captions, frames, turns, last = Captions(source.title, source.interface, source.controllers), None, True, None
+    shades = environment_hooks(source.config.environment).declared.agent_colors
+    captions = Captions(source.title, source.interface, source.controllers, shades)
+    frames, turns, last = None, True, None
     with closing(environment), tempfile.TemporaryFile() as spool:
         with AppendingTiffWriter(spool) as writer:
             for last in islice(source.play(environment), max_frames):
@@ -276,11 +287,16 @@ def _require(source: GameSource, mode: str) -> None:
 
 
 def _write(spool: IO[bytes], out: Path, seconds: Sequence[float]) -> None:
+    kind = FORMATS[out.suffix.lower()]
     with disk_errors(out, action="written"), replacing(out) as part, Image.open(spool) as frames:
-        frames.save(
+        # GIF: Pillow's own choice of colours, a median cut, loses those of the small discs of the legend.
+        few = (frame.quantize(method=Image.Quantize.FASTOCTREE) for frame in ImageSequence.Iterator(frames))
+        first, rest = (next(few), few) if kind == "GIF" else (frames, ())
+        first.save(
             part,
-            FORMATS[out.suffix.lower()],
+            kind,
             save_all=True,
+            append_images=rest,
             duration=[round(1000 * each) for each in seconds],
             loop=0,
             quality=85,

@@ -48,6 +48,19 @@ def test_an_agents_action_is_shown_until_its_next() -> None:
     assert (second.title, second.step) == ("a game", "step 2 · end")
 
 
+def test_lines_have_the_colours_of_their_agents() -> None:
+    two, many = interface(2, Discrete(n=3)), interface(8, Discrete(n=3), policies=2)
+    shades = {f"agent_{i}": ("red", "gray")[i % 2] for i in range(8)}
+    for league_interface, declared, expected in (
+        (two, shades, ["red", "gray"]),
+        (two, {"agent_0": "red"}, ["red", None]),
+        (many, shades, ["red", "gray"]),
+        (many, shades | {"agent_7": "blue"}, ["red", None]),
+    ):
+        drawn = Captions("a game", league_interface, dict.fromkeys(league_interface.agents, "league@1"), declared)
+        assert [line.shade for line in drawn.of(game_step(0, {}, 8)).lines] == expected
+
+
 def test_the_most_probable_actions_have_their_names_in_the_environment() -> None:
     caption = captions(interface(1, Discrete(n=4, start=5)))
     logits = np.log([0.1, 0.6, 0.05, 0.25])

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from evaluation.matches.tournament import evaluate
+from evaluation.playback.environment_hooks import KNOWN
 from evaluation.playback.replay import GameSource, live_game, recorded_game
 from evaluation.playback.video import FrameComposer, show_window, write_video
 from league.config.league import LeagueConfig
@@ -77,6 +78,15 @@ def test_a_turn_based_game_has_a_frame_for_each_move(registry: Registry, tmp_pat
         assert durations[-1] == 2000
     assert sum(result.returns.values()) == 0
     assert len({frame.tobytes() for frame in frames}) == len(frames), "all frames differ"
+
+
+def test_the_legend_of_a_gif_has_the_colours_of_the_marks(registry: Registry, tmp_path: Path) -> None:
+    write_video(live_game(["tictactoe@2", "script:one_ply"], registry), tmp_path / "game.gif")
+    _, frames, _ = read_video(tmp_path / "game.gif")
+    colors = KNOWN["tictactoe_v3"]["agent_colors"].values()
+    for frame in (frames[0], frames[-1]):
+        legend = np.array(frame.crop((10, frame.height - 70, 28, frame.height))).reshape(-1, 3).astype(int)
+        assert [abs(legend - ImageColor.getrgb(color)).max(axis=1).min() < 16 for color in colors] == [True, True]
 
 
 def test_simultaneous_agents_have_a_frame_for_each_step(registry: Registry, tmp_path: Path) -> None:
