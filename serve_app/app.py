@@ -299,6 +299,7 @@ class Replica:
             Route("/v1/leagues/{league}/runs", runs.page),
             Route("/v1/leagues/{league}/runs/{run}", runs.get),
             Route("/v1/leagues/{league}/nights", nights.page),
+            Route("/v1/leagues/{league}/nightly-runs", nights.nightly_runs),
             Route("/v1/leagues/{league}/aliases/{alias}/history", aliases.history),
             Route("/v1/leagues/{league}/aliases/{alias}", aliases.move, methods=["POST"]),
             Route("/v1/leagues/{league}/rollback", aliases.roll_back, methods=["POST"]),

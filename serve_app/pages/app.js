@@ -8,7 +8,7 @@ import { League } from "./league.js";
 import { Leagues } from "./leagues.js";
 import { Dialog, Form, Notifications, sentence } from "./components.js";
 import { clock } from "./format.js";
-import { followLinks, matchRoute, ROOT, useAddress } from "./router.js";
+import { followLinks, keepPositions, matchRoute, ROOT, useAddress } from "./router.js";
 
 const THEMES = ["system", "light", "dark"];
 /** The filled part of the theme icon. */
@@ -101,4 +101,5 @@ function Theme() {
 const icon = document.querySelector("link[rel=icon]");
 icon.href = icon.href; // absolute: browsers resolve it again when the address changes
 followLinks();
+keepPositions();
 render(html`<${App} />`, document.getElementById("app"));

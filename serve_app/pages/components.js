@@ -60,6 +60,15 @@ export function State({ value }) {
   return html`<${Badge} tone=${tone} sign=${sign}>${label}<//>`;
 }
 
+const MAX_SHOWN = 120;
+
+/** Text of people in a cell of a table: the beginning of a long one, which opens. */
+export function LongText({ children: text }) {
+  if (!text) return html`<span class="muted">–</span>`;
+  if (text.length <= MAX_SHOWN) return text;
+  return html`<details class="long"><summary>${text.slice(0, MAX_SHOWN)} …</summary>${text}</details>`;
+}
+
 /** A contestant, with a badge if it is the champion. */
 export function Ref({ value, champion }) {
   const isChampion = champion != null && value.endsWith(`@${champion}`) && !value.startsWith("script:") && !value.includes("://");

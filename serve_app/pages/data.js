@@ -4,6 +4,7 @@ import { createContext, useCallback, useContext, useEffect, useRef, useState } f
 import { ApiError, isTemporary, key, query, request } from "./api.js";
 import { onBack } from "./connection.js";
 import { follow } from "./events.js";
+import { remember } from "./router.js";
 
 const PAGE = 50;
 const MAX_LIMIT = 100;
@@ -19,8 +20,7 @@ export function useData(path, token = "", every = null) {
 
 /** {items, more, error, retry} of a list with cursor pagination. `more()` loads the next page; it is null on the last page. */
 export function useList(path, name, token = "") {
-  const [minimum, setMinimum] = useState(PAGE);
-  useEffect(() => setMinimum(PAGE), [path]);
+  const [minimum, setMinimum] = useMinimum(path);
   const load = (signal) => loadPages(path, name, minimum, signal);
   const { data, error, retry } = useLoaded(path, `${token} ${minimum}`, load);
   return { items: data?.items ?? null, more: data?.next != null ? () => setMinimum(data.items.length + PAGE) : null, error, retry };
@@ -41,8 +41,7 @@ async function loadPages(path, name, minimum, signal) {
 
 /** {items, page, more, error, retry} of a list with offset pagination (`?limit=&offset=`) and a `total`. */
 export function useOffsetList(path, name, token = "") {
-  const [minimum, setMinimum] = useState(PAGE);
-  useEffect(() => setMinimum(PAGE), [path]);
+  const [minimum, setMinimum] = useMinimum(path);
   const load = async (signal) => {
     let page = null;
     const items = [];
@@ -55,6 +54,14 @@ export function useOffsetList(path, name, token = "") {
   const { data, error, retry } = useLoaded(path, `${token} ${minimum}`, load);
   const more = data && data.items.length < data.page.total ? () => setMinimum(data.items.length + PAGE) : null;
   return { items: data?.items ?? null, page: data?.page ?? null, more, error, retry };
+}
+
+/** The number of items of a list that are loaded: a page, or what was shown when the user left this history entry. */
+function useMinimum(path) {
+  const shown = history.state?.list === path ? history.state.shown : PAGE;
+  const [state, setState] = useState({ path, minimum: shown });
+  const set = (minimum) => { remember({ list: path, shown: minimum }); setState({ path, minimum }); };
+  return [state.path === path ? state.minimum : PAGE, set];
 }
 
 function useLoaded(path, token, load, every = null) {
@@ -116,6 +123,9 @@ export function useTicks(milliseconds) {
   }, [milliseconds]);
   return ticks;
 }
+
+/** Whether all agents of a league are a team, so that contestants do not meet in a game. `about`: the league. */
+export const hasOneSide = (about) => Object.keys(about.sides).length === 1;
 
 /** Add parameters to a path that may have a query string. */
 function withQuery(path, parameters) {

@@ -3,7 +3,7 @@
 import { html, useState } from "./vendor/preact-htm.js";
 import { apiPath, request } from "./api.js";
 import { useChangeToken, useData, useList, useMissingScope } from "./data.js";
-import { Await, EmptyState, Form, leaguePath, Progress, ShowMore, State, Table, Time, useTitle } from "./components.js";
+import { Await, EmptyState, Form, leaguePath, LongText, Progress, ShowMore, State, Table, Time, useTitle } from "./components.js";
 import { navigate } from "./router.js";
 import { mixture, shortRef } from "./format.js";
 
@@ -28,7 +28,7 @@ function Row({ league, evaluation: each }) {
     <td><${State} value=${each.state} /></td>
     <td>${typeOf(each.request)}</td>
     <td>${progress ? html`<${Progress} played=${progress.played} of=${progress.of} label="Progress of evaluation ${each.evaluation}" />` : html`<span class="muted">–</span>`}</td>
-    <td class="wrap">${each.actor}</td><td class="wrap">${each.reason ?? html`<span class="muted">–</span>`}</td>
+    <td class="wrap"><${LongText}>${each.actor}<//></td><td class="wrap long"><${LongText}>${each.reason}<//></td>
     <td class="nowrap"><${Time} at=${each.created_at} /></td>
   </tr>`;
 }

@@ -33,8 +33,8 @@ export const percent = (share, digits = 1) => {
   return `${share && Number(rounded) === 0 ? (100 * share).toPrecision(2) : rounded} %`;
 };
 
-/** The members of a mixture: `60 % @3, 40 % @5`. */
-export const mixture = (members) => members.map((each) => `${percent(each.probability, 0)} @${each.version}`).join(", ");
+/** The members of a mixture: `60.0 % @3, 40.0 % @5`. */
+export const mixture = (members) => members.map((each) => `${percent(each.probability)} @${each.version}`).join(", ");
 
 /** An interval; a null bound is infinite. */
 export function interval(bounds) {

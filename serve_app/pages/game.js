@@ -2,6 +2,7 @@
 
 import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { apiPath, query, request } from "./api.js";
+import { hasOneSide } from "./data.js";
 import { useKeys } from "./keyboard.js";
 import { Await, ErrorNotice, leaguePath, notify, Properties, useTitle } from "./components.js";
 import { describe, Moves, Picture } from "./step.js";
@@ -11,10 +12,11 @@ import { number, plural, shortRef } from "./format.js";
 const PAGE = 50;
 const SPEEDS = [0.5, 1, 2, 4, 8];
 
-export function Game({ league, schedule, position, game }) {
+export function Game({ league, schedule, position, game, about }) {
   const path = apiPath(league, "matches", schedule, position, "games", game);
   const [recording, error, loadFrom] = useSteps(path);
-  useTitle(recording && Object.values(recording.players).map(shortRef).join(" against "), league);
+  const players = recording && [...new Set(Object.values(recording.players))];
+  useTitle(players?.map(shortRef).join(hasOneSide(about) ? " and " : " against "), league);
   return html`<section aria-labelledby="heading">
     <p class="crumbs"><a href=${leaguePath(league, "matches", schedule, position)}>Match</a></p>
     <div class="head"><h2 id="heading">Game ${game}</h2>${recording && !recording.fault && html`<${DownloadGif} path=${path} name="${league}-${schedule}-${position}-${game}.gif" />`}</div>
@@ -48,13 +50,19 @@ function Player({ recording, loadFrom }) {
   const { fragment } = useAddress();
   const last = recording.length;
   const names = recording.action_names;
-  const [at, setAt] = useState(() => Math.min(last, Math.max(0, Number(fragment) || 0)));
+  const clamped = (step) => Math.min(last, Math.max(0, Math.floor(Number(step)) || 0));
+  const [at, setAt] = useState(() => clamped(fragment));
+  const written = useRef(fragment);
   const [isPlaying, setIsPlaying] = useState(false);
   const [speed, setSpeed] = useState(1);
   const step = recording.steps[at];
-  const move = (to) => { setIsPlaying(false); setAt(Math.min(last, Math.max(0, to))); };
+  const move = (to) => { setIsPlaying(false); setAt(clamped(to)); };
   const toggle = () => { if (!isPlaying && at === last) setAt(0); setIsPlaying(!isPlaying); };
-  useEffect(() => { loadFrom(at); if (at + PAGE / 2 <= last) loadFrom(at + PAGE / 2); navigate(`#${at}`, { replace: true }); }, [at]);
+  useEffect(() => { loadFrom(at); if (at + PAGE / 2 <= last) loadFrom(at + PAGE / 2); written.current = String(at); navigate(`#${at}`, { replace: true }); }, [at]);
+  useEffect(() => {
+    const now = location.hash.slice(1); // `fragment` may be older than what was written
+    if (now !== written.current) move(now); // the user has changed the address
+  }, [fragment]);
   useEffect(() => {
     if (!isPlaying || !step) return undefined; // waits until the step is loaded
     if (at === last) { setIsPlaying(false); return undefined; }

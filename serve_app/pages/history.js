@@ -3,7 +3,7 @@
 import { html, useState } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
 import { useChangeToken, useData, useList } from "./data.js";
-import { Await, EmptyState, leaguePath, ShowMore, Table, Time } from "./components.js";
+import { Await, EmptyState, leaguePath, LongText, ShowMore, Table, Time } from "./components.js";
 
 export function History({ league, about }) {
   const aliases = [...new Set(["champion", ...Object.keys(about.aliases ?? {})])];
@@ -30,8 +30,8 @@ function Row({ league, event }) {
     <th scope="row"><span class="ref">@${event.version}</span></th>
     <td>${event.previous == null ? html`<span class="muted">–</span>` : html`<span class="ref">@${event.previous}</span>`}</td>
     <td class="nowrap">${event.verdict ? html`<a href=${leaguePath(league, "verdicts", event.verdict)}>${change}</a>` : change}</td>
-    <td class="wrap">${event.actor}</td>
-    <td class="wrap">${event.reason}</td>
+    <td class="wrap long"><${LongText}>${event.actor}<//></td>
+    <td class="wrap long"><${LongText}>${event.reason}<//></td>
   </tr>`;
 }
 

@@ -30,7 +30,7 @@ const TABS = [
   ["History", "history", History],
   ["Traffic", "traffic", Traffic],
   ["Evaluations", "evaluations", Evaluations],
-  ["Training", "runs", Runs],
+  ["Training", "training", Runs],
   ["Nights", "nights", Nights],
   ["Play", "play", Play],
 ];
@@ -38,11 +38,13 @@ const TABS = [
 const REFRESH_INTERVAL = 5000;
 const LEAGUE = "/leagues/:league";
 const ROUTES = [
-  ...TABS.map(([name, path, page]) => [`${LEAGUE}/${path}`, { tab: path, page, name, isCompact: page === Play }]),
+  ...TABS.flatMap(([name, path, page]) => [path, name.toLowerCase().replace(" ", "-")].map((part) => [`${LEAGUE}/${part}`, { tab: path, page, name, isCompact: page === Play }])),
   [`${LEAGUE}/verdicts/:verdict`, { tab: "verdicts", page: Verdict }],
   [`${LEAGUE}/evaluations/new`, { tab: "evaluations", page: NewEvaluation }],
   [`${LEAGUE}/evaluations/:evaluation`, { tab: "evaluations", page: Evaluation }],
-  [`${LEAGUE}/runs/:run`, { tab: "runs", page: Run }],
+  [`${LEAGUE}/training/:run`, { tab: "training", page: Run }],
+  [`${LEAGUE}/runs`, { tab: "training", page: Runs, name: "Training" }], // as in the API, and in links of before
+  [`${LEAGUE}/runs/:run`, { tab: "training", page: Run }],
   [`${LEAGUE}/matches`, { tab: "payoff", page: Matches }],
   [`${LEAGUE}/matches/:schedule/:position`, { tab: "payoff", page: Match }],
   [`${LEAGUE}/matches/:schedule/:position/:game`, { tab: "payoff", page: Game, isCompact: true }],

@@ -31,7 +31,7 @@ function List({ leagues }) {
 function Row({ row }) {
   const { league, last_verdict: verdict } = row;
   return html`<tr>
-    <th scope="row"><a href=${leaguePath(league)}>${league}</a>${row.archived_at && html` <span class="muted small">archived</span>`}</th>
+    <th scope="row"><a class="ref" href=${leaguePath(league)}>${league}</a>${row.archived_at && html` <span class="muted small">archived</span>`}</th>
     <td data-label="Champion">${row.champion == null ? html`<span class="muted">none</span>` : html`<span class="ref">@${row.champion}</span>`}</td>
     <td class="number" data-label="Versions">${count(row.versions)}</td>
     <td data-label="Last verdict">${verdict ? html`<a class="plain-link" href=${leaguePath(league, "verdicts", verdict.verdict)}>
@@ -45,6 +45,6 @@ function Row({ row }) {
 
 function Activity({ row: { league, running_evaluations: evaluations, running_runs: runs } }) {
   if (!evaluations && !runs) return html`<span class="muted">–</span>`;
-  return html`${runs > 0 && html`<a class="plain-link" href=${leaguePath(league, "runs")}><${Badge} tone="accent" sign="●">${plural(runs, "training run")}<//></a> `}
+  return html`${runs > 0 && html`<a class="plain-link" href=${leaguePath(league, "training")}><${Badge} tone="accent" sign="●">${plural(runs, "training run")}<//></a> `}
     ${evaluations > 0 && html`<a class="plain-link" href=${leaguePath(league, "evaluations")}><${Badge} tone="accent" sign="●">${plural(evaluations, "evaluation")}<//></a>`}`;
 }

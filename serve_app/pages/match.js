@@ -2,14 +2,14 @@
 
 import { html } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
-import { useData } from "./data.js";
+import { hasOneSide, useData } from "./data.js";
 import { Await, leaguePath, Properties, Table, Time, useTitle } from "./components.js";
 import { count, number, shortRef } from "./format.js";
 
-export function Match({ league, schedule, position }) {
+export function Match({ league, schedule, position, about }) {
   const match = useData(apiPath(league, "matches", schedule, position));
   const found = match.data;
-  useTitle(found && found.contestants.map(shortRef).join(" against "), league);
+  useTitle(found && found.contestants.map(shortRef).join(hasOneSide(about) ? " and " : " against "), league);
   return html`<section aria-labelledby="heading">
     <p class="crumbs">${found && html`<a href=${query(leaguePath(league, "matches"), { first: found.contestants[0], second: found.contestants[1] })}>Matches of this pair</a>`}</p>
     <${Await} result=${match}>${found && html`

@@ -30,8 +30,8 @@ export function Opponents({ curves, points }) {
 
 function MetricChart({ metric, name, x, lines }) {
   return html`<article><h4>${name}</h4>
-    <${Chart} label="${name} of ${lines.length} opponents. The table above lists the latest values." x=${x} lines=${lines} xName="steps" yName=${metric} height=${220} format=${percent} />
-    <${DataTable} x=${x} lines=${lines} xName="steps" caption=${name} format=${percent} /></article>`;
+    <${Chart} label="${name} of ${lines.length} opponents. The table above lists the latest values." x=${x} lines=${lines} xName="steps" yName=${metric} height=${220} format=${(share) => percent(share)} />
+    <${DataTable} x=${x} lines=${lines} xName="steps" caption=${name} format=${(share) => percent(share)} /></article>`;
 }
 
 /** [{ref, share, score}] of recent episodes, the most frequent first. */

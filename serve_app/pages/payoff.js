@@ -2,7 +2,7 @@
 
 import { html } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
-import { useChangeToken, useData } from "./data.js";
+import { hasOneSide, useChangeToken, useData } from "./data.js";
 import { Await, EmptyState, leaguePath } from "./components.js";
 import { EarlierResults } from "./earlier.js";
 import { useAddress } from "./router.js";
@@ -25,33 +25,33 @@ export function Payoff({ league, about }) {
     </div>
     <${EarlierResults} league=${league} summary=${about.summary} game=${game} page="payoff" />
     <${Await} result=${payoff}>${payoff.data && (table
-      ? html`<${Heatmap} league=${league} payoff=${table} scores=${table.by_side?.[side] ?? table.score} champion=${about.champion} />`
+      ? html`<${Heatmap} league=${league} payoff=${table} scores=${table.by_side?.[side] ?? table.score} champion=${about.champion} relation=${hasOneSide(about) ? "compared with" : "against"} />`
       : html`<${EmptyState}>${about.up_to_date
           ? html`No games yet. <a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to compare the versions.`
           : "The payoff matrix has not been computed yet. The evaluation service computes it a few seconds after new games."}<//>`)}<//>
   </section>`;
 }
 
-function Heatmap({ league, payoff: { contestants, games }, scores, champion }) {
+function Heatmap({ league, payoff: { contestants, games }, scores, champion, relation }) {
   const isDense = contestants.length > 16;
   return html`
-    <p class="muted">Each cell shows the mean score of the row against the column in percent; 50 is even. Select a cell to see its matches.</p>
+    <p class="muted">Each cell shows the mean score of the row ${relation} the column in percent; 50 is even. Select a cell to see its matches.</p>
     <div class="wide" tabindex="0" role="region" aria-label="Mean scores">
       <table class="heatmap ${isDense ? "dense" : ""}">
-        <caption class="visually-hidden">Mean score of each row against each column, in percent</caption>
+        <caption class="visually-hidden">Mean score of each row ${relation} each column, in percent</caption>
         <thead><tr><td></td>${contestants.map((ref) => html`<th scope="col" title=${ref}><span>${shortRef(ref).replace("script:", "")}</span></th>`)}</tr></thead>
         <tbody>${contestants.map((ref, row) => html`<tr>
           <th scope="row" title=${ref}>${shortRef(ref)}${ref === `${league}@${champion}` && html`<span class="star" title="champion"><span aria-hidden="true"> ★</span><span class="visually-hidden"> champion</span></span>`}</th>
-          ${contestants.map((other, column) => html`<${Cell} league=${league} row=${ref} column=${other} score=${row === column ? null : scores[row][column]} games=${games[row][column]} />`)}
+          ${contestants.map((other, column) => html`<${Cell} league=${league} relation=${relation} row=${ref} column=${other} score=${row === column ? null : scores[row][column]} games=${games[row][column]} />`)}
         </tr>`)}</tbody>
       </table>
     </div>
     <p class="key" aria-hidden="true"><span>always loses</span>${Array.from({ length: SHADES }, (_, shade) => html`<i class="h${shade}"></i>`)}<span>always wins</span></p>`;
 }
 
-function Cell({ league, row, column, score, games }) {
+function Cell({ league, relation, row, column, score, games }) {
   if (score == null) return html`<td class="none">${row === column ? "" : html`<span class="visually-hidden">no games</span>`}</td>`;
-  const label = `${row} scores ${Math.round(100 * score)} % against ${column} in ${plural(games, "game")}`;
+  const label = `${row} scores ${Math.round(100 * score)} % ${relation} ${column} in ${plural(games, "game")}`;
   return html`<td class="h${Math.min(SHADES - 1, Math.round(score * (SHADES - 1)))}">
     <a href=${query(leaguePath(league, "matches"), { first: row, second: column })} title=${label} aria-label="${label}: show matches">${Math.round(100 * score)}</a></td>`;
 }

@@ -2,12 +2,12 @@
 
 import { html, useEffect, useState } from "./vendor/preact-htm.js";
 import { apiPath, request } from "./api.js";
-import { useData } from "./data.js";
+import { hasOneSide, useData } from "./data.js";
 import { useKeys } from "./keyboard.js";
 import { Await, Badge, EmptyState, ErrorNotice, sentence } from "./components.js";
 import { navigate, useAddress } from "./router.js";
 import { actionName, describe, Moves, Picture, Probabilities } from "./step.js";
-import { number } from "./format.js";
+import { count, number } from "./format.js";
 
 const SEED_LIMIT = 2 ** 31;
 
@@ -17,7 +17,7 @@ export function Play({ league, about }) {
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Play</h2></div>
     <${Await} result=${playable} message="Starting the evaluation service …">${playable.data && (playable.data.playable
-      ? game ? html`<${Game} key=${`${game.agent} ${game.seed}`} league=${league} playable=${playable.data} game=${game} />`
+      ? game ? html`<${Game} key=${`${game.agent} ${game.seed}`} league=${league} about=${about} playable=${playable.data} game=${game} />`
         : html`<${NewGame} league=${league} about=${about} playable=${playable.data} />`
       : html`<${EmptyState}>You cannot play in this league: ${sentence(playable.data.why)}<//>`)}<//>
   </section>`;
@@ -46,9 +46,10 @@ function NewGame({ league, about, playable }) {
     const seed = fields.get("seed") ? Number(fields.get("seed")) : randomSeed();
     navigate(fragmentOf({ opponent: fields.get("opponent"), agent: fields.get("agent"), seed, actions: [] }));
   };
+  const isTeam = hasOneSide(about);
   return html`<form class="narrow" onSubmit=${start}>
-    <p class="muted">You play one agent. The opponent plays all others. As in the matches of this league, versions ${about.actions === "sampled" ? "sample their actions" : "take their most likely actions"}.</p>
-    <label class="field">Opponent <select name="opponent">
+    <p class="muted">You play one agent. ${isTeam ? "A policy plays all others, your teammates." : "The opponent plays all others."} As in the matches of this league, versions ${about.actions === "sampled" ? "sample their actions" : "take their most likely actions"}.</p>
+    <label class="field">${isTeam ? "Teammates" : "Opponent"} <select name="opponent">
       ${about.champion != null && html`<option value="${league}@champion">${league}@champion (version ${about.champion})</option>`}
       ${playable.opponents.map((ref) => html`<option value=${ref}>${ref}</option>`)}
     </select></label>
@@ -58,7 +59,7 @@ function NewGame({ league, about, playable }) {
   </form>`;
 }
 
-function Game({ league, playable, game }) {
+function Game({ league, about, playable, game }) {
   const [showProbabilities, setShowProbabilities] = useState(false);
   const [state, setState] = useState(null);
   const [error, setError] = useState(null);
@@ -85,35 +86,36 @@ function Game({ league, playable, game }) {
   const undo = () => navigate(fragmentOf({ ...game, actions: actions.slice(0, -1) }), { replace: true });
   const seat = playable.agents.find((each) => each.agent === agent);
   const names = Object.fromEntries(playable.agents.map((each) => [each.agent, each.names]));
+  const isTeam = hasOneSide(about);
   return html`<div class="player">
     <div class="screen">
-      <p class="turn" role="status">${statusOf(state, busy, error, agent)}</p>
+      <p class="turn" role="status">${statusOf(state, busy, error, agent, isTeam)}</p>
       ${state && html`<${Board} state=${state} playable=${playable} names=${names} act=${act} isTurn=${isTurn}>
         ${seat && !state.over && html`<${Actions} seat=${seat} board=${state.picture && playable.board} legal=${state.legal} act=${act} isTurn=${isTurn} />`}<//>`}
       ${playable.reveals && html`<p class="notice">The picture shows everything, also what is hidden from ${agent}: this environment does not render the view of one agent.</p>`}
       ${error && html`<${ErrorNotice} error=${error} retry=${() => setAttempt(attempt + 1)} />`}
     </div>
     <div class="game-info">
-      <p>You are <${AgentColor} color=${seat?.color} /><strong>${agent}</strong> against <strong class="ref">${opponent}</strong> <${Badge}>seed ${seed}<//></p>
-      <${OtherAgents} agents=${playable.agents} own=${agent} />
+      <p>You are <strong>${agent}</strong> ${isTeam ? "with" : "against"} <strong class="ref">${opponent}</strong> <${Badge}>seed ${seed}<//></p>
+      <${Agents} sides=${about.sides} agents=${playable.agents} own=${agent} opponent=${opponent} />
       <label class="option"><input type="checkbox" checked=${showProbabilities} onChange=${(event) => setShowProbabilities(event.target.checked)} /><span>Show the policy's probabilities</span></label>
       ${showProbabilities && state?.chances?.length > 0 && !state.over && html`<h3>Policy's probabilities in your position</h3><${Probabilities} values=${state.chances} names=${names[agent]} />`}
       ${state && html`<${MoveLog} steps=${state.steps} names=${names} showProbabilities=${showProbabilities} />`}
       <div class="buttons">
         <button type="button" class=${state?.over ? "primary" : ""} onClick=${restart}>Play again</button>
         <button type="button" onClick=${undo} disabled=${!actions.length || busy}>Undo move</button>
-        <button type="button" onClick=${() => navigate("#")}>Change opponent</button>
+        <button type="button" onClick=${() => navigate("#")}>Change ${isTeam ? "teammates" : "opponent"}</button>
       </div>
     </div>
   </div>`;
 }
 
 /** Whose turn it is, or the result. */
-function statusOf(state, busy, error, agent) {
+function statusOf(state, busy, error, agent, isTeam) {
   if (error) return "";
   if (!state) return "Loading …";
   if (state.over) return `${outcomeOf(state)} Your return is ${number(state.returns?.[agent] ?? 0, 2)}.`;
-  return busy ? "Waiting for the opponent …" : "Your turn.";
+  return busy ? `Waiting for the ${isTeam ? "teammates" : "opponent"} …` : "Your turn.";
 }
 
 /** The outcome from a score in [0, 1]; games without a score only have returns. */
@@ -139,9 +141,19 @@ function AgentColor({ color }) {
   return color && html`<svg class="agent-color" viewBox="0 0 12 12" width="12" height="12" role="img" aria-label=${color}><circle cx="6" cy="6" r="5" fill=${color} /></svg> `;
 }
 
-function OtherAgents({ agents, own }) {
-  const colored = agents.filter((each) => each.color && each.agent !== own);
-  return colored.length > 0 && html`<p class="muted small">${colored.map((each) => html`<span key=${each.agent}><${AgentColor} color=${each.color} />${each.agent} </span>`)}</p>`;
+const MAX_AGENTS = 12;
+
+/** All agents, with their colors in the pictures and their relation to the person. */
+function Agents({ sides, agents, own, opponent }) {
+  const colors = Object.fromEntries(agents.map((each) => [each.agent, each.color]));
+  const side = Object.keys(sides).find((name) => sides[name].includes(own));
+  const all = Object.entries(sides).flatMap(([name, members]) => members.map((agent) => ({ agent, relation: agent === own ? "you" : name === side ? "teammate" : "opponent" })));
+  if (all.length > MAX_AGENTS) {
+    const teammates = all.filter(({ relation }) => relation === "teammate").length;
+    return html`<p class="muted small">${count(teammates)} teammates and ${count(all.length - teammates - 1)} opponents: <span class="ref">${opponent}</span></p>`;
+  }
+  return html`<ul class="agents small" aria-label="Agents">${all.map(({ agent, relation }) => html`<li key=${agent} class=${relation === "you" ? "strong" : "muted"}>
+    <${AgentColor} color=${colors[agent]} />${agent} · ${relation}</li>`)}</ul>`;
 }
 
 /** One button per action; digit keys select the first ten, and other keys as the server lists them. Illegal actions are disabled. */

@@ -10,9 +10,48 @@ const NAVIGATED = "league:navigated";
 /** Navigate to another address. `replace`: replace the current history entry. */
 export function navigate(address, { replace = false } = {}) {
   const isOtherPage = new URL(address, location.href).pathname !== location.pathname;
-  history[replace ? "replaceState" : "pushState"](null, "", address);
+  if (replace) history.replaceState(history.state, "", address);
+  else history.pushState(null, "", address);
   if (isOtherPage) scrollTo(0, 0);
   dispatchEvent(new Event(NAVIGATED));
+}
+
+/** Remember values of the current history entry, which are in `history.state` when the user returns to it. */
+export const remember = (values) => history.replaceState({ ...history.state, ...values }, "");
+
+const RESTORING_TIME = 5000; // milliseconds for the content of a page to arrive
+const BY_USER = ["wheel", "touchstart", "pointerdown", "keydown"];
+let stopRestoring = null;
+
+/** Remember how far a page is scrolled, and scroll there when the user returns to it and its content has arrived. */
+export function keepPositions() {
+  history.scrollRestoration = "manual"; // the browser's own precedes the content
+  let timer = null;
+  addEventListener("scroll", () => {
+    clearTimeout(timer);
+    if (!stopRestoring) timer = setTimeout(() => remember({ scroll: scrollY }), 100);
+  });
+  addEventListener(NAVIGATED, () => { clearTimeout(timer); stopRestoring?.(); });
+  addEventListener("popstate", () => { clearTimeout(timer); restorePosition(); });
+  restorePosition();
+}
+
+function restorePosition() {
+  stopRestoring?.();
+  const position = history.state?.scroll ?? 0;
+  scrollTo(0, position);
+  if (!position) return;
+  const observer = new ResizeObserver(() => scrollTo(0, position));
+  const timer = setTimeout(() => stopRestoring(), RESTORING_TIME);
+  const stop = () => {
+    observer.disconnect();
+    clearTimeout(timer);
+    BY_USER.forEach((event) => removeEventListener(event, stop));
+    stopRestoring = null;
+  };
+  stopRestoring = stop;
+  BY_USER.forEach((event) => addEventListener(event, stop, { passive: true }));
+  observer.observe(document.body);
 }
 
 /** {path, parameters, fragment} of the current address, the path without ROOT; updated on navigation. */

@@ -16,7 +16,7 @@ export function Runs({ league }) {
     <${Await} result=${runs}>${runs.items && (runs.items.length
       ? html`<${Table} caption="Training runs, newest first" head=${[["Run"], ["State"], ["Role"], ["Algorithm"], ["Steps", "number"], ["Progress"], ["Started"], ["Last heartbeat"]]} cls="full">
           ${runs.items.map((run) => html`<tr key=${run.run}>
-            <th scope="row"><a href=${leaguePath(league, "runs", run.run)}>${run.run}</a></th><td><${State} value=${run.state} /></td><td class="nowrap"><${Role} run=${run} /></td><td>${run.algorithm}</td>
+            <th scope="row"><a href=${leaguePath(league, "training", run.run)}>${run.run}</a></th><td><${State} value=${run.state} /></td><td class="nowrap"><${Role} run=${run} /></td><td>${run.algorithm}</td>
             <td class="number">${short(run.steps)}</td><td><${RunProgress} run=${run} /></td><td class="nowrap"><${Time} at=${run.began_at} /></td><td class="nowrap"><${Time} at=${run.heartbeat_at} /></td></tr>`)}<//>`
       : html`<${EmptyState}>No training runs yet. Start one with <code>league train</code>.<//>`)}<//>
     <${ShowMore} list=${runs} />
@@ -38,7 +38,7 @@ export function Run({ league, run }) {
   const about = found.data;
   useTitle(run, league);
   return html`<section aria-labelledby="heading">
-    <p class="crumbs"><a href=${leaguePath(league, "runs")}>Training</a></p>
+    <p class="crumbs"><a href=${leaguePath(league, "training")}>Training</a></p>
     <${Await} result=${found}>${about && html`
       <div class="head"><h2 id="heading" class="wrap">${run}</h2><${State} value=${about.state} /></div>
       <${Properties} items=${[

@@ -19,7 +19,7 @@ export const actionName = (names, action) => names?.[action] ?? String(action);
 export function describe(step, names) {
   if (!step) return "";
   if (!step.moves.length) return step.step === 0 ? "Start of the game." : "No moves.";
-  return step.moves.map((move) => `${move.agent} plays ${actionName(names?.[move.agent], move.action)}`).join("; ") + (step.opening ? " (random opening)" : "");
+  return step.moves.map((move) => `${move.agent} plays ${actionName(names?.[move.agent], move.action)}${move.ref === PERSON ? " (you)" : ""}`).join("; ") + (step.opening ? " (random opening)" : "");
 }
 
 /** The moves of a step with their probabilities. */
@@ -34,5 +34,5 @@ export function Moves({ step, names }) {
 export function Probabilities({ values, taken, names }) {
   return html`<ul class="probabilities ${names && Object.keys(names).length ? "named" : ""}" aria-label="Probabilities">${values.map(([action, probability]) => html`
     <li class=${String(action) === String(taken) ? "taken" : ""}><span class="action">${actionName(names, action)}</span>
-      <progress max="1" value=${probability} aria-hidden="true"></progress><span class="value">${percent(probability, probability < 0.1 ? 1 : 0)}</span></li>`)}</ul>`;
+      <progress max="1" value=${probability} aria-hidden="true"></progress><span class="value">${percent(probability)}</span></li>`)}</ul>`;
 }

@@ -29,7 +29,7 @@ function OpponentChart({ opponent, rows }) {
   const last = rows.at(-1);
   const label = `Scores against ${opponent}. Version ${last.version}: ${percent(last.score)}, 95 % interval ${range(last)}.`;
   return html`<article><h4>against ${shortRef(opponent)}</h4>
-    <${Chart} label=${label} x=${rows.map((row) => row.steps)} xName="total steps" yName="score" height=${220} format=${(share) => percent(share, 0)} thresholds=${EVEN}
+    <${Chart} label=${label} x=${rows.map((row) => row.steps)} xName="total steps" yName="score" height=${220} format=${(share) => percent(share)} thresholds=${EVEN}
       lines=${[{ name: "score", values: rows.map((row) => row.score), dots: true }]} intervals=${rows.map((row) => [row.low, row.high])} /></article>`;
 }
 

@@ -6,7 +6,7 @@ const EXPLANATIONS = {
   rating: "Strength in Elo: 0 is script:random. A contestant that is 100 points stronger scores about 64 % against the other, 200 points about 76 %. In 95 % of all cases, the true rating lies in the interval.",
   LLR: "Log-likelihood ratio: the evidence that the candidate is stronger, from all blocks so far. Each block adds to it or takes from it. The candidate is promoted at the upper bound and rejected at the lower one.",
   "log wealth": "Evidence that the candidate's mean return is higher: the logarithm of the wealth of a bettor who bets on it in each block. The candidate is promoted at the upper bound.",
-  block: "Two games, or one for each side, from the same seed and the same opening. The contestants swap sides, so that neither has an advantage. It is the unit of evidence.",
+  block: "Two games from the same seed and the same opening. The contestants swap sides, so that neither has an advantage; with one side, each plays one of the games. It is the unit of evidence.",
 };
 
 let termCount = 0; // a page can contain a term several times

@@ -3,7 +3,7 @@
 import { html } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
 import { Chart, DataTable } from "./chart.js";
-import { useChangeToken, useData, useList } from "./data.js";
+import { hasOneSide, useChangeToken, useData, useList } from "./data.js";
 import { Await, EmptyState, leaguePath, Outcome, Properties, ShowMore, Table, Time, useTitle } from "./components.js";
 import { Term } from "./term.js";
 import { count, interval, number, percent, shortRef, shortVerdict, signed } from "./format.js";
@@ -35,14 +35,15 @@ function Row({ league, verdict: each }) {
   </tr>`;
 }
 
-export function Verdict({ league, verdict }) {
+export function Verdict({ league, verdict, about }) {
   const found = useData(apiPath(league, "verdicts", verdict), useChangeToken("verdicts", "computed_at"));
   const loaded = found.data;
-  useTitle(loaded && `${shortRef(loaded.candidate)} against ${shortRef(loaded.opponent)}`, league);
+  const relation = hasOneSide(about) ? "compared with" : "against";
+  useTitle(loaded && `${shortRef(loaded.candidate)} ${relation} ${shortRef(loaded.opponent)}`, league);
   return html`<section aria-labelledby="heading">
     <p class="crumbs"><a href=${leaguePath(league, "verdicts")}>Verdicts</a></p>
     <${Await} result=${found}>${loaded && html`
-      <div class="head"><h2 id="heading"><span class="ref">${loaded.candidate}</span> against <span class="ref">${loaded.opponent}</span></h2> <${Outcome} value=${loaded.outcome} /></div>
+      <div class="head"><h2 id="heading"><span class="ref">${loaded.candidate}</span> ${relation} <span class="ref">${loaded.opponent}</span></h2> <${Outcome} value=${loaded.outcome} /></div>
       ${loaded.reason && html`<p class="lead">${loaded.reason}</p>`}
       ${loaded.remedy && html`<p>${loaded.remedy}</p>`}
       ${loaded.earlier_game && html`<div class="notice" role="status"><p><strong>The game of this league has changed since.</strong> These games count in no current rating.</p>

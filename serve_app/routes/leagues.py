@@ -142,6 +142,7 @@ def _league(registry: Registry, league: str) -> dict[str, Any]:
         },
         "policies": {policy: interface.of_policy(policy).model_dump(mode="json") for policy in interface.policy_ids},
         "agents": interface.policies,
+        "sides": interface.sides,
         "baselines": baselines(row.config, interface),
         "replicas": list(map(_replica, acknowledgements)),
         "faults": sorted({each.fault for each in acknowledgements if each.fault}),

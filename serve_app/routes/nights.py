@@ -1,6 +1,7 @@
-"""Lists nights of training: what each published, its champion with its rating, and how exploitable the champion is.
+"""Lists nights of training and nightly runs: the champion after each, how exploitable it is, and the verdicts.
 
-GET  /v1/leagues/{league}/nights    newest first; ?limit= &before=
+GET  /v1/leagues/{league}/nights         nights of training, newest first; ?limit= &before=
+GET  /v1/leagues/{league}/nightly-runs   nightly runs, newest first; ?limit= &before=
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from starlette.responses import Response
 
 from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.storage.rows import TrainingNightRow
+from league.registry.storage.rows import NightlyRunRow, TrainingNightRow
 from serve_app.models.resolver import ModelResolver
 from serve_app.routes import parsing
 
@@ -20,7 +21,7 @@ RATINGS = "ratings"
 
 
 class NightRoutes:
-    """The endpoint."""
+    """The endpoints."""
 
     def __init__(self, models: ModelResolver) -> None:
         self._models = models
@@ -38,6 +39,35 @@ class NightRoutes:
             return {"league": league, "nights": [_night(row, ratings) for row in page], "next": more}
 
         return await parsing.query_response(self._models, query)
+
+    async def nightly_runs(self, request: Request) -> Response:
+        """A page of a league's nightly runs. Raises UnknownLeague or InvalidInput."""
+        league = check_slug("league", request.path_params["league"])
+        limit, before = parsing.page_size(request), parsing.query_number(request, "before")
+
+        def query(registry: Registry) -> dict[str, Any]:
+            rows = [row for row in reversed(registry.nightly_runs.all(league)) if before is None or row.id < before]
+            page, more = parsing.paginate(rows[: limit + 1], limit, lambda row: row.id)
+            return {"league": league, "nightly_runs": list(map(_nightly_run, page)), "next": more}
+
+        return await parsing.query_response(self._models, query)
+
+
+def _nightly_run(row: NightlyRunRow) -> dict[str, Any]:
+    """A nightly run as JSON. What it decided is null or empty while it runs."""
+    report = row.report or {}
+    shown = ("verdict", "candidate", "opponent", "outcome", "promoted")
+    return {
+        "nightly_run": row.id,
+        "candidates": [f"{row.league}@{number}" for number in row.candidates],
+        "alpha": row.alpha,
+        "verdicts": [{name: verdict[name] for name in shown} for verdict in report.get("verdicts", ())],
+        "champion_before": report.get("champion_before"),
+        "champion": report.get("champion"),
+        "errors": report.get("faults", []),
+        "began_at": row.began_at.isoformat(),
+        "ended_at": row.ended_at and row.ended_at.isoformat(),
+    }
 
 
 def _night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,15 +30,22 @@ PAGES = {
     f"{L}/matches/{{schedule}}/0/0": (r"player_1", r"of \d"),
     f"{L}/evaluations": (r"No evaluations yet|#\d",),
     f"{L}/evaluations/new": (r"Contestants: all versions", r"Maximum minutes"),
-    f"{L}/runs": (RUN, r"7\d %"),
-    f"{L}/runs/{RUN}": (
+    f"{L}/training": (RUN, r"7\d %"),
+    f"{L}/runs": (RUN, r"7\d %"),  # as in the API
+    f"{L}/leaderboard": (r"script:random", r"95 % interval"),
+    f"{L}/training/{RUN}": (
         r"2\d,000 of 40,000",
         r"Strength.*against script:random",
         r"Opponents.*@1\s*30\.0 %",
         r"entropy",
         r"Show all metrics",
     ),
-    f"{L}/nights": (r"Strength", r"Learned exploitability", r"60\.0 %\s*50\.0 % to 90\.0 %\s*\+0\.20\s*0\.00 to 0\.80"),
+    f"{L}/nights": (
+        r"Strength",
+        r"Learned exploitability",
+        r"60\.0 %\s*50\.0 % to 90\.0 %\s*\+0\.20\s*0\.00 to 0\.80",
+        r"Nightly runs.*▲ promote.*new",
+    ),
     f"/leagues/{NAMED}": (r"The game of this league has changed", r"2 matches", r"play\.opening_plies: 4 → 0"),
     f"/leagues/{NAMED}/payoff": (r"The game of this league has changed", r"No games yet"),
     f"{L}/play": (r"tictactoe@champion \(version 3\)", r"Your agent", r"versions take their most likely actions"),

@@ -46,7 +46,7 @@ def page(browser: Browser) -> Iterator[Page]:
         ("short", [0.0123], "0.0123"),
         ("short", [-12345.678], "−12,350"),
         ("short", [0.00123456], "0.001235"),
-        ("mixture", [[{"version": 3, "probability": 0.6}, {"version": 5, "probability": 0.4}]], "60 % @3, 40 % @5"),
+        ("mixture", [[{"version": 3, "probability": 0.6}, {"version": 5, "probability": 0.4}]], "60.0 % @3, 40.0 % @5"),
         ("interval", [[-3, 12.2]], "−3 to +12"),
         ("interval", [[None, 12.2]], "−∞ to +12"),
         ("rate", [0], "0"),

@@ -6,16 +6,19 @@ from io import BytesIO
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 from playwright.sync_api import Page, expect
 
+from evaluation.playback.environment_hooks import KNOWN
 from tests.support.clients.browsers import Served, Tab
 from tests.support.environments.declaring import VIEWS as VIEWS_OF_AGENTS
 from tests.support.leagues.browser_leagues import (
     CONNECT_FOUR,
     HIDDEN,
     NAMED,
+    TEAM,
     VIEWS,
     answer,
     verdict_between_versions,
@@ -77,6 +80,19 @@ def test_a_key_pressed_as_soon_as_the_game_is_visible(tab: Tab, served: Served) 
     expect(page.locator(".game-info")).to_contain_text("· end")
 
 
+def test_the_address_of_an_open_game_selects_the_step(tab: Tab, served: Served) -> None:
+    page = tab.open(game_of(served))
+    expect(page.locator(".seek output")).to_have_text(re.compile("^0 of"))
+    page.evaluate("location.hash = '#3'")
+    expect(page.locator(".game-info")).to_contain_text("Step 3")
+    page.goto(f"{tab.url}{game_of(served)}#2")  # of the same document
+    expect(page.locator(".game-info")).to_contain_text("Step 2")
+    page.get_by_role("button", name="Next step").click()
+    expect(page.locator(".game-info")).to_contain_text("Step 3")
+    page.evaluate("location.hash = '#99999'")
+    expect(page.locator(".game-info")).to_contain_text("· end")
+
+
 def test_playback_and_seeking(tab: Tab, served: Served) -> None:
     page = tab.open(game_of(served))
     expect(page.locator(".picture img")).to_be_visible()
@@ -95,6 +111,10 @@ def test_a_game_is_downloaded_as_a_gif(tab: Tab, served: Served, tmp_path: Path)
     download.value.save_as(tmp_path / "game.gif")
     with Image.open(tmp_path / "game.gif") as gif:
         assert (gif.format, gif.n_frames > 3) == ("GIF", True)
+        frame = gif.convert("RGB")
+        legend = np.array(frame.crop((10, frame.height - 70, 28, frame.height))).reshape(-1, 3).astype(int)
+    for color in KNOWN["tictactoe_v3"]["agent_colors"].values():  # those of the marks in the picture
+        assert abs(legend - ImageColor.getrgb(color)).sum(axis=1).min() < 30
 
 
 def found(served: Served, opponent: str, score: float) -> tuple[int, list[int]]:
@@ -163,7 +183,7 @@ def test_a_click_in_a_hole_of_connect_four_takes_its_column(tab: Tab, width: int
         assert button is not None
         assert button["x"] + button["width"] / 2 == pytest.approx(x, abs=2)
     page.mouse.click(picture["x"] + scale * 10.5 + 20, picture["y"] + scale * (10.5 + 13 * 5))
-    expect(page.locator(".move-log")).to_contain_text("player_0 plays 0")
+    expect(page.locator(".move-log")).to_contain_text("player_0 plays 0 (you)")
 
 
 def test_a_click_on_the_frame_of_the_board_is_no_move(tab: Tab) -> None:
@@ -241,6 +261,38 @@ def test_each_seat_sees_its_own_view(tab: Tab, agent: str) -> None:
     assert source is not None
     with Image.open(BytesIO(b64decode(source.partition("base64,")[2]))) as picture:
         assert set(picture.convert("L").getdata()) == {VIEWS_OF_AGENTS[agent]}
+
+
+def test_teammates_are_no_opponents(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{TEAM}/play")
+    expect(page.get_by_label("Teammates")).to_be_visible()
+    page = open_game(tab, TEAM, "agent_1")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    info = page.locator(".game-info")
+    expect(info).to_contain_text(re.compile("You are agent_1 with script:first"))
+    expect(info.get_by_role("list", name="Agents")).to_have_text(re.compile(r"agent_0 · teammate\s*agent_1 · you"))
+    page.get_by_role("group", name="Your actions").get_by_role("button", name="1", exact=True).click()
+    expect(page.locator(".move-log")).to_contain_text(re.compile(r"agent_0 plays \d; agent_1 plays 1 \(you\)"))
+    expect(page.locator("main")).not_to_contain_text(re.compile("against|opponent", re.IGNORECASE))
+
+
+def test_the_own_agent_is_marked_among_opponents(tab: Tab) -> None:
+    page = open_game(tab, CONNECT_FOUR, "player_1")
+    agents = page.get_by_role("list", name="Agents")
+    expect(agents).to_have_text(re.compile(r"player_0 · opponent\s*player_1 · you"))
+    expect(page.locator(".game-info")).to_contain_text("You are player_1 against script:first")
+
+
+def test_matches_of_a_team_swap_no_sides(tab: Tab) -> None:
+    pair = "first=script%3Arandom&second=script%3Afirst"
+    page = tab.open(f"/leagues/{TEAM}/matches?{pair}")
+    expect(page.get_by_role("heading", level=2)).to_have_text("script:random and script:first")
+    expect(page.get_by_text("Each contestant plays one of them, as the whole team")).to_be_visible()
+    expect(page.locator("main")).not_to_contain_text(re.compile("against|swap"))
+    expect(page.get_by_role("columnheader", name="Games")).to_have_count(0)  # always two, as the text says
+    page.get_by_role("link", name=re.compile("^Match ")).first.click()
+    expect(page.get_by_role("table", name="Games").locator("tbody tr")).to_have_count(2)
+    expect(page.locator("main")).not_to_contain_text("against")
 
 
 def test_terms_are_explained(tab: Tab) -> None:

@@ -238,6 +238,18 @@ def test_nights_have_the_strength_and_the_exploitability_of_their_champions(read
     assert get(reader, "/v1/leagues/memory/nights", "Nights")["nights"] == []
 
 
+def test_nightly_runs_have_their_verdicts(reader: TestClient) -> None:
+    assert get(reader, "/v1/leagues/memory/nightly-runs", "NightlyRuns")["nightly_runs"] == []
+    (open_run,), (run,) = pages(reader, f"{BOARD}/nightly-runs", "NightlyRuns", "nightly_runs", limit=1)
+    assert (run["candidates"], run["champion_before"], run["champion"]) == (["board@2"], "board@1", "board@2")
+    assert [(each["candidate"], each["outcome"], each["promoted"]) for each in run["verdicts"]] == [
+        ("board@2", "promote", True)
+    ]
+    assert run["errors"] == ["board@3: its file is missing"]
+    assert (open_run["candidates"], open_run["verdicts"]) == (["board@3"], [])
+    assert open_run["ended_at"] is None
+
+
 def test_results_of_an_earlier_game_stay_viewable(reader: TestClient) -> None:
     (earlier,) = get(reader, BOARD, "League")["summary"]["earlier"]
     assert (earlier["name"], earlier["matches"]) == (EARLIER, 3)

@@ -22,6 +22,8 @@ from tests.support.waiting import until
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
+TEAM, LONG = "team", "n" * 60 + "_" + "m" * 39
+"""The two-step game, whose agents are a team, and tic-tac-toe with the longest name and the longest reason."""
 NAMED, HIDDEN, VIEWS = "named", "hidden", "views"
 """Tic-tac-toe with names of actions, with pictures that show hidden information, and with one view per agent."""
 DIRECTIONS = ["up-left", "left", "down-left", "up", "centre", "down", "up-right", "right", "down-right"]
@@ -43,9 +45,15 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
             tictactoe.config(league=NAMED, play={"action_names": DIRECTIONS}),
             tictactoe.config(league=HIDDEN, environment=hidden),
             tictactoe.config(league=VIEWS, environment=views),
+            tictactoe.config(league=LONG),
+            LeagueConfig.load(CONFIGS / f"{EMPTY}.yaml").model_copy(update={"league": TEAM}),
         ):
             registry.leagues.register(config, interface(config))
         change_game(registry)
+        tictactoe.publish(registry, tictactoe.graph(), LONG)
+        registry.aliases.set(LONG, "champion", 1, expected=None, actor="a" * 100, reason="why " * 500)
+        evaluate(LONG, [f"{LONG}@1", "script:random"], registry=registry, blocks=1)
+        evaluate(TEAM, ["script:random", "script:first"], registry=registry, blocks=2)
         registry.traffic.set(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
         registry.versions.set_note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
         registry.runs.begin(

@@ -108,12 +108,17 @@ def _runs(registry: Registry) -> None:
 
 
 def _nights(registry: Registry) -> None:
-    """A complete night, and one that has only begun."""
+    """A complete night and nightly run, and one each that has only begun."""
     night = registry.training_nights.open(LEAGUE)
     for step, result in NIGHT.items():
         registry.training_nights.record(night.id, step, result)
     registry.training_nights.close(night.id)
     registry.training_nights.open(LEAGUE)
+    verdict = {"verdict": WON, "candidate": "board@2", "opponent": "board@1", "outcome": "promote"} | evidence(True)
+    report = {"champion_before": "board@1", "champion": "board@2", "verdicts": [verdict]}
+    nightly_run = registry.nightly_runs.open(LEAGUE, [2], 0.001)
+    registry.nightly_runs.close(nightly_run.id, report | {"faults": ["board@3: its file is missing"]})
+    registry.nightly_runs.open(LEAGUE, [3], 0.001)
 
 
 def snapshots() -> dict[str, Any]:

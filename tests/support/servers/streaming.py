@@ -12,6 +12,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.runtime import uvicorn_http, uvicorn_websocket
+from serve_app.runtime.serve_bypass import ServeBypass
 from serve_app.settings import ServeSettings
 from tests.support.servers.replicas import QUICK, UnavailableEvaluation
 from tests.support.waiting import until
@@ -42,9 +43,8 @@ def listening(
     server = Replica(Registry.open(storage), settings, replica, evaluation_client=UnavailableEvaluation())
     uvicorn_http.install(server.events.end)
     uvicorn_websocket.install(settings.max_body, settings.max_incomplete)
-    config = uvicorn.Config(
-        server.application(), port=port, log_config=None, log_level="critical", access_log=False, **options
-    )
+    application = ServeBypass(server.application())
+    config = uvicorn.Config(application, port=port, log_config=None, log_level="critical", access_log=False, **options)
     runner = uvicorn.Server(config)
     thread = threading.Thread(target=runner.run, daemon=True)
     thread.start()
