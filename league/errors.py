@@ -70,6 +70,10 @@ class EnvironmentMismatch(InvalidInput, code="environment_mismatch"):
     """An environment, script or version does not fit the league."""
 
 
+class InvalidReturn(EnvironmentMismatch):
+    """An environment returned something else than its API requires."""
+
+
 class NotFound(LeagueError, code="not_found"):
     """A named object does not exist."""
 

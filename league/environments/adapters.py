@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 
-from league.errors import EnvironmentMismatch
+from league.errors import InvalidReturn
 from league.spaces import Space, paths
 from league.spaces.arrays import at_path
 
@@ -21,6 +21,13 @@ MAX_IDLE_STEPS = 10_000
 """Consecutive steps without an acting agent after which an environment counts as hung."""
 
 
+RESET, STEP = ("observations", "infos"), ("observations", "rewards", "terminations", "truncations", "infos")
+UNFIT = (AttributeError, LookupError, TypeError, ValueError)
+"""What a return that does not fit raises here. The environment's own exceptions are not caught."""
+LAST = ("observation", "reward", "termination", "truncation", "info")
+"""What `reset` and `step` of APIs with simultaneous actions return, and `last` of PettingZoo's AEC API."""
+
+
 class EnvAdapter(Protocol):
     """An environment with any API. An episode is over when no agent in the reports of a call must act."""
 
@@ -29,6 +36,10 @@ class EnvAdapter(Protocol):
 
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
         """Step the environment. moves: (agent, action) of each agent that must act, ordered by agent."""
+
+    @property
+    def infos(self) -> Mapping[str, Any]:
+        """The current infos by agent."""
 
     def state(self) -> Any:
         """Return the current global state; None if the environment has none."""
@@ -75,6 +86,14 @@ class _Adapter:
     def close(self) -> None:
         self._env.close()
 
+    def _split(self, agent: int, value: Any) -> Observation:
+        try:
+            return self._splits[agent](value)
+        except (LookupError, TypeError) as error:
+            raise InvalidReturn(
+                f"agent {self._agents[agent]} observes {_shown(value)}: expected the keys of its observation space"
+            ) from error
+
 
 class AECAdapter(_Adapter):
     """PettingZoo's AEC API: one agent acts at a time. Removes finished agents by dead steps."""
@@ -87,6 +106,10 @@ class AECAdapter(_Adapter):
         self._env.step(moves[0][1])
         return self._reports()
 
+    @property
+    def infos(self) -> Mapping[str, Any]:
+        return self._env.infos
+
     def state(self) -> Any:
         return _state(self._env)
 
@@ -94,20 +117,24 @@ class AECAdapter(_Adapter):
         env, reports = self._env, []
         while env.agents:
             agent = self._index[env.agent_selection]
-            value, reward, terminated, truncated, _ = env.last()
-            observation = self._splits[agent](value)
+            value, reward, terminated, truncated, _ = self._last()
+            observation, reward = self._split(agent, value), _number(env.agent_selection, reward)
             if not (terminated or truncated):
-                reports.append((agent, observation, float(reward), False, False))
+                reports.append((agent, observation, reward, False, False))
                 return reports
             # Copied because the environment may reuse the arrays in later steps.
             last = {name: np.array(array) for name, array in observation.items()}
-            reports.append((agent, last, float(reward), bool(terminated), bool(truncated)))
+            reports.append((agent, last, reward, bool(terminated), bool(truncated)))
             env.step(None)
             if self._agents[agent] in env.agents:
-                raise EnvironmentMismatch(
-                    f"agent {self._agents[agent]} is terminated or truncated, but remains in `agents`"
-                )
+                raise InvalidReturn(f"agent {self._agents[agent]} is terminated or truncated, but remains in `agents`")
         return reports
+
+    def _last(self) -> Any:
+        returned = self._env.last()
+        if isinstance(returned, tuple) and len(returned) == len(LAST):
+            return returned
+        raise InvalidReturn(f"last returned {_counted(returned)}: expected {', '.join(LAST)}")
 
 
 class _Simultaneous(_Adapter):
@@ -115,7 +142,7 @@ class _Simultaneous(_Adapter):
 
     def __init__(self, env: Any, splits: Sequence[Split]) -> None:
         super().__init__(env, splits)
-        self._infos: Mapping[str, Any] = {}
+        self.infos: Mapping[str, Any] = {}
         self._present: set[str] = set()
         self._left: set[str] = set()
         self._unreported: dict[str, float] = {}
@@ -123,7 +150,7 @@ class _Simultaneous(_Adapter):
 
     def state(self) -> Any:
         """Return `info["state"]` of any agent or of RLlib's common info, else the environment's `state()`."""
-        for info in self._infos.values():
+        for info in self.infos.values():
             if isinstance(info, Mapping) and "state" in info:
                 return info["state"]
         return _state(self._env)
@@ -143,6 +170,8 @@ class _Simultaneous(_Adapter):
         terminated: Mapping[str, bool],
         truncated: Mapping[str, bool],
     ) -> list[Report]:
+        if type(self.infos) is not dict and not isinstance(self.infos, Mapping):  # the first condition is faster
+            raise TypeError(self.infos)
         unreported, present = self._unreported, self._present
         for agent, reward in rewards.items():
             if agent in unreported and agent not in self._left:
@@ -162,6 +191,7 @@ class _Simultaneous(_Adapter):
                 continue
             last = self._last_observations[agent]
             if has_left:
+                _check_flags(agent, terminated, truncated)
                 last = {name: np.array(array) for name, array in last.items()}
                 present.discard(agent)
                 self._left.add(agent)
@@ -170,9 +200,23 @@ class _Simultaneous(_Adapter):
             unreported[agent] = 0.0
         return reports
 
+    def _check(self, call: str, names: Sequence[str], returned: Any) -> None:
+        """Raise InvalidReturn if `reset` or `step` returned something else than dictionaries by agent that fit."""
+        if not isinstance(returned, tuple | list) or len(returned) != len(names):
+            dones = " (the former dones are terminations and truncations)" * (call == "step")
+            raise InvalidReturn(f"{call} returned {_counted(returned)}: expected {', '.join(names)}{dones}")
+        parts = dict(zip(names, returned, strict=True))
+        for name, part in parts.items():
+            if not isinstance(part, Mapping):
+                raise InvalidReturn(f"{call} returned {_shown(part)} as {name}: expected a dictionary by agent")
+        for agent, reward in parts.get("rewards", {}).items():
+            _number(agent, reward)
+        for agent, value in parts["observations"].items():
+            self._split(self._index[self._known(agent)], value)
+
     def _known(self, agent: str) -> str:
         if agent not in self._index:
-            raise EnvironmentMismatch(
+            raise InvalidReturn(
                 f"agent {agent!r} has an observation, but is not in possible_agents ({', '.join(self._agents)})"
             )
         return agent
@@ -182,12 +226,19 @@ class ParallelAdapter(_Simultaneous):
     """PettingZoo's Parallel API: all live agents act simultaneously."""
 
     def reset(self, seed: int) -> list[Report]:
-        observations, self._infos = self._env.reset(seed=seed)
+        returned = self._env.reset(seed=seed)
+        self._check("reset", RESET, returned)
+        observations, self.infos = returned
         return self._begin(observations)
 
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
-        observations, rewards, terminated, truncated, self._infos = self._env.step(self._actions(moves))
-        reports = self._reports(observations, rewards, terminated, truncated)
+        returned = self._env.step(self._actions(moves))
+        try:
+            observations, rewards, terminated, truncated, self.infos = returned
+            reports = self._reports(observations, rewards, terminated, truncated)
+        except UNFIT:
+            self._check("step", STEP, returned)
+            raise
         if self._present:
             self._check_agents(observations)
         return reports
@@ -195,34 +246,43 @@ class ParallelAdapter(_Simultaneous):
     def _check_agents(self, observations: Mapping[str, Any]) -> None:
         agents = set(self._env.agents)
         for agent in self._present - agents:
-            raise EnvironmentMismatch(f"agent {agent} has left the environment neither terminated nor truncated")
+            raise InvalidReturn(
+                f"agent {agent} has left the environment neither terminated nor truncated: both need its key"
+            )
         for agent in agents - observations.keys() - self._left:
-            raise EnvironmentMismatch(f"agent {agent} is in `agents`, but has no observation")
+            raise InvalidReturn(f"agent {agent} is in `agents`, but has no observation")
 
 
 class MultiAgentAdapter(_Simultaneous):
     """RLlib's MultiAgentEnv: agents with an observation act; `__all__` ends the episode for all remaining agents."""
 
     def reset(self, seed: int) -> list[Report]:
-        observations, self._infos = self._env.reset(seed=seed)
+        returned = self._env.reset(seed=seed)
+        self._check("reset", RESET, returned)
+        observations, self.infos = returned
         return self._begin(self._kept(observations)) or self.step(())
 
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
         actions = self._actions(moves)
         ended: list[Report] = []
         for _ in range(MAX_IDLE_STEPS):
-            observations, rewards, terminated, truncated, self._infos = self._env.step(actions)
-            is_over = terminated.get("__all__", False) or truncated.get("__all__", False)
-            if is_over:
-                # Agents without their own flag get that of the episode.
-                left = {*self._present, *observations}
-                terminated, truncated = _for_all(left, terminated, truncated)
-            reports = ended + self._reports(self._kept(observations), rewards, terminated, truncated)
+            returned = self._env.step(actions)
+            try:
+                observations, rewards, terminated, truncated, self.infos = returned
+                is_over = terminated.get("__all__", False) or truncated.get("__all__", False)
+                if is_over:
+                    # Agents without their own flag get that of the episode.
+                    left = {*self._present, *observations}
+                    terminated, truncated = _for_all(left, terminated, truncated)
+                reports = ended + self._reports(self._kept(observations), rewards, terminated, truncated)
+            except UNFIT:
+                self._check("step", STEP, returned)
+                raise
             is_over = is_over or len(self._left) == len(self._agents)
             if is_over or any(not (report[3] or report[4]) for report in reports):
                 return reports
             actions, ended = {}, reports
-        raise EnvironmentMismatch(f"no agent had to act for {MAX_IDLE_STEPS} steps")
+        raise InvalidReturn(f"no agent had to act for {MAX_IDLE_STEPS} steps")
 
     @staticmethod
     def _kept(observations: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,8 +303,32 @@ def _state(env: Any) -> Any:
         return None
 
 
+def _number(agent: str, reward: Any) -> float:
+    try:
+        return float(reward)
+    except (TypeError, ValueError):
+        raise InvalidReturn(f"agent {agent} got the reward {_shown(reward)}: expected a number") from None
+
+
+def _counted(returned: Any) -> str:
+    return f"{len(returned)} values" if isinstance(returned, tuple | list) else f"one {type(returned).__name__}"
+
+
+def _shown(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    text = text if len(text) <= 60 else f"{text[:59]}…"
+    return text if value is None else f"{text} ({type(value).__name__})"
+
+
 def _flag(agent: str, terminated: Mapping[str, bool], truncated: Mapping[str, bool]) -> bool:
     return bool(terminated.get(agent, False) or truncated.get(agent, False))
+
+
+def _check_flags(agent: str, *flags: Mapping[str, Any]) -> None:
+    """Raise InvalidReturn for lists, which are true whatever they contain."""
+    for flag in (values.get(agent, False) for values in flags):
+        if not isinstance(flag, bool | int | np.bool_) and np.shape(flag) != ():
+            raise InvalidReturn(f"step returned {_shown(flag)} as a flag of {agent}: expected True or False")
 
 
 def _for_all(

@@ -1,4 +1,4 @@
-"""Action masks that PettingZoo environments report in `infos`: they become part of the observations."""
+"""Action masks that environments report in `infos`: they become part of the observations."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
-from league.errors import EnvironmentMismatch
+from league.environments.apis import RLlibEnv
+from league.errors import InvalidReturn
 from league.spaces import ACTION_MASK, OBSERVATION
 from league.spaces.arrays import mask_size
 from league.spaces.conversion import from_gymnasium
@@ -29,13 +30,13 @@ def with_info_masks(env: Any, configuration: str) -> Any:
         env: An environment of any API.
         configuration: A text that is equal for environments that are built alike. The first of them is reset once.
     """
-    if not isinstance(env, AECEnv | ParallelEnv):
-        return env
     if configuration not in _reports_masks:
         _reports_masks[configuration] = _finds_masks(env)
     if not _reports_masks[configuration]:
         return env
-    return _AECInfoMasks(env) if isinstance(env, AECEnv) else _ParallelInfoMasks(env)
+    if isinstance(env, AECEnv):
+        return _AECInfoMasks(env)
+    return _ParallelInfoMasks(env) if isinstance(env, ParallelEnv) else _RLlibInfoMasks(env)
 
 
 def _finds_masks(env: Any) -> bool:
@@ -43,11 +44,11 @@ def _finds_masks(env: Any) -> bool:
         if all(_missing_mask(env, agent) is None for agent in env.possible_agents):
             return False
         returned = env.reset(seed=0)
+        infos = env.infos if isinstance(env, AECEnv) else returned[1]
+        return any(isinstance(info, Mapping) and ACTION_MASK in info for info in infos.values())
     except Exception:
         # The same call fails again where its error is reported with the seed.
         return False
-    infos = env.infos if isinstance(env, AECEnv) else returned[1]
-    return any(isinstance(info, Mapping) and ACTION_MASK in info for info in infos.values())
 
 
 def _missing_mask(env: Any, agent: str) -> int | None:
@@ -60,6 +61,8 @@ def _missing_mask(env: Any, agent: str) -> int | None:
 class _InfoMasks:
     """The spaces of the agents, and the mask of an info."""
 
+    env: Any
+
     def __init__(self, env: Any) -> None:
         super().__init__(env)  # type: ignore[call-arg]
         self._widths = {agent: size for agent in env.possible_agents if (size := _missing_mask(env, agent)) is not None}
@@ -71,7 +74,11 @@ class _InfoMasks:
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the space of the observation with the mask. The same object for each call, as PettingZoo requires."""
         own = self._observation_spaces.get(agent)
-        return super().observation_space(agent) if own is None else own  # type: ignore[misc]
+        return self.env.observation_space(agent) if own is None else own
+
+    def action_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Return the action space."""
+        return self.env.action_space(agent)
 
     def _with_mask(self, agent: str, observation: Any, info: Any) -> Any:
         if agent not in self._widths:
@@ -85,7 +92,7 @@ class _InfoMasks:
             return np.ones(width, np.int8)
         mask = np.asarray(given)
         if mask.shape != (width,):
-            raise EnvironmentMismatch(
+            raise InvalidReturn(
                 f"the info of agent {agent!r} has an action_mask of shape {list(mask.shape)}, expected [{width}]"
             )
         return mask.astype(np.int8)
@@ -99,10 +106,10 @@ class _AECInfoMasks(_InfoMasks, BaseWrapper):
         return self._with_mask(agent, self.env.observe(agent), self.env.infos.get(agent))
 
 
-class _ParallelInfoMasks(_InfoMasks, BaseParallelWrapper):
-    """A Parallel environment whose observations contain the masks."""
+class _SimultaneousInfoMasks(_InfoMasks):
+    """Observations with masks for APIs with simultaneous actions."""
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset the environment; the observations contain the masks."""
         observations, infos = self.env.reset(seed=seed, options=options)
         return self._all_with_masks(observations, infos), infos
@@ -114,3 +121,9 @@ class _ParallelInfoMasks(_InfoMasks, BaseParallelWrapper):
 
     def _all_with_masks(self, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> dict[str, Any]:
         return {agent: self._with_mask(agent, value, infos.get(agent)) for agent, value in observations.items()}
+
+
+class _ParallelInfoMasks(_SimultaneousInfoMasks, BaseParallelWrapper): ...
+
+
+class _RLlibInfoMasks(_SimultaneousInfoMasks, RLlibEnv): ...

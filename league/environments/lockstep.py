@@ -26,7 +26,7 @@ from league.environments.stepping import (
     no_envs,
 )
 from league.environments.vector.vector_env import AgentRows
-from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, ObservationError
+from league.errors import EnvironmentMismatch, InvalidReturn, InvalidReward, LeagueError, ObservationError
 from league.spaces import Leaf, inputs
 from league.spaces.arrays import environment_actions
 
@@ -107,6 +107,8 @@ class Lockstep:
             acting = sorted(moves[env], key=itemgetter(0))
             try:
                 reports[env] = self._timed(env, self._envs[env].step, acting)
+            except InvalidReturn as error:
+                raise self._with_seed(env, error) from error
             except LeagueError:
                 raise
             except Exception as error:
@@ -180,6 +182,8 @@ class Lockstep:
             try:
                 reports = self._timed(env, self._envs[env].reset, int(self._seeds[env]))
                 break
+            except InvalidReturn as error:
+                raise self._with_seed(env, error) from error
             except LeagueError:
                 raise
             except Exception as error:
@@ -189,6 +193,9 @@ class Lockstep:
             raise EnvironmentMismatch(f"the episode with seed {self._seeds[env]} ends at its reset, without an action")
         self._check_rewards(env, reports)
         return reports
+
+    def _with_seed(self, env: int, error: InvalidReturn) -> InvalidReturn:
+        return InvalidReturn(f"{error}, in the episode with seed {self._seeds[env]}")
 
     def _check_rewards(self, env: int, reports: Sequence[Report]) -> None:
         for agent, _, reward, _, _ in reports:
@@ -251,7 +258,7 @@ class Lockstep:
         for name, leaf in self._inputs[agents[0]].items():
             try:
                 stacked[name] = np.array([row[name] for row in observations], dtype=leaf.dtype)
-            except ValueError:
+            except (TypeError, ValueError):
                 stacked[name] = np.zeros(0)
             if stacked[name].shape != (len(agents), *leaf.shape):
                 raise self._misshapen(name, leaf, agents, observations)

@@ -3,7 +3,7 @@
 import math
 import random
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from league.config.league import LeagueConfig
-from league.environments.adapters import EnvAdapter, Report, adapter_for
+from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import build
 from league.environments.conformance.findings import Episode, Examination, Trace
 from league.environments.conformance.observations import ObservationCheck, check_constant_observations
@@ -21,7 +21,7 @@ from league.environments.conformance.time_budget import TimeBudget
 from league.errors import EnvironmentMismatch, IllegalMask, one_line
 from league.interface import Interface
 from league.spaces import ACTION_MASK
-from league.spaces.arrays import check_mask
+from league.spaces.arrays import check_mask, mask_size
 
 FIRST, RETURNS, OPENINGS = 0.2, 0.7, 0.9
 """Shares of the time after which no further episodes are played: the first ones, which are repeated; those that compare
@@ -170,6 +170,7 @@ class Examiner:
                 returns[agent] += reward
                 _check_report(self._agents[agent], (agent, observation, reward, terminated, truncated), self._found)
                 if not (terminated or truncated):
+                    self._check_info(agent, observation, adapter.infos.get(self._agents[agent]))
                     moves.append((agent, self._actions.draw(agent, observation.get(ACTION_MASK))))
             is_late = share is not None and step > 0 and self._budget.is_spent(share)
             if not moves or step == most or is_late:
@@ -180,6 +181,13 @@ class Examiner:
             self.place.step = step
             self._budget.report(f"{doing}, step {step}")
             reports = adapter.step(moves)
+
+    def _check_info(self, agent: int, observation: Observation, info: Any) -> None:
+        """Find masks in infos that are not used, because no info had one after the first reset."""
+        is_unused = ACTION_MASK not in observation and mask_size(self._spaces[agent]) is not None
+        if is_unused and isinstance(info, Mapping) and ACTION_MASK in info:
+            text = "gets a mask in its info after a step, but no agent gets one after reset: report masks from reset on"
+            self._found.add("fault", text, self._agents[agent])
 
     def _check_returns(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
         """Find agents whose returns agree, as those of a team do."""

@@ -22,7 +22,7 @@ from league.environments.conformance.time_budget import TimeBudget
 from league.environments.implementation import implementation
 from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
-from league.errors import LeagueError, cause, one_line, raised_at
+from league.errors import InvalidReturn, LeagueError, cause, one_line, raised_at
 from league.interface import Interface
 from league.spaces import Box, Discrete, MultiDiscrete, Space
 
@@ -85,6 +85,8 @@ def examine(
     examiner = Examiner(env, interface, config, found, steps, budget)
     try:
         examiner.examine(episodes, seed)
+    except InvalidReturn as error:
+        found.add("fault", f"{error} ({examiner.place})")
     except LeagueError as error:
         found.add("fault", str(error))
     except Exception as error:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from league.environments.adapters import Observation
 from league.environments.building import agent_interface, observation_space
 from league.environments.conformance.findings import Examination, Trace
-from league.errors import EnvironmentMismatch
-from league.spaces import Box, Leaf, inputs
+from league.errors import EnvironmentMismatch, InvalidReturn
+from league.spaces import ACTION_MASK, Box, Leaf, inputs
 from league.spaces.arrays import tensors
 
 ENOUGH_TURNS = 20
@@ -50,6 +50,8 @@ class ObservationCheck:
         for name in misshapen:
             shape, expected = list(arrays[name].shape), list(self._leaves[name].shape)
             text = f"observes {name} with shape {shape}, but its space has {expected}: {REMEDY}"
+            if name == ACTION_MASK:
+                raise InvalidReturn(f"agent {self._agent} {text}")  # no legal action can be drawn
             self._found.add("fault", text, self._agent)
         if not misshapen:
             self._check_size(arrays)

@@ -181,26 +181,51 @@ def test_with_actions_that_cannot_be_masked_the_key_is_observed_like_any_other()
     assert type(observation).model_validate_json(observation.model_dump_json()) == observation
 
 
-class InfoMasked(ParallelMasked):
-    """Reports its masks in infos only."""
+class InfoMasks:
+    """Masks in infos only, after reset or only after a step. The observation has two other keys."""
 
-    def __init__(self) -> None:
-        super().__init__("obs")
+    def __init__(self, late: bool = False) -> None:
+        super().__init__(space="obs")  # type: ignore[call-arg]
+        self.late = late
         self.observed = spaces.Dict({"obs": BOX, "secret": BOX})
         self.observation_spaces = dict.fromkeys(AGENTS, self.observed)
 
-    def reset(self, seed: int | None = None, options: Any = None) -> Any:
-        return super().reset(seed)[0], self.infos()
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=seed)[0], {} if self.late else self.masks()  # type: ignore[misc]
 
     def step(self, actions: dict[str, Any]) -> Any:
-        return *super().step(actions)[:-1], self.infos()
+        return *super().step(actions)[:-1], self.masks()  # type: ignore[misc]
 
-    def infos(self) -> dict[str, Any]:
+    def move(self, action: Any) -> None:
+        if self.late:
+            self.turn += 1
+        else:
+            super().move(action)  # type: ignore[misc]
+
+    def masks(self) -> dict[str, Any]:
         return {agent: {"action_mask": np.array([1, 0, 1])} for agent in AGENTS}
 
 
-def test_a_mask_in_infos_joins_observations_with_several_keys() -> None:
-    config = EnvironmentConfig(entry_point=f"{__name__}:InfoMasked")
-    assert examine(LeagueConfig(league="x", environment=config), episodes=1).passed
-    turn = stock_stepping(config, 1).start(each_agent_alone([0], 2))
+class ParallelInfoMasks(InfoMasks, ParallelMasked): ...
+
+
+class RLlibInfoMasks(InfoMasks, RLlibMasked): ...
+
+
+@pytest.mark.parametrize("environment", ["ParallelInfoMasks", "RLlibInfoMasks"])
+def test_masks_in_infos_join_observations_with_several_keys(environment: str) -> None:
+    config = EnvironmentConfig(entry_point=f"{__name__}:{environment}")
+    found = examine(LeagueConfig(league="x", environment=config), episodes=1)
+    assert found.passed, found.findings
+    stepping = stock_stepping(config, 1)
+    turn = stepping.start(each_agent_alone([0], 2))
     assert list(turn.batches[0].observations) == ["observation.obs", "observation.secret", "action_mask"]
+    with pytest.raises(IllegalAction, match=r"action_mask is \[1, 0, 1\]"):
+        stepping.step({group: np.array([1]) for group in turn.batches})
+
+
+@pytest.mark.parametrize("environment", ["ParallelInfoMasks", "RLlibInfoMasks"])
+def test_masks_that_appear_only_after_a_step_are_a_fault(environment: str) -> None:
+    config = EnvironmentConfig(entry_point=f"{__name__}:{environment}", kwargs={"late": True})
+    examination = examine(LeagueConfig(league="x", environment=config), episodes=1)
+    assert "gets a mask in its info after a step, but no agent gets one after reset" in str(examination.findings)
