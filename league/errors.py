@@ -190,6 +190,15 @@ class ArtifactCorrupt(LeagueError, code="artifact_corrupt"):
     """A file of a version is missing, or its digest differs from the manifest."""
 
 
+class FilesMissing(ArtifactCorrupt):
+    """All files of a version are missing. The message names the place, after a colon."""
+
+    @property
+    def public_message(self) -> str:
+        """The message without the place, which is in the server's log."""
+        return str(self).partition(":")[0]
+
+
 class RunCorrupt(LeagueError, code="run_corrupt"):
     """The record of a training run is not valid: a file was changed, or another release wrote it."""
 

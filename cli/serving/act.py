@@ -11,11 +11,11 @@ import typer
 from cli.options import DEFAULT_URL, MAX_SEED, open_registry
 from cli.output import emit, say
 from league.errors import ConfigError, InvalidReference, RemoteError
-from league.refs import CheckpointRef, PolicyRef, parse_ref
+from league.refs import CHAMPION, CheckpointRef, PolicyRef, RemoteRef, ScriptRef, parse_ref
 
 
 def act(
-    ref: Annotated[str, typer.Argument(metavar="REF", help="connect_four@champion, connect_four@3, script:random …")],
+    ref: Annotated[str, typer.Argument(metavar="REF", help="connect_four, connect_four@3, connect_four@candidate …")],
     observation: Annotated[
         str | None,
         typer.Option(
@@ -38,7 +38,12 @@ def act(
     as_json: Annotated[bool, typer.Option("--json", help="Print the complete response as JSON.")] = False,
 ) -> None:
     """Request one action from a policy server, or compute it locally."""
-    parsed = parse_ref(ref)
+    parsed: CheckpointRef | ScriptRef | RemoteRef
+    if "@" in ref or ":" in ref:
+        parsed = parse_ref(ref)
+    else:  # as over HTTP, LEAGUE or LEAGUE.POLICY stands for the champion
+        model = PolicyRef.parse(ref)
+        parsed, policy = CheckpointRef(model.league, CHAMPION), policy or model.policy
     if not isinstance(parsed, CheckpointRef):
         raise InvalidReference(f"{ref} is not a version. Only versions can be served, such as connect_four@champion")
     value = _first_observation(parsed, policy) if observation is None else _read(observation)

@@ -60,6 +60,8 @@ def promote(
     check_alias(alias)
     wanted = None if expected is None else (_expected(expected),)
     version = _mixture(registry, ref) if is_mixture(ref) else registry.versions.resolve(CheckpointRef.parse(ref))
+    for number in (version.number, *(version.mixture.versions if version.mixture else ())):
+        registry.artifacts.check_exists(version.league, number)
     current = registry.aliases.current(version.league).get(alias)
     event = registry.aliases.set(
         version.league,

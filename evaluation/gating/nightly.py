@@ -28,6 +28,7 @@ from league.errors import (
     BoundExceeded,
     EnvironmentMismatch,
     ExploiterMissing,
+    FilesMissing,
     GameCrashed,
     GameHung,
     NotFound,
@@ -96,6 +97,7 @@ def nightly(
         check_exploiters(config, found)
         registry.leagues.register(config, found)
         nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), train, workers, listener)
+        nightly_run.find_missing_files()
         before = nightly_run.champion()
         nightly_run.run_gate()
         nightly_run.confirm()
@@ -174,6 +176,15 @@ class _NightlyRun:
             f" ({gate.alpha:g}); for more than {gate.nights} nightly runs per year, raise gate.nights"
         )
         return None
+
+    def find_missing_files(self) -> None:
+        """Report versions whose files were deleted: they may be needed by no match of this run."""
+        for version in self._registry.versions.all(self._league.slug):
+            if version.retired_at is None:
+                try:
+                    self._registry.artifacts.check_exists(version.league, version.number)
+                except FilesMissing as error:
+                    self.faults.append(str(error))
 
     def _test_candidates(self, nightly_run: NightlyRunRow) -> None:
         for version in self._untested():
@@ -258,4 +269,5 @@ class _NightlyRun:
         try:
             yield
         except CONTESTANT_FAULTS as error:
-            self.faults.append(f"{who}: {error}")
+            if str(error) not in self.faults:  # that all its files are missing
+                self.faults.append(f"{who}: {error}")

@@ -196,7 +196,7 @@ def cross_play(
             f" and {len(interface.agents)} agent(s)"
         )
     if len(contestants) < 2:
-        raise EnvironmentMismatch(f"cross-play in league {config.league} needs two contestants")
+        raise too_few(config.league, contestants)
     pairings = list(combinations_with_replacement(range(len(contestants)), 2))
     length, actions = blocks * len(pairings), action_selection(config, interface)
     return _schedule(config, interface.apart(), "cross_play", contestants, pairings, length, seed, "team", actions)
@@ -255,6 +255,13 @@ def _turns(interface: Interface) -> int:
     return len(interface.sides) if len(interface.sides) > 2 else 1
 
 
+def too_few(league: str, contestants: Sequence[str]) -> EnvironmentMismatch:
+    """Return the error for a schedule without a pair of contestants."""
+    different = list(dict.fromkeys(contestants))
+    given = f"{len(different)}: {', '.join(different)}" if different else "none"
+    return EnvironmentMismatch(f"a schedule of league {league} needs at least two contestants, got {given}")
+
+
 def _schedule(
     config: LeagueConfig,
     interface: Interface,
@@ -270,7 +277,7 @@ def _schedule(
     compared = compared or scoring(config, interface)
     actions = actions or action_selection(config, interface)
     if not pairings:
-        raise EnvironmentMismatch(f"a schedule of league {config.league} needs at least two contestants")
+        raise too_few(config.league, contestants)
     content: dict[str, Any] = {
         "environment": config.environment.digest(),
         "sides": {side: list(agents) for side, agents in interface.sides.items()},

@@ -24,10 +24,11 @@ from evaluation.schedules.builders import (
     cross_play,
     gauntlet,
     round_robin,
+    too_few,
 )
 from evaluation.statistics.bradley_terry import rate
 from league.config.league import LeagueConfig
-from league.errors import EnvironmentMismatch, InvalidInput
+from league.errors import InvalidInput
 from league.interface import Interface
 from league.results.records import GAMES_PER_BLOCK, BlockResult, Match, Schedule
 
@@ -110,7 +111,7 @@ def _adaptive(
     config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int
 ) -> TournamentPlan:
     if len(contestants) < 2:
-        raise EnvironmentMismatch(f"a schedule of league {config.league} needs at least two contestants")
+        raise too_few(config.league, contestants)
     shortest = next(adaptive_rounds(interface, len(contestants)))
     return TournamentPlan(
         name=adaptive_name(config, interface, contestants, seed),

@@ -46,22 +46,27 @@ def describe_validation_error(model: type[BaseModel], error: ValidationError) ->
     """Return the first faults as a sentence that names the keys and the expected values, unknown keys first."""
     faults = _by_value(_without_consequences([Fault.of(model, detail) for detail in error.errors()]))
     unknown_first = sorted(faults, key=lambda fault: not fault.is_unknown_key)
-    messages = dict.fromkeys(str(fault) for fault in unknown_first)
-    return "; ".join(list(messages)[:SHOWN])
+    first = list({str(fault): fault for fault in unknown_first}.values())[:SHOWN]
+    # Several keys of one mapping have the same list.
+    lists = [fault.known for fault in first]
+    return "; ".join(
+        f"{fault}{'' if fault.known in lists[:number] else fault.known}" for number, fault in enumerate(first)
+    )
 
 
 @dataclass(frozen=True)
 class Fault:
     """One of pydantic's errors.
 
-    path: keys and indices, without the names of union members; guess: a similar key; expected: the types that the value
-    does not have.
+    path: keys and indices, without the names of union members; guess: a similar key; known: the list of known keys, if
+    none is similar; expected: the types that the value does not have.
     """
 
     path: tuple[str | int, ...]
     kind: str
     message: str
     guess: str | None = None
+    known: str = ""
     expected: tuple[str, ...] = ()
 
     @classmethod
@@ -78,10 +83,10 @@ class Fault:
         if detail["type"] != "extra_forbidden" or path[-1] in RENAMED_KEYS:
             return cls(tuple(path), detail["type"], _message(detail, path))
         known = _known_keys(known_by, path[start:-1])
-        guesses = difflib.get_close_matches(str(path[-1]), known, n=1)
+        if guesses := difflib.get_close_matches(str(path[-1]), known, n=1):
+            return cls(tuple(path), "extra_forbidden", f"unknown key, did you mean {guesses[0]!r}?", guesses[0])
         listed = f", expected one of {', '.join(sorted(known))}" if known else ""
-        hint = f", did you mean {guesses[0]!r}?" if guesses else listed
-        return cls(tuple(path), "extra_forbidden", f"unknown key{hint}", guesses[0] if guesses else None)
+        return cls(tuple(path), "extra_forbidden", "unknown key", known=listed)
 
     @property
     def is_unknown_key(self) -> bool:

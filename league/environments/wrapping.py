@@ -1,5 +1,6 @@
 """Applies SuperSuit wrappers by name, vectorised over agents where possible."""
 
+import difflib
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -164,7 +165,11 @@ def _maker(name: str) -> Any:
     try:
         make = getattr(supersuit, name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"environment.wrappers: SuperSuit has no wrapper {name!r}: {error}") from error
+        known = [wrapper for wrapper in dir(supersuit) if re.search(r"_v\d+$", wrapper)]
+        near = difflib.get_close_matches(name, known, n=1)
+        # The error of a former version of a wrapper names the present one.
+        hint = f"did you mean {near[0]!r}?" if near and type(error) is ImportError else error
+        raise ConfigError(f"environment.wrappers: SuperSuit has no wrapper {name!r}: {hint}") from error
     if not (callable(make) and re.search(r"_v\d+$", name)):
         raise ConfigError(
             f"environment.wrappers: {name!r} of SuperSuit is not a wrapper: expected for example frame_stack_v1"

@@ -1,6 +1,7 @@
 """Ten typical mistakes: the message is one line that names the file, key or line, and what to do."""
 
 import os
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -282,6 +283,55 @@ def test_a_leagues_name_in_place_of_its_file(league: League, folder: Path) -> No
     result = league("train", "guess")
     assert result.code == 2
     assert one_line(result.err).endswith(": did you mean guess.yaml?")
+
+
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [("gess.yaml", "; did you mean guess.yaml?"), ("tictacto.yaml", "; did you mean tictactoe?"), ("x.yaml", "")],
+)
+def test_a_wrong_name_of_a_file(league: League, folder: Path, name: str, end: str) -> None:
+    write(folder)
+    result = league("train", name)
+    assert (result.code, one_line(result.err)) == (2, f"league: {name}: No such file or directory{end}")
+
+
+def test_a_wrong_name_of_a_wrapper(league: League, folder: Path) -> None:
+    write(folder, environment={"entry_point": f"{module(folder).stem}:Guess", "wrappers": ["frame_stak_v2"]})
+    result = league("train", "guess.yaml")
+    assert result.code == 2
+    expected = "environment.wrappers: SuperSuit has no wrapper 'frame_stak_v2': did you mean 'frame_stack_v2'?"
+    assert one_line(result.err) == f"league: {expected}"
+
+
+def test_the_files_of_a_version_were_deleted(league: League, registry: Registry, tmp_path: Path) -> None:
+    """Each command names the directory and what to do, and no night passes over it."""
+    directory = registry.artifacts.path("tictactoe", 3)
+    shutil.rmtree(directory)
+    message = (
+        f"tictactoe/3/manifest.json is missing: {directory} does not exist; mount its disk or restore it from a backup,"
+        " or remove the version by `league remove tictactoe@3` and publish it again"
+    )
+    for command in (
+        ("act", "tictactoe@3", "--local"),
+        ("export", "tictactoe@3", str(tmp_path / "exported")),
+        ("evaluate", "tictactoe", "tictactoe@3", "--blocks", "1", "--workers", "0"),
+        ("promote", "tictactoe@3"),
+        ("replay", "tictactoe@3", "script:random", "--out", str(tmp_path / "game.gif")),
+    ):
+        result = league(*command)
+        assert (result.code, one_line(result.err)) == (1, f"league: {message}"), command
+    night = league("nightly", "tictactoe", "--workers", "0")
+    assert (night.code, f"tictactoe: {message}" in night.err) == (1, True)
+    assert league("remove", "tictactoe@3", "--yes", "--force").code == 0
+    assert "is missing" not in league("nightly", "tictactoe", "--workers", "0").err
+
+
+def test_one_contestant(league: League, registry: Registry) -> None:
+    result = league("evaluate", "tictactoe", "tictactoe@1", "--schedule", "gauntlet", "--against", "tictactoe@1")
+    assert (result.code, one_line(result.err).endswith("needs at least two contestants, got 1: tictactoe@1")) == (
+        2,
+        True,
+    )
 
 
 @pytest.fixture

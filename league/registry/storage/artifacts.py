@@ -9,7 +9,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
-from league.errors import ArtifactCorrupt
+from league.errors import ArtifactCorrupt, FilesMissing
 from league.files import (
     check_digest,
     copy_verified,
@@ -100,6 +100,13 @@ class ArtifactStore:
         with disk_errors(directory):
             return directory.parent.is_dir() and not directory.is_dir()
 
+    def check_exists(self, league: str, number: int) -> None:
+        """Raise FilesMissing if all files of a version are missing, although the registry has the version."""
+        directory = self.path(league, number)
+        with disk_errors(directory):
+            if not directory.is_dir():
+                raise files_missing(league, number, str(directory))
+
     def has_folder(self, league: str, number: int, folder: str) -> bool:
         """Return whether a version has files in a folder."""
         return (self.path(league, number) / folder).is_dir()
@@ -130,7 +137,7 @@ class ArtifactStore:
         return manifest
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
-        """Read the manifest of a version. Raises ArtifactCorrupt if its digest is not `sha256`."""
+        """Read the manifest of a version. Raises FilesMissing, or ArtifactCorrupt if its digest is not `sha256`."""
         content = self._verified(league, number, MANIFEST, sha256)
         return Manifest.from_json(content, source=label(league, number, MANIFEST))
 
@@ -162,6 +169,8 @@ class ArtifactStore:
 
     def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
         content = self._content(league, number, name, digest)
+        if content is None:
+            self.check_exists(league, number)
         check_digest(
             label(league, number, name), digest, None if content is None else hashlib.sha256(content).hexdigest()
         )
@@ -182,6 +191,14 @@ def _size(directory: Path) -> int:
     """Return the size of all files in a directory, in bytes; 0 if it does not exist."""
     with disk_errors(directory):
         return sum(path.lstat().st_size for path in directory.rglob("*") if not path.is_dir())
+
+
+def files_missing(league: str, number: int, place: str) -> FilesMissing:
+    """Return the error for a version whose directory, or URL, does not exist any more."""
+    return FilesMissing(
+        f"{label(league, number, MANIFEST)} is missing: {place} does not exist; mount its disk or restore it from a"
+        f" backup, or remove the version by `league remove {league}@{number}` and publish it again"
+    )
 
 
 def label(league: str, number: int, name: str) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 
 from league.errors import ConfigError, StorageError, one_line
 from league.files import check_digest, digests_of, disk_errors, files_in
-from league.registry.storage.artifacts import ArtifactStore, label
+from league.registry.storage.artifacts import ArtifactStore, files_missing, label
 from league.registry.storage.digest_cache import DigestCache
 from league.registry.storage.manifest import MANIFEST, TRAINING, Manifest
 
@@ -90,6 +90,11 @@ class ObjectArtifactStore(ArtifactStore):
     def is_purged(self, league: str, number: int) -> bool:  # noqa: ARG002
         """Return False: only the registry records which versions were removed."""
         return False
+
+    def check_exists(self, league: str, number: int) -> None:
+        """Raise FilesMissing if the store has no object of a version, although the registry has the version."""
+        if not self._objects(f"{self._key(league, number)}/"):
+            raise files_missing(league, number, f"{self.url}/{self._key(league, number)}")
 
     def has_folder(self, league: str, number: int, folder: str) -> bool:
         """Return whether a version has files in a folder."""

@@ -15,6 +15,13 @@ def test_act_locally_on_the_first_observation_of_an_episode(league: League, regi
     assert league("act", "tictactoe@3", "--local").out.strip() == "1"
 
 
+def test_without_a_version_the_champion_acts(league: League, registry: Registry) -> None:
+    """As over HTTP."""
+    registry.aliases.set("tictactoe", "champion", 3, expected=None, actor="ann", reason="best")
+    for name in ("tictactoe", "tictactoe.shared"):
+        assert league("act", name, "--local", "--json").json["version"] == 3
+
+
 def test_act_locally_on_text_a_file_and_stdin(league: League, registry: Registry, tmp_path) -> None:
     corner = EMPTY | {"action_mask": [1, 0, 0, 0, 0, 0, 0, 0, 0]}
     path = tmp_path / "observation.json"

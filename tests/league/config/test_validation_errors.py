@@ -55,6 +55,15 @@ def test_an_unknown_key_without_a_similar_one_lists_the_known_ones() -> None:
         LeagueConfig.from_mapping(MINIMAL | {"gate": {"zzz": 1}})
 
 
+def test_the_known_keys_are_listed_once() -> None:
+    with pytest.raises(ConfigError) as caught:
+        LeagueConfig.from_mapping(MINIMAL | {"gate": {"zzz": 1, "qqq": 2}, "play": {"xxx": 3}})
+    lists, bare = [], []
+    for fault in str(caught.value).removeprefix("configuration: ").split("; "):
+        (lists if ", expected one of " in fault else bare).append(fault.partition(":")[0])
+    assert (lists, bare) == (["play.xxx", "gate.zzz"], ["gate.qqq"])
+
+
 def test_a_key_of_a_mapping_is_checked_by_the_type_of_its_values() -> None:
     with pytest.raises(ConfigError, match=r"training\.per_policy\.hidden\.zzz: unknown key, expected one of clip, "):
         LeagueConfig.from_mapping(MINIMAL | {"training": {"per_policy": {"hidden": {"zzz": 1}}}})

@@ -1,12 +1,14 @@
 """Only bytes with the digest of the manifest are used."""
 
 import os
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from league.errors import ArtifactCorrupt, UnknownVersion
+from league.errors import ArtifactCorrupt, FilesMissing, UnknownVersion
 from league.registry.registry import Registry
 from league.registry.storage.manifest import TRAINING
 from tests.support.leagues.registries import GRAPH, LEAGUE, publish
@@ -90,3 +92,12 @@ def test_a_changed_file_is_not_copied(local: Registry, tmp_path: Path) -> None:
     state.write_bytes(b"a pickle")
     with pytest.raises(ArtifactCorrupt, match=r"training/.* was changed"):
         local.versions.copy(LEAGUE, version.number, TRAINING, tmp_path / "copy")
+
+
+def test_the_place_of_deleted_files_is_not_public(local: Registry) -> None:
+    publish(local, "run/1")
+    directory = local.versions.fetch(LEAGUE, 1)
+    shutil.rmtree(directory)
+    with pytest.raises(FilesMissing, match=re.escape(f"{directory} does not exist; ")) as caught:
+        local.versions.fetch(LEAGUE, 1)
+    assert caught.value.public_message == f"{LEAGUE}/1/manifest.json is missing"

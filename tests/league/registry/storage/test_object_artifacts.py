@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from league.errors import ConfigError, LeagueError, StorageError
+from league.errors import ConfigError, FilesMissing, LeagueError, StorageError
 from league.registry.registry import Registry
 from league.registry.storage import object_artifacts
 from league.registry.storage.object_artifacts import ObjectArtifactStore
@@ -29,6 +29,14 @@ def test_a_cached_version_is_read_without_the_store(remote: Registry, monkeypatc
     assert not remote.artifacts.is_purged(LEAGUE, 1)
     manifest = remote.artifacts.verify_names(LEAGUE, 1, version.sha256)
     assert remote.artifacts.read(manifest, "shared.onnx") == GRAPH
+
+
+def test_a_version_without_objects_is_reported(bucket: str, remote: Registry) -> None:
+    publish(remote, "run/1")
+    remote.artifacts.check_exists(LEAGUE, 1)
+    remote.artifacts.discard(LEAGUE, 1)
+    with pytest.raises(FilesMissing, match=f"{bucket}/{LEAGUE}/1 does not exist; "):
+        remote.artifacts.check_exists(LEAGUE, 1)
 
 
 def test_an_unreachable_store_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
