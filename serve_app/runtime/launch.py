@@ -23,6 +23,7 @@ import yaml
 from pydantic import ValidationError
 
 from league import errors
+from league.config.validation_errors import describe_validation_error
 from league.errors import AlreadyRunning, ConfigError, LeagueError, NotReady, last_line, one_line
 from league.ray_cluster import LocalRay, check_stacks, join, node_addresses, ray_session, start_local, usable_cpus
 from league.registry.registry import Registry
@@ -214,7 +215,7 @@ def _settings(document: dict[str, Any]) -> ServeSettings:
     try:
         return ServeSettings.model_validate(document["applications"][0].get("args", {}))
     except ValidationError as error:
-        raise ConfigError(f"deploy.yaml: args: {one_line(error)}") from error
+        raise ConfigError(f"deploy.yaml: args: {describe_validation_error(ServeSettings, error)}") from error
 
 
 def _check_exposure(document: dict[str, Any], storage: Storage) -> None:
