@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from league.errors import ConfigError, NotReady, one_line
+from league.local_ray.loopback_node import LIMITS, StartFailed, loopback_addresses, loopback_node
+from league.local_ray.token import create_token, forget_token
 from league.settings import Storage
 from league.stack import difference, installed_with_this
 
@@ -29,6 +31,8 @@ DRAINING = "DRAINING"
 NO_AUTOSCALER = (None, "0")
 """Versions of the state of an autoscaler that does not run."""
 SAME_VERSIONS = "install the same versions on all machines (constraints.txt)"
+ATTEMPTS = 3
+"""Starts of a local Ray of which a process ends."""
 MIN_OBJECT_STORE = 80
 """MB. Ray refuses less than 75 MiB."""
 
@@ -81,7 +85,7 @@ def _cpu_quota() -> float:
 
 
 def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
-    """Start a local Ray and return the address of its dashboard, if it has one.
+    """Start a local Ray on the loopback interface, and return the address of its dashboard, if it has one.
 
     options: further arguments of `ray.init`. Raises ConfigError if the dashboard is not installed, and NotReady if Ray
     does not start.
@@ -91,18 +95,27 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
     if local.dashboard:
         _check_dashboard()
     os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # inherited by all processes of Ray
-    try:
-        context = ray.init(
-            address="local",
-            num_cpus=local.cpus,
-            object_store_memory=None if local.object_store is None else local.object_store * 10**6,
-            include_dashboard=local.dashboard,
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-            **options,
-        )
-    except Exception as error:  # what Ray raises when its processes take too long to start
-        raise NotReady(f"Ray did not start: {one_line(error)}") from error
+    for name, limit in LIMITS.items():
+        os.environ.setdefault(name, limit)
+    create_token()
+    for attempt in range(ATTEMPTS):
+        try:
+            with loopback_node():
+                context = ray.init(
+                    address="local",
+                    num_cpus=local.cpus,
+                    object_store_memory=None if local.object_store is None else local.object_store * 10**6,
+                    include_dashboard=local.dashboard,
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                    **options,
+                )
+            break
+        except StartFailed as error:  # another program may have taken a port
+            if attempt == ATTEMPTS - 1:
+                raise NotReady(f"Ray did not start: {error}") from error
+        except Exception as error:
+            raise NotReady(f"Ray did not start: {one_line(error)}") from error
     return context.dashboard_url
 
 
@@ -116,8 +129,9 @@ def join(address: str, **options: Any) -> str | None:
 
     try:
         _check_port(address)
-        context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
-    except (OSError, ValueError) as error:
+        with loopback_addresses():
+            context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+    except (OSError, ValueError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(
             f"no Ray cluster at {address!r}: {one_line(error)} (if it requires a token, as `ray start`"
             " does by default: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN on other machines)"
@@ -141,6 +155,7 @@ def ray_session(address: str | None = None) -> Iterator[None]:
     finally:
         if is_owner and ray.is_initialized():
             ray.shutdown()
+            forget_token()
 
 
 def ensure_local(cpus: int) -> None:

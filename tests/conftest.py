@@ -103,7 +103,9 @@ def ray_session() -> Iterator[None]:
     """One Ray with two CPUs for all tests of this process that need it."""
     import ray
 
-    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    from league.ray_cluster import LocalRay, start_local
+
+    start_local(LocalRay(cpus=2))
     yield
     ray.shutdown()
 

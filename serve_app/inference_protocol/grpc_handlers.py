@@ -15,7 +15,8 @@ from google.protobuf.message import Message
 from league.errors import LeagueError, NotReady
 from serve_app.access.errors import status_of
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from serve_app.runtime.ray_serve import add_rpc_service, logger
+from serve_app.runtime.grpc_servers import add_rpc_service
+from serve_app.runtime.ray_serve import logger
 
 SERVICE = "inference.GRPCInferenceService"
 CODES = {

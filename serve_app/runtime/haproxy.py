@@ -23,7 +23,7 @@ from pathlib import Path
 
 from league.errors import NotReady
 from league.ray_cluster import usable_cpus
-from serve_app.runtime import haproxy_script
+from serve_app.runtime import grpc_servers, haproxy_script
 
 DIRECTORIES = Path("/tmp")
 PREFIX = "league-serve-"
@@ -71,6 +71,7 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "serve_app.runtime.serve_bypass:middlewares",
         # Ray starts its workers with 15: any busy process of the machine would take the CPU from the replicas.
         "RAY_worker_niceness": "0",
+        grpc_servers.WORKER_HOOK: f"{grpc_servers.__name__}.{grpc_servers.listen_on_loopback.__name__}",
         "RAY_AUTH_MODE": "token",
         "RAY_USAGE_STATS_ENABLED": "0",
         # Inference in a replica uses one thread.

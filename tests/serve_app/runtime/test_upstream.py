@@ -420,10 +420,13 @@ class TestRayServe:
         assert SERVE_LOGGER_NAME == "ray.serve", "the logger of ray_serve.py is not a child of Ray Serve's any more"
         assert upstream.logger.name == SERVE_LOGGER_NAME, "ray_serve.check_haproxy silences another logger"
 
-    def test_the_address_of_a_local_node_can_be_set(self) -> None:
-        import ray
+    def test_grpc_servers_have_the_expected_parts(self) -> None:
+        from ray.serve._private.constants import DEFAULT_GRPC_SERVER_OPTIONS
 
-        assert "_node_ip_address" in inspect.getsource(ray.init), "launch.py starts Ray on the loopback interface by it"
+        assert grpc_util.DEFAULT_GRPC_SERVER_OPTIONS is DEFAULT_GRPC_SERVER_OPTIONS, "grpc_servers.py extends this list"
+        assert isinstance(DEFAULT_GRPC_SERVER_OPTIONS, list)
+        methods = grpc_util.SERVE_DESCRIPTOR.services_by_name["RayServeAPIService"].methods
+        assert not [field for method in methods for field in method.input_type.fields], "they are not read"
 
 
 def act(client: httpx.Client) -> httpx.Response:

@@ -7,6 +7,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from league.ray_cluster import join
 from serve_app.runtime.launch import load_document
 from serve_app.runtime.ray_serve import deploy
 from tests.support.servers.under_load import RayServer, processes
@@ -40,7 +41,7 @@ def main() -> None:
     import ray
     from ray.serve.schema import ServeDeploySchema
 
-    ray.init(address=address, namespace="serve", log_to_driver=False)
+    join(address, namespace="serve")
     schema = ServeDeploySchema.model_validate(
         load_document(Path(deploy_yaml), None, None, None, int(count), None, insecure=True)
     )

@@ -1,0 +1,137 @@
+"""The node of a local Ray, which `ray.init` creates.
+
+Ray's own node would listen on all interfaces, and give up 30 s after it has started its processes. Its raylet would end
+after half of that time unless the agents that it starts, which import for seconds, have written down their ports. Here
+the ports are given, so that the raylet does not wait for them, and the node waits as long as its processes live.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from league.errors import NotReady
+
+if TYPE_CHECKING:
+    from ray._private.node import Node
+
+ADDRESS = "127.0.0.1"
+"""Ray binds all ports of a node with this address to the loopback interface."""
+PORTS = range(31_000, 32_768)
+"""Range of the agents' ports: below the kernel's ephemeral ports, above those of a server's replicas."""
+AGENT_PORTS = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")
+"""Ray's names of the ports for whose choice its raylet would wait."""
+PATIENCE = 600
+"""Seconds for the steps of a start whose progress cannot be observed."""
+LIMITS = {
+    "RAY_gcs_server_port_wait_time_s": str(PATIENCE),  # until the GCS listens
+    "RAY_agent_register_timeout_ms": str(1000 * PATIENCE),  # until the raylet reaches its agents, or else ends
+    "RAY_worker_register_timeout_seconds": str(PATIENCE),  # until a worker has started, or else is replaced
+}
+"""Ray's environment variables for limits of a start, whose defaults are 30, 30 and 60 s."""
+POLL = 0.1
+"""Seconds between two looks at a node that starts."""
+NOTICE = 10.0
+"""Seconds between two lines that say what is waited for."""
+
+
+class StartFailed(Exception):
+    """A process of the node ended while it started."""
+
+
+@contextmanager
+def loopback_node() -> Iterator[None]:
+    """Let `ray.init` start its node on the loopback interface, and wait for it."""
+    from ray._private import node
+
+    original = node.Node
+    node.Node = _node_class(original)
+    try:
+        yield
+    finally:
+        node.Node = original
+
+
+@contextmanager
+def loopback_addresses() -> Iterator[None]:
+    """Let `ray.init` connect to loopback addresses as they are. Ray would replace them by that of the machine."""
+    from ray._private import ray_constants
+
+    original = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False  # read only where an address is replaced
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = original
+
+
+def _node_class(base: Any) -> Any:
+    class LoopbackNode(base):
+        def __init__(self, ray_params: Any, *arguments: Any, **options: Any) -> None:
+            ray_params.node_ip_address = ADDRESS
+            for name, port in zip(AGENT_PORTS, free_ports(len(AGENT_PORTS)), strict=True):
+                setattr(ray_params, name, port)
+            super().__init__(ray_params, *arguments, **options)
+
+        def start_ray_processes(self) -> None:
+            raylet: Any = import_module("ray._raylet")
+            # The only one of these ports that is not among the arguments of the raylet.
+            name, port = raylet.DASHBOARD_AGENT_LISTEN_PORT_NAME, self._ray_params.dashboard_agent_listen_port
+            raylet.persist_port(self._session_dir, self._node_id, name, port)
+            super().start_ray_processes()
+            try:
+                _await_registration(self)
+            except BaseException:
+                self.kill_all_processes(check_alive=False, wait=True)
+                raise
+
+    return LoopbackNode
+
+
+def _await_registration(node: Node) -> None:
+    """Wait until the raylet has registered. Raises StartFailed if a process ends before."""
+    begun = noticed = time.monotonic()
+    while not _is_registered(node):
+        for name, processes in node.all_processes.items():
+            if any(info.process.poll() is not None for info in processes):
+                raise StartFailed(f"its process {name} ended; see {node.get_logs_dir_path()}")
+        if (now := time.monotonic()) - noticed >= NOTICE:
+            noticed = now
+            say(f"Waiting for Ray to start: its raylet has not registered after {now - begun:.0f} s")
+        time.sleep(POLL)
+
+
+def _is_registered(node: Node) -> bool:
+    from ray.exceptions import RpcError
+
+    try:
+        return bool(node.get_gcs_client().get_all_node_info(timeout=NOTICE))
+    except RpcError:  # the GCS did not answer in time
+        return False
+
+
+def say(line: str) -> None:
+    """Print a line for the person who waits, on standard error."""
+    Console(stderr=True, highlight=False).print(line, style="dim", soft_wrap=True)
+
+
+def free_ports(count: int) -> list[int]:
+    """Unused ports of the loopback interface. Raises NotReady."""
+    found: list[int] = []
+    for port in random.sample(PORTS, len(PORTS)):
+        with socket.socket() as probe:
+            try:
+                probe.bind((ADDRESS, port))
+            except OSError:
+                continue
+        found.append(port)
+        if len(found) == count:
+            return found
+    raise NotReady(f"found fewer than {count} free ports from {PORTS.start} to {PORTS.stop - 1}")

@@ -1,0 +1,183 @@
+"""A local Ray in a process of its own: where it listens, its token, and a start that takes long."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from league.local_ray import token
+
+DEADLINE = 240
+TOKENS = (token.MODE, token.TOKEN, token.TOKEN_FILE)
+START = """
+import os, re, sys, threading
+import psutil, ray
+from ray._private import services
+from league.local_ray import loopback_node, token
+from league.ray_cluster import LocalRay, join, ray_session, start_local
+
+loopback_node.NOTICE = 0.2
+this = psutil.Process()
+
+def below(name):
+    found = []
+    for process in this.children(recursive=True):
+        try:
+            if process.name() == name or any(part.endswith(name) for part in process.cmdline()):
+                found.append(process)
+        except psutil.NoSuchProcess:
+            pass
+    return found
+
+def run_a_task():
+    return ray.get(ray.remote(lambda: "a task ran").remote())
+"""
+LISTENERS = """
+start_local(LocalRay(cpus=1))
+print(run_a_task())
+listeners = {
+    connection.laddr.ip.removeprefix("::ffff:")
+    for process in [this, *this.children(recursive=True)]
+    for connection in process.net_connections("tcp")
+    if connection.status == "LISTEN"
+}
+assert listeners == {"127.0.0.1"}, listeners
+assert ray.util.get_node_ip_address() == "127.0.0.1"
+address = ray.get_runtime_context().gcs_address
+import subprocess
+script = "import ray; from league.ray_cluster import join; join(sys.argv[1]); print(*ray.cluster_resources())"
+joined = subprocess.run([sys.executable, "-c", "import sys; " + script, address], capture_output=True, text=True)
+assert "CPU" in joined.stdout, joined.stderr
+strangers = {name: value for name, value in os.environ.items() if name != token.TOKEN}
+command = [sys.executable, "-c", "import sys; " + script, address]
+refused = subprocess.run(command, env=strangers, capture_output=True, text=True)
+assert "ConfigError: no Ray cluster" in refused.stderr and "CPU" not in refused.stdout, refused
+"""
+SLOW_AGENTS = """
+stopped = {}
+is_over = threading.Event()
+
+def stop_agents():
+    while not is_over.wait(0.01):
+        for process in below("dashboard/agent.py"):
+            if process.ppid() != this.pid and process.pid not in stopped:
+                process.suspend()
+                stopped[process.pid] = process
+
+thread = threading.Thread(target=stop_agents)
+thread.start()
+start_local(LocalRay(cpus=1))
+is_over.set()
+thread.join()
+print(run_a_task(), "while", len(stopped), "agent is stopped")
+for process in stopped.values():
+    process.resume()
+"""
+SLOW_RAYLET = """
+is_noticed = threading.Event()
+print_line = loopback_node.say
+
+def say(line):
+    print_line(line)
+    is_noticed.set()
+
+def stop_raylet():
+    while not (found := below("raylet")):
+        pass
+    found[0].suspend()
+    is_noticed.wait()
+    found[0].resume()
+
+loopback_node.say = say
+threading.Thread(target=stop_raylet).start()
+start_local(LocalRay(cpus=1))
+print(run_a_task())
+"""
+DEAD_RAYLETS = """
+from league import ray_cluster
+from league.errors import NotReady
+
+killed = []
+most = int(sys.argv[1])
+
+def kill_raylets():
+    while len(killed) < most:
+        for process in below("raylet"):
+            if process.pid not in killed and process.status() != psutil.STATUS_ZOMBIE:
+                killed.append(process.pid)
+                process.kill()
+
+threading.Thread(target=kill_raylets, daemon=True).start()
+try:
+    start_local(LocalRay(cpus=1))
+    print(run_a_task(), "after", len(killed), "was killed")
+except NotReady as error:
+    print(error)
+    assert below("gcs_server") == [], "processes are left behind"
+"""
+TWICE = """
+tokens = []
+for _ in range(2):
+    with ray_session():
+        start_local(LocalRay(cpus=1))
+        print(run_a_task())
+        tokens.append(os.environ[token.TOKEN])
+assert token.TOKEN not in os.environ
+assert tokens[0] != tokens[1] and len(tokens[0]) >= 32
+"""
+
+
+def run(script: str, home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a script with a home directory of its own, without Ray's variables for tokens."""
+    inherited = {name: value for name, value in os.environ.items() if name not in TOKENS}
+    done = subprocess.run(
+        [sys.executable, "-c", START + script, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+        cwd=home,
+        env=inherited | {"HOME": str(home), "PYTHONPATH": str(Path(__file__).parents[3])},
+    )
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_it_listens_on_loopback_and_requires_its_token(tmp_path: Path) -> None:
+    assert "a task ran" in run(LISTENERS, tmp_path).stdout
+    assert not (tmp_path / ".ray").exists(), "Ray's own token would be readable by everybody"
+
+
+def test_it_starts_while_its_agents_do_not_answer(tmp_path: Path) -> None:
+    assert "a task ran while 1 agent is stopped" in run(SLOW_AGENTS, tmp_path).stdout
+
+
+def test_the_person_who_waits_is_told_for_what(tmp_path: Path) -> None:
+    done = run(SLOW_RAYLET, tmp_path)
+    assert "a task ran" in done.stdout
+    assert "Waiting for Ray to start: its raylet has not registered after 0 s" in done.stderr
+
+
+def test_a_start_of_which_a_process_ends_is_repeated(tmp_path: Path) -> None:
+    assert "a task ran after 1 was killed" in run(DEAD_RAYLETS, tmp_path, "1").stdout
+
+
+def test_a_process_that_always_ends_is_named(tmp_path: Path) -> None:
+    assert "Ray did not start: its process raylet ended; see /" in run(DEAD_RAYLETS, tmp_path, "100").stdout
+
+
+def test_each_has_a_token_of_its_own(tmp_path: Path) -> None:
+    assert run(TWICE, tmp_path).stdout.count("a task ran") == 2
+
+
+@pytest.mark.parametrize(
+    "chosen", [{token.TOKEN: "chosen"}, {token.TOKEN_FILE: "/home/me/token"}, {token.MODE: token.DISABLED}]
+)
+def test_a_choice_of_the_user_is_kept(chosen: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in TOKENS:
+        monkeypatch.delenv(name, raising=False)
+    for name, value in chosen.items():
+        monkeypatch.setenv(name, value)
+    token.create_token()
+    assert {name: os.environ[name] for name in TOKENS if name in os.environ} == {token.MODE: "token", **chosen}
