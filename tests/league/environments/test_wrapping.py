@@ -108,6 +108,7 @@ def test_vector_environments_are_rejected(name: str) -> None:
         ([{"resize_v1": {"x": 8}}], r"resize_v1 \(number 1\).*'x'"),
         ([{"reshape_v0": {"shape": [3]}}], r"reshape_v0 \(number 1\).*as many elements"),
         (["frame_stack_v0"], "SuperSuit has no wrapper 'frame_stack_v0'.*use frame_stack_v1 instead"),
+        (["frame_stak_v2"], "SuperSuit has no wrapper 'frame_stak_v2': did you mean 'frame_stack_v2'?"),
         (["utils"], "'utils' of SuperSuit is not a wrapper"),
         (
             [{"observation_lambda_v0": {"change_observation_fn": "no.such:thing"}}],
