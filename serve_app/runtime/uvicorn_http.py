@@ -111,7 +111,7 @@ def _is_loopback(address: str) -> bool:
     return ip_address(address).is_loopback
 
 
-NO_HTTP = b'{"code": "malformed_request", "message": "the request is not valid HTTP"}'
+NO_HTTP = b'{"code": "invalid_input", "message": "the request is not valid HTTP"}'
 MALFORMED = (
     b"HTTP/1.1 400 Bad Request\r\ncontent-type: application/json\r\nx-content-type-options: nosniff\r\n"
     b"connection: close\r\ncontent-length: %d\r\n\r\n%b" % (len(NO_HTTP), NO_HTTP)
