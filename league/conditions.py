@@ -69,12 +69,14 @@ def _short(value: Any) -> str | None:
 
 def action_selection(config: "LeagueConfig", interface: "Interface") -> ActionSelection:
     """Return `play.actions`, by default `default_selection`."""
-    return config.play.actions or default_selection(interface.hidden_information, len(interface.sides))
+    return config.play.actions or default_selection(
+        interface.hidden_information or interface.simultaneous, len(interface.sides)
+    )
 
 
-def default_selection(hidden_information: bool, sides: int) -> ActionSelection:
-    """Return `sampled` if the environment hides information from opponents. A single side has no opponents."""
-    return "sampled" if hidden_information and sides > 1 else "greedy"
+def default_selection(is_unseen: bool, sides: int) -> ActionSelection:
+    """Return `sampled` if information or moves are unseen by opponents. A single side has no opponents."""
+    return "sampled" if is_unseen and sides > 1 else "greedy"
 
 
 def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
@@ -88,9 +90,16 @@ def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
         reason = "there is only one side"
     elif interface.hidden_information:
         reason = "the environment hides information from opponents"
+    elif interface.simultaneous:
+        reason = "opponents act at once, without seeing the other's action"
     else:
         reason = "the environment is not known to hide information"
     return f"Versions play with {chosen} actions: {reason} (play.actions)."
+
+
+def declares_information(env: Any) -> bool:
+    """Return whether an environment says itself whether it hides information, also that it does not."""
+    return "hidden_information" in (getattr(env, "metadata", None) or {})
 
 
 def hides_information(env: Any) -> bool:

@@ -30,6 +30,8 @@ class Interface(BaseModel):
     """Side → agents, in the order in which contestants rotate."""
     hidden_information: bool = False
     """Whether the environment hides information from opponents; see `league.conditions.hides_information`."""
+    simultaneous: bool = False
+    """Whether agents of several sides take discrete actions at once, without seeing those of the others."""
 
     @property
     def policy_ids(self) -> tuple[str, ...]:

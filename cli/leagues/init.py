@@ -78,6 +78,8 @@ def init(
     found = proposal.found
     say(found.policies)
     say(found.actions)
+    if found.views and len(proposal.config.sides or ()) != 1:
+        say(found.views)
     if proposal.config.play.actions == "greedy" and found.openings is not None:
         say(str(found.openings))
     for finding in found.findings:

@@ -60,6 +60,8 @@ def _show(league: "LeagueConfig", found: "Examination") -> None:
         say(found.implementation)
         say(found.policies)
         say(found.actions)
+        if found.views:
+            say(found.views)
         if (openings := found.openings) is not None:
             say(str(openings))
             if (plies := league.play.opening_plies) != openings.recommended and 0 < plies <= len(openings.lengths):

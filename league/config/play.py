@@ -31,7 +31,8 @@ class PlayConfig(Part):
     environment."""
     actions: Literal["greedy", "sampled"] | None = None
     """greedy: versions take the most likely actions. sampled: versions sample actions from their distributions. By
-    default `sampled` if the environment hides information from opponents, else `greedy`; see league/conditions.py.
+    default `sampled` if the environment hides information from opponents, or they take discrete actions at once, else
+    `greedy`; see league/conditions.py.
     Versions of value-based algorithms have no distribution, and are always greedy."""
     scoring: Literal["game", "side"] | None = None
     """What a contestant's return is compared with. game: the returns of its opponents in the same game. side: the

@@ -19,7 +19,7 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
-from league.conditions import hides_information
+from league.conditions import declares_information, hides_information
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
@@ -31,7 +31,7 @@ from league.environments.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
-from league.spaces import Discrete
+from league.spaces import Discrete, MultiDiscrete
 from league.spaces.conversion import from_gymnasium, with_mask
 
 
@@ -191,6 +191,10 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
         policies=policies,
         sides={side: tuple(agent for agent in names if side_of[agent] == side) for side in sides},
         hidden_information=hides_information(env),
+        simultaneous=isinstance(env, ParallelEnv)
+        and not declares_information(env)
+        and len(sides) > 1
+        and all(isinstance(spaces.action, Discrete | MultiDiscrete) for spaces in agents.values()),
     )
 
 

@@ -192,9 +192,13 @@ def _end_keys(session: Session, league: str) -> None:
 def _action_selections(session: Session, league: str | None = None) -> dict[str, ActionSelection]:
     """league → action selection, of all leagues or of one."""
     chosen, interface = LeagueTable.config["play"]["actions"].as_string(), LeagueTable.interface
-    query = select(LeagueTable.slug, chosen, interface["hidden_information"].as_boolean(), interface["sides"])
+    hidden, simultaneous = (interface[key].as_boolean() for key in ("hidden_information", "simultaneous"))
+    query = select(LeagueTable.slug, chosen, hidden, simultaneous, interface["sides"])
     rows = session.execute(query if league is None else query.where(LeagueTable.slug == league))
-    return {slug: actions or default_selection(bool(hidden), len(sides or ())) for slug, actions, hidden, sides in rows}
+    return {
+        slug: actions or default_selection(bool(is_hidden or at_once), len(sides or ()))
+        for slug, actions, is_hidden, at_once, sides in rows
+    }
 
 
 def _has_versions(session: Session, league: str) -> bool:

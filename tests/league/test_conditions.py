@@ -16,6 +16,17 @@ def config(entry_point: str, **parts: Any) -> LeagueConfig:
     return LeagueConfig.from_mapping({"league": "one", "environment": {"entry_point": entry_point}} | parts)
 
 
+ADVERSARY = "mpe2.simple_adversary_v3"
+STEERED = {"entry_point": ADVERSARY, "kwargs": {"continuous_actions": True}}
+
+
+def open_game() -> Any:
+    """Simultaneous moves in an environment that declares that it hides nothing."""
+    env = build(config(ADVERSARY).environment)
+    env.unwrapped.metadata = {**env.unwrapped.metadata, "hidden_information": False}
+    return env
+
+
 LEDUC, CHESS = "pettingzoo.classic.leduc_holdem_v4", "pettingzoo.classic.tictactoe_v3"
 
 
@@ -25,6 +36,11 @@ LEDUC, CHESS = "pettingzoo.classic.leduc_holdem_v4", "pettingzoo.classic.tictact
         (config(LEDUC), "sampled", "hides information from opponents"),
         (config("pettingzoo.classic.rps_v2"), "sampled", "hides information from opponents"),
         (config("examples.kuhn_poker:env"), "sampled", "hides information from opponents"),
+        (config(ADVERSARY), "sampled", "opponents act at once"),
+        (config(ADVERSARY, play={"actions": "greedy"}), "greedy", "as play.actions says"),
+        (config(ADVERSARY, sides={"team": ["*"]}), "greedy", "there is only one side"),
+        (config(ADVERSARY, environment=STEERED), "greedy", "is not known to hide information"),
+        (config(f"{__name__}:open_game"), "greedy", "is not known to hide information"),
         (config(CHESS), "greedy", "is not known to hide information"),
         (config(CHESS, play={"actions": "sampled"}), "sampled", "as play.actions says"),
         (config(LEDUC, play={"actions": "greedy"}), "greedy", "as play.actions says"),

@@ -4,13 +4,16 @@ import math
 import random
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import AECEnv
 
 from league.config.league import LeagueConfig
+from league.config.network import channels_of
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import build
 from league.environments.conformance.findings import Episode, Examination, Trace
@@ -154,7 +157,7 @@ class Examiner:
             doing: What the progress says.
             most: Steps after which the episode is cut.
             share: Share of the time after which it is cut.
-            states: Check the global state at each step.
+            states: Check the global state at each step, and compare the observations of agents.
         """
         trace: Trace = []
         returns, actions, step = [0.0] * len(self._agents), [0] * len(self._agents), 0
@@ -164,6 +167,7 @@ class Examiner:
         while True:
             if states:
                 _check_state(adapter, self._found)
+                self._compare_views(reports)
             moves = []
             for agent, observation, reward, terminated, truncated in reports:
                 trace.append((agent, joined(observation), reward, terminated, truncated))
@@ -189,6 +193,21 @@ class Examiner:
             text = "gets a mask in its info after a step, but no agent gets one after reset: report masks from reset on"
             self._found.add("fault", text, self._agents[agent])
 
+    def _compare_views(self, reports: Sequence[Report]) -> None:
+        """Find out whether two agents observe different things in one state."""
+        if self._found.views_differ:
+            return
+        if isinstance(self._env, AECEnv):
+            with suppress(Exception):  # `observe` of an agent that is not to act is optional
+                views = [
+                    check.arrays(self._env.observe(agent))
+                    for agent, check in zip(self._agents, self._checks, strict=True)
+                    if agent in self._env.agents
+                ]
+                self._found.views_differ = _differ(views)
+        else:
+            self._found.views_differ = _differ([observation for _, observation, *_ in reports])
+
     def _check_returns(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
         """Find agents whose returns agree, as those of a team do."""
         games = [episode.returns for episode in first if episode.is_whole]
@@ -207,6 +226,19 @@ class Examiner:
                 "note",
                 f'the returns of all agents {how}: are they one team? A team is one side: `sides: {{team: ["*"]}}`',
             )
+
+
+def _differ(views: Sequence[Observation]) -> bool:
+    """Whether two observations differ. Boards show the same in another order: my pieces, then yours."""
+    return len({b"".join(_planes(array) for name, array in view.items() if name != ACTION_MASK) for view in views}) > 1
+
+
+def _planes(array: NDArray[Any]) -> bytes:
+    """The values of an array; of a board or an image, its planes in the order of their values."""
+    if array.ndim != 3:
+        return array.tobytes()
+    planes = np.moveaxis(array, 0 if channels_of(array.shape) == "first" else -1, 0)
+    return b"".join(sorted(plane.tobytes() for plane in planes))
 
 
 def _agreement(games: Sequence[Sequence[float]]) -> float | None:

@@ -45,7 +45,7 @@ class ObservationCheck:
             self._found.add(
                 "note", "its observations are modified after they are returned: they are copied", self._agent
             )
-        arrays = self._arrays(value)
+        arrays = self.arrays(value)
         misshapen = [name for name, leaf in self._leaves.items() if arrays[name].shape != leaf.shape]
         for name in misshapen:
             shape, expected = list(arrays[name].shape), list(self._leaves[name].shape)
@@ -75,7 +75,7 @@ class ObservationCheck:
                 is_float = np.dtype(leaf.dtype).kind == "f"
                 self._found.add("fault", text + (", or set training.normalize_observations" * is_float), self._agent)
 
-    def _arrays(self, value: Any) -> Observation:
+    def arrays(self, value: Any) -> Observation:
         """Split an observation. Raises EnvironmentMismatch if its structure is not that of the space."""
         try:
             return tensors(self._space, value)

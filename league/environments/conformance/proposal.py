@@ -151,7 +151,8 @@ def _play(config: LeagueConfig, found: Examination, interface: Interface, is_tea
     if is_team:
         reason = "the most likely ones, as there is no opponent"
     elif actions == "sampled":
-        reason = "drawn at random, as the environment hides information"
+        hides = interface.hidden_information
+        reason = f"drawn at random, as {'the environment hides information' if hides else 'opponents act at once'}"
     yield _Line()
     yield _Line("play:", "the games that are rated")
     yield _Line(f"  actions: {actions}", reason)

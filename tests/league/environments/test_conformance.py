@@ -178,6 +178,24 @@ def test_returns_that_agree_are_those_of_a_team(entry_point: str, least: float, 
     assert found.is_team == ("are they one team?" in findings(found, "note")) == (least > 0)
 
 
+@pytest.mark.parametrize(
+    ("entry_point", "expected"),
+    [
+        ("mpe2.simple_adversary_v3", '`metadata["hidden_information"] = True` and `render_for(agent)`'),
+        ("pettingzoo.classic.leduc_holdem_v4", "the environment declares `render_for(agent)`"),
+        ("pettingzoo.classic.tictactoe_v3", ""),
+        ("examples.traffic:crossing", ""),
+    ],
+)
+def test_how_to_declare_hidden_information_is_said_where_observations_differ(entry_point: str, expected: str) -> None:
+    config = LeagueConfig.from_mapping({"league": "x", "environment": {"entry_point": entry_point}})
+    if "traffic" in entry_point:
+        config = LeagueConfig.load("configs/cars_and_lights.yaml")
+    found = examine(config, episodes=1)
+    assert expected in found.views
+    assert bool(found.views) == bool(expected)
+
+
 class WrongShape(Simultaneous):
     def _observe(self, agent: str) -> np.ndarray:
         return np.zeros(4, np.float32)

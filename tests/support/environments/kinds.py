@@ -37,7 +37,9 @@ class Kind:
     @cached_property
     def config(self) -> LeagueConfig:
         environment = {"entry_point": self.entry_point, "kwargs": self.kwargs}
-        document: dict[str, Any] = {"league": "kind", "environment": environment, "sides": self.sides}
+        # A game is then a function of its policies and its seed, which the tests compare.
+        play = {"actions": "greedy"}
+        document: dict[str, Any] = {"league": "kind", "environment": environment, "sides": self.sides, "play": play}
         if self.policies:
             document["policies"] = self.policies
         return LeagueConfig.from_mapping(document)
