@@ -6,6 +6,7 @@ takes over the ports without refusing a connection, as from a stand-in (serve_ap
 
 import json
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,6 +63,7 @@ def starting_page(directory: Path, binary: str, host: str, port: int, grpc_port:
         [binary, "-db", "-f", configuration], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:
         (directory / STAND_IN).write_text(str(process.pid))
+        threading.Thread(target=process.wait, daemon=True).start()  # it ends long before the server, and must be reaped
         try:
             yield
         finally:

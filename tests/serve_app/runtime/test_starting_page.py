@@ -8,6 +8,7 @@ from pathlib import Path
 
 import grpc
 import httpx
+import psutil
 import pytest
 
 from serve_app.runtime import haproxy, haproxy_script
@@ -56,6 +57,16 @@ def test_the_ports_are_free_afterwards(tmp_path: Path) -> None:
     with starting_page(tmp_path, binary, "127.0.0.1", port, None):
         until(lambda: not haproxy.is_free("127.0.0.1", port))
     assert haproxy.is_free("127.0.0.1", port)
+
+
+def test_the_process_that_was_replaced_is_reaped(tmp_path: Path) -> None:
+    (port,) = haproxy.free_ports(1, "127.0.0.1")
+    binary = haproxy_script.find_haproxy()
+    assert binary is not None
+    with starting_page(tmp_path, binary, "127.0.0.1", port, None):
+        process = psutil.Process(int((tmp_path / haproxy_script.STAND_IN).read_text()))
+        process.kill()
+        until(lambda: not process.is_running())
 
 
 CONFIGURATION = """global
