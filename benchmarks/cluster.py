@@ -86,7 +86,7 @@ def _draining(cluster: LeagueCluster, _: Path, __: bool) -> None:
 
 @contextmanager
 def _served(cluster: LeagueCluster) -> Iterator[str]:
-    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "benchmark")
+    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--yes", "--reason", "benchmark")
     with serving_scenarios.serving(cluster) as key:
         yield key
 

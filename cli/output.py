@@ -265,12 +265,14 @@ def _note(event: "Games") -> str:
     return "  ".join(filter(None, (places, speed, llr)))
 
 
-def show_leaderboard(leaderboard: "tuple[Standing, ...]") -> None:
-    """Print a leaderboard."""
+def show_leaderboard(leaderboard: "tuple[Standing, ...]", explanation: str | None = None) -> None:
+    """Print a leaderboard. explanation: why its first is not the champion."""
     table(
         ("contestant", "rating [95 %]", "score", "mean return", "games"),
         [(each.ref, elo(each.rating, each.interval), each.score, each.mean_return, each.games) for each in leaderboard],
     )
+    if explanation:
+        say(explanation)
 
 
 def verdict(report: "VerdictReport") -> str:

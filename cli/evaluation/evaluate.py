@@ -13,6 +13,7 @@ from league.settings import Storage
 
 if TYPE_CHECKING:
     from evaluation.results import CrossPlay, Estimate, EvaluationReport, Population
+    from league.registry.registry import Registry
 
 
 class ScheduleName(Enum):
@@ -81,11 +82,12 @@ def evaluate(
     from league.ray_cluster import ray_session
 
     Storage.from_environment().export()
+    registry = open_registry()
     with ray_session(address), GameProgress(quiet=as_json) as listener:
         report = run(
             check_slug("league", league),
             refs or (),
-            registry=open_registry(),
+            registry=registry,
             schedule=schedule.value,
             against=against or (),
             blocks=blocks,
@@ -97,16 +99,18 @@ def evaluate(
     if as_json:
         emit(report.to_json())
     else:
-        _show(report)
+        _show(report, registry)
 
 
-def _show(report: "EvaluationReport") -> None:
+def _show(report: "EvaluationReport", registry: "Registry") -> None:
+    from evaluation.reporting.gate_record import why_not_champion
+
     end = "" if report.stopped_by == "schedule" else f"; stopped by --{report.stopped_by}"
     say(f"{report.league}: {report.games} games, {report.unique_games} unique{end}\n")
     if report.cross_play is not None:
         _show_cross_play(report.cross_play)
         return
-    show_leaderboard(report.leaderboard)
+    show_leaderboard(report.leaderboard, why_not_champion(registry, report.league, report.leaderboard))
     for side, leaderboard in report.by_side.items():
         say(f"\nAs {side}:")
         show_leaderboard(leaderboard)

@@ -179,6 +179,7 @@ def run_nightly(config: "LeagueConfig", workers: int | None = CORES, quiet: bool
 
 def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig", quiet: bool) -> None:
     """Print the results of a nightly run, and write the league's report."""
+    from evaluation.reporting.gate_record import why_not_champion
     from evaluation.reporting.html_page import write
     from evaluation.reporting.league_report import league_report
 
@@ -197,7 +198,7 @@ def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig",
         for sentence in summary_of(report):
             say(sentence)
         say()
-        show_leaderboard(report.leaderboard)
+        show_leaderboard(report.leaderboard, why_not_champion(registry, config.league, report.leaderboard))
         say(f"\nReport: {page}")
 
 

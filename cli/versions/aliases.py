@@ -42,6 +42,7 @@ def promote(
             metavar="VERSION", help="Fail unless the alias currently points to this version (`none`: to no version)."
         ),
     ] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
     reason: Reason = "promoted by hand",
     actor: Actor = None,
     wait: Wait = False,
@@ -49,6 +50,9 @@ def promote(
     as_json: AsJson = False,
 ) -> None:
     """Make a version or a mixture the champion, or move another alias to it.
+
+    A champion that the gate has rejected, or that has played no game under the current conditions, is confirmed in the
+    terminal or with --yes.
 
     A mixture becomes a version of its own, which plays each episode with one of its members, drawn by the
     probabilities.
@@ -63,6 +67,8 @@ def promote(
     for number in (version.number, *(version.mixture.versions if version.mixture else ())):
         registry.artifacts.check_exists(version.league, number)
     current = registry.aliases.current(version.league).get(alias)
+    if alias == CHAMPION and not yes and version.number != current:
+        _confirm(registry, version, as_json)
     event = registry.aliases.set(
         version.league,
         alias,
@@ -72,6 +78,21 @@ def promote(
         reason=reason,
     )
     _moved(event, current, as_json, _followers(registry, event, timeout) if wait else None)
+
+
+def _confirm(registry: "Registry", version: "VersionRow", as_json: bool) -> None:
+    """Ask before a version becomes champion that the gate has rejected, or that has not played.
+
+    Raises InvalidInput without a terminal.
+    """
+    from evaluation.reporting.gate_record import doubts
+
+    if (evidence := doubts(registry, version)) is None:
+        return
+    if as_json or not sys.stdin.isatty():
+        raise InvalidInput(f"{evidence}; confirm with --yes that {version.ref} shall be champion")
+    say(f"{evidence}.")
+    typer.confirm(f"Make {version.ref} the champion?", abort=True)
 
 
 def _mixture(registry: "Registry", text: str) -> "VersionRow":
@@ -137,7 +158,7 @@ def mixture(
             raise InvalidInput("without a terminal, confirm with --yes, or omit --alias to show the mixture only")
         typer.confirm(f"Point {league}@{alias} to it?", abort=True)
     ref = next(iter(shares)) if len(shares) == 1 else ",".join(f"{ref}:{share!r}" for ref, share in shares.items())
-    promote(ref, alias=alias, reason=reason, actor=actor, wait=wait, timeout=timeout, as_json=as_json)
+    promote(ref, alias=alias, yes=True, reason=reason, actor=actor, wait=wait, timeout=timeout, as_json=as_json)
 
 
 def _show(found: "MetaStrategy", shares: dict[str, float]) -> None:

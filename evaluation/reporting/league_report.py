@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from evaluation.gating.verdict_evidence import VerdictEvidence, verdict_evidence
 from evaluation.matches.leaderboard import MOST_CONTESTANTS, CountedGames, rated_version
 from evaluation.reporting.flipbook import Flipbook, flipbooks
+from evaluation.reporting.gate_record import why_not_champion
 from evaluation.results import Document, Payoff, RatedVersion, Standing, iso_timestamp
 from evaluation.statistics.population import PopulationShare, shares
 from league.conditions import ActionSelection
@@ -44,7 +45,8 @@ class ChampionChange(Document):
 class LeagueReport(Document):
     """The state of a league.
 
-    leaderboard: best first. by_side: leaderboard of each side, empty if sides are alike or there is only one.
+    leaderboard: best first. not_champion: why its best version is not the champion, if so.
+    by_side: leaderboard of each side, empty if sides are alike or there is only one.
     payoff: of the best contestants, None before the first game. shares: of contestants that have all met, else empty.
     versions: oldest first. roles: of exploiters and mixtures, by reference. verdicts, promotions: newest first.
     left_out: what is omitted, in sentences.
@@ -61,6 +63,7 @@ class LeagueReport(Document):
     games: int
     unique_games: int
     leaderboard: tuple[Standing, ...]
+    not_champion: str | None
     by_side: dict[str, tuple[Standing, ...]]
     payoff: Payoff | None
     shares: tuple[PopulationShare, ...]
@@ -95,6 +98,7 @@ def league_report(
         games=played.games,
         unique_games=played.unique_games,
         leaderboard=leaderboard,
+        not_champion=why_not_champion(registry, league, leaderboard),
         by_side=played.by_side(),
         payoff=table,
         shares=shares(table, played.matches) if table else (),

@@ -5,7 +5,7 @@
 | part | content |
 |---|---|
 | `summary` | counts of games, matches and unique games; scoring, sides and environment; earlier conditions |
-| `leaderboard` | `sides`, `leaderboard` (best first), `by_side` |
+| `leaderboard` | `sides`, `leaderboard` (best first), `by_side`, `not_champion` (why not the best version) |
 | `payoff` | payoff matrix of the best contestants; null before the first game |
 | `ratings` | `versions`, oldest first |
 | `earlier/<conditions>/leaderboard`, `earlier/<conditions>/payoff` | the same for results under earlier conditions |
@@ -25,6 +25,7 @@ from typing import Any
 
 from evaluation.gating.verdict_evidence import verdict_evidence
 from evaluation.matches.leaderboard import CountedGames, rated_version
+from evaluation.reporting.gate_record import why_not_champion
 from evaluation.service.earlier_results import earlier_results, refresh_earlier_results, tables
 from evaluation.statistics.blas import single_threaded_blas
 from league.errors import AlreadyRunning, StorageError
@@ -58,6 +59,8 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
     row, events = registry.leagues.get(league), registry.aliases.history(league)
     played = CountedGames(registry, row)
     sides, leaderboard = list(row.interface.sides), played.leaderboard
+    results = tables(played, sides)
+    results["leaderboard"]["not_champion"] = why_not_champion(registry, league, leaderboard)
     versions = [rated_version(version, leaderboard, events).to_json() for version in registry.versions.all(league)]
     return {
         SUMMARY: {
@@ -71,7 +74,7 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
             "environment_digest": row.environment_digest,
             "earlier": [each.to_json() for each in earlier_results(registry, row)],
         },
-        **tables(played, sides),
+        **results,
         "ratings": {"versions": versions},
     }
 

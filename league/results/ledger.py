@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 from league.conditions import Conditions
 from league.errors import InvalidInput, NotFound, OutOfSpace, UnknownMatch
 from league.files import free_space
+from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.registry import Registry
 from league.registry.storage import tables
@@ -210,6 +211,23 @@ class Ledger:
         query = select(match.schedule, func.count()).filter_by(league=league).group_by(match.schedule)
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
+
+    def has_played(self, ref: str, conditions: Conditions) -> bool:
+        """Return whether a version has a match under these conditions that counts."""
+        match = tables.MatchTable
+        league = CheckpointRef.parse(ref).league
+        query = select(match.schedule).filter_by(league=league).distinct()
+        with self._database.read() as session:
+            counted = {
+                known.id
+                for known in _schedules(session, league)
+                if known.conditions == conditions and ref in known.contestants
+            }
+            return any(
+                schedule in counted
+                for side in (match.first, match.second)
+                for schedule in session.scalars(query.where(side == ref))
+            )
 
     def results(
         self, league: str, conditions: Conditions | None = None, between: tuple[str, str] | None = None

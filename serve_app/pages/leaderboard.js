@@ -22,6 +22,7 @@ export function Leaderboard({ league, about }) {
       </ul></nav>`}
     </div>
     <${EarlierResults} league=${league} summary=${about.summary} game=${game} />
+    ${rows.page?.not_champion && html`<p>${rows.page.not_champion}</p>`}
     <${Await} result=${rows}>${rows.items && html`<${Rows} league=${league} rows=${rows.items} champion=${about.champion} isComputed=${!!rows.page.computed_at && about.up_to_date} />`}<//>
     <${ShowMore} list=${rows} />
     ${rows.items?.length > 0 && html`<p class="muted small">${plural(rows.page.total, "contestant")}. Ratings are Elo above <code>script:random</code>, with 95 % intervals.</p>`}

@@ -169,6 +169,7 @@ def _leaderboard(
         "sides": sides,
         "side": side,
         "leaderboard": page,
+        "not_champion": document.get("not_champion"),
         "total": len(every),
     }
 

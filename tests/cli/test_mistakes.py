@@ -347,7 +347,7 @@ def test_a_port_in_use(league_process: League, registry: Registry, taken_port: i
 
 def test_no_version_yet(league: League, home: Path) -> None:
     tictactoe.registry(home)
-    result = league("promote", "tictactoe@1")
+    result = league("promote", "tictactoe@1", "--yes")
     assert result.code == 2
     expected = "league tictactoe has no version 1; none is published yet: `league train CONFIG` publishes versions"
     assert one_line(result.err) == f"league: {expected}"

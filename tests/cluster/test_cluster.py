@@ -49,7 +49,7 @@ def test_a_node_with_another_version_is_refused(cluster: LeagueCluster, director
 
 @pytest.fixture(scope="module")
 def key(cluster: LeagueCluster) -> Iterator[str]:
-    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "test")
+    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--yes", "--reason", "test")
     with serving_scenarios.serving(cluster) as token:
         yield token
 

@@ -13,7 +13,7 @@ from tests.support.cluster.league_cluster import LeagueCluster
 def test_no_attempt_is_lost_with_a_drained_worker(cluster: LeagueCluster, directory: Path) -> None:
     """Replicas are started elsewhere first, and those of the worker finish their requests."""
     scenarios.train(cluster, directory)
-    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--reason", "test")
+    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--yes", "--reason", "test")
     with serving_scenarios.serving(cluster) as key:
         calls, began, _ = serving_scenarios.drain_worker_while_serving(cluster, key)
     assert calls.lost == calls.attempts_lost == []

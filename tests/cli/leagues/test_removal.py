@@ -21,7 +21,7 @@ def test_a_version_is_removed_after_confirmation(league: League, registry: Regis
 
 
 def test_the_champion_is_removed_by_force_only(league: League, registry: Registry) -> None:
-    league("promote", "tictactoe@1")
+    league("promote", "tictactoe@1", "--yes")
     refused = league("remove", "tictactoe@champion", "--yes")
     assert refused.code == 1
     assert "tictactoe@1 is in use: the alias champion points to it" in refused.err
@@ -36,7 +36,7 @@ def test_a_league_is_removed_with_its_report_and_runs(league: League, registry: 
     report = registry.storage.home / "reports" / f"{NAME}.html"
     report.parent.mkdir()
     report.write_text("a report")
-    league("promote", "tictactoe@1")
+    league("promote", "tictactoe@1", "--yes")
     refused = league("remove", NAME, "--yes")
     assert (refused.code, "tictactoe is in use: the alias champion is set" in refused.err) == (1, True)
     removed = league("remove", NAME, "--yes", "--force")

@@ -8,7 +8,7 @@ pytestmark = on_both_databases
 
 def test_canary_and_shadow_are_set_shown_and_ended(league: League, registry: Registry) -> None:
     assert "the champion serves all requests" in league("traffic", "tictactoe").out
-    league("promote", "tictactoe@2", "--alias", "candidate")
+    league("promote", "tictactoe@2", "--yes", "--alias", "candidate")
     assert (
         "tictactoe@candidate is the canary for 5.0% of the routing keys"
         in league("traffic", "tictactoe", "--canary", "candidate").out

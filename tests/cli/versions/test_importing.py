@@ -27,7 +27,7 @@ def test_an_imported_model_can_be_promoted(league: League, registry: Registry, t
     version = registry.versions.get("tictactoe", 4)
     assert version.note is not None
     assert version.note.text == "made elsewhere"
-    assert league("promote", "tictactoe@4").code == 0
+    assert league("promote", "tictactoe@4", "--yes").code == 0
 
 
 def test_an_exported_version_can_be_imported(league: League, registry: Registry, tmp_path: Path) -> None:

@@ -11,23 +11,23 @@ REFS = ("tictactoe@1", "tictactoe@2", "tictactoe@3")
 
 
 def test_a_mixture_is_promoted_shown_and_rolled_back(league: League, registry: Registry) -> None:
-    league("promote", "tictactoe@1")
-    out = league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--to", "champion").out
+    league("promote", "tictactoe@1", "--yes")
+    out = league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--yes", "--to", "champion").out
     assert "tictactoe@champion now points to version 4 (before: version 1)." in out
     assert "mixture of @1 60.0%, @3 40.0%" in league("versions", "tictactoe").out
     assert "4 (@1 60.0%, @3 40.0%)" in league("history", "tictactoe").out
     event = league("history", "tictactoe", "--json").json["events"][0]
     assert (event["version"], [member["version"] for member in event["members"]]) == (4, [1, 3])
-    assert league("promote", "tictactoe@3:0.4,@1:0.6", "--json").json["id"] == event["id"], "nothing changes"
+    assert league("promote", "tictactoe@3:0.4,@1:0.6", "--yes", "--json").json["id"] == event["id"], "nothing changes"
     assert league("rollback", "tictactoe", "--json").json["version"] == 1
 
 
 def test_replicas_are_waited_for(league: League, registry: Registry) -> None:
-    league("promote", "tictactoe@1")
+    league("promote", "tictactoe@1", "--yes")
     with listening(registry.storage):
-        assert "Confirmed by 1 replica." in league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--wait").out
+        assert "Confirmed by 1 replica." in league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--yes", "--wait").out
         assert "Confirmed by 1 replica." in league("rollback", "tictactoe", "--wait").out
-    result = league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--wait", "--timeout", "0")
+    result = league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--yes", "--wait", "--timeout", "0")
     assert result.code == 1
     assert "is a server running" in result.err
     assert registry.versions.resolve("tictactoe@champion").mixture is not None
@@ -48,9 +48,9 @@ def test_replicas_are_waited_for(league: League, registry: Registry) -> None:
 )
 def test_an_invalid_mixture_changes_nothing(league: League, registry: Registry, ref: str, message: str) -> None:
     if "mixed" in ref:
-        league("promote", "tictactoe@1:0.5,@2:0.5", "--to", "mixed")
+        league("promote", "tictactoe@1:0.5,@2:0.5", "--yes", "--to", "mixed")
     before = registry.aliases.current("tictactoe"), registry.versions.numbers("tictactoe")
-    result = league("promote", ref)
+    result = league("promote", ref, "--yes")
     assert result.code in (1, 2)
     assert result.err.startswith(f"league: {message}")
     assert result.err.count("\n") == 1
@@ -97,7 +97,7 @@ def test_scores_are_those_against_the_mixture_that_is_shown(
 
 
 def test_what_needs_one_policy_names_the_members(league: League, registry: Registry) -> None:
-    league("promote", "tictactoe@1:0.5,@2:0.5")
+    league("promote", "tictactoe@1:0.5,@2:0.5", "--yes")
     message = "league: tictactoe@4 is a mixture (@1 50.0%, @2 50.0%): name one of its members\n"
     assert league("export", "tictactoe@champion").err == message
     assert league("act", "tictactoe@champion", "--local", "--json").json["version"] in (1, 2)

@@ -2,6 +2,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from evaluation.gating.verdicts import open_verdict
 from evaluation.service.snapshots import refresh
 from league.config.league import LeagueConfig
 from league.registry.registry import Registry
@@ -12,7 +13,7 @@ pytestmark = on_both_databases
 
 
 def test_versions_as_json(league: League, registry: Registry) -> None:
-    league("promote", "tictactoe@2")
+    league("promote", "tictactoe@2", "--yes")
     document = league("versions", "tictactoe", "--json").json
     assert document["league"] == "tictactoe"
     assert [version["version"] for version in document["versions"]] == [1, 2, 3]
@@ -63,7 +64,7 @@ def test_terminal_control_characters_are_escaped(league: League, registry: Regis
     hostile = "\x1b]0;owned\x07 \x9b31m\r"
     outputs = [
         league("note", "tictactoe@2", hostile).out,
-        league("promote", "tictactoe@2", "--reason", hostile, "--actor", hostile).out,
+        league("promote", "tictactoe@2", "--yes", "--reason", hostile, "--actor", hostile).out,
         league("versions", "tictactoe").out,
         league("history", "tictactoe").out,
     ]
@@ -74,7 +75,7 @@ def test_terminal_control_characters_are_escaped(league: League, registry: Regis
 
 
 def test_text_with_invalid_unicode_is_rejected(league: League, registry: Registry) -> None:
-    for arguments in (("note", "tictactoe@2", "a\udcff"), ("promote", "tictactoe@2", "--reason", "a\udcff")):
+    for arguments in (("note", "tictactoe@2", "a\udcff"), ("promote", "tictactoe@2", "--yes", "--reason", "a\udcff")):
         result = league(*arguments)
         assert result.code == 2
         assert result.err.startswith("league: ")
@@ -84,9 +85,14 @@ def test_text_with_invalid_unicode_is_rejected(league: League, registry: Registr
 
 
 def test_promotions_rollbacks_and_their_history(league: League, registry: Registry) -> None:
-    assert "now points to version 1 (before: nothing)" in league("promote", "tictactoe@1", "--reason", "the first").out
-    assert "now points to version 3 (before: version 1)" in league("promote", "tictactoe@3", "--actor", "ada").out
-    assert league("promote", "tictactoe@3").out == "tictactoe@champion already points to version 3.\n"
+    assert (
+        "now points to version 1 (before: nothing)"
+        in league("promote", "tictactoe@1", "--yes", "--reason", "the first").out
+    )
+    assert (
+        "now points to version 3 (before: version 1)" in league("promote", "tictactoe@3", "--yes", "--actor", "ada").out
+    )
+    assert league("promote", "tictactoe@3", "--yes").out == "tictactoe@champion already points to version 3.\n"
     assert league("rollback", "tictactoe", "--json").json["version"] == 1
     events = league("history", "tictactoe", "--json").json["events"]
     assert [(event["version"], event["previous"], event["kind"]) for event in events] == [
@@ -106,11 +112,33 @@ def test_promotions_rollbacks_and_their_history(league: League, registry: Regist
     assert outcome.err.startswith("league: ")
 
 
+def test_a_version_that_never_played_or_was_rejected_becomes_champion_with_yes_only(
+    league: League, registry: Registry
+) -> None:
+    refused = league("promote", "tictactoe@1")
+    assert refused.code == 2
+    assert refused.err.startswith("league: tictactoe@1 has played no game under the current conditions")
+    assert "confirm with --yes that tictactoe@1 shall be champion" in refused.err
+    assert league("promote", "tictactoe@1", "--json").code == 2
+    assert registry.aliases.current("tictactoe") == {}
+    assert league("promote", "tictactoe@1", "--alias", "candidate").code == 0, "other aliases are not asked about"
+    league("evaluate", "tictactoe", "--blocks", "2", "--workers", "0")
+    assert league("promote", "tictactoe@1").code == 0
+    verdict = open_verdict(registry, registry.leagues.get("tictactoe"), 2, "tictactoe@1")
+    registry.verdicts.close(verdict.id, "reject", {"reason": "Not stronger: it scored 40.0 % against tictactoe@1."})
+    refused = league("promote", "tictactoe@2")
+    assert refused.code == 2
+    rejected = f"the gate has rejected tictactoe@2 in verdict {verdict.short_id}: Not stronger: it scored 40.0 %"
+    assert rejected in refused.err
+    assert league("promote", "tictactoe@2", "--yes").code == 0
+    assert league("promote", "tictactoe@2").code == 0, "it is champion already"
+
+
 def test_of_two_concurrent_promotions_one_fails(league_process: League, registry: Registry) -> None:
-    league_process("promote", "tictactoe@1")
+    league_process("promote", "tictactoe@1", "--yes")
     with ThreadPoolExecutor(2) as pool:
         refs = ("tictactoe@2", "tictactoe@3")
-        results = list(pool.map(lambda ref: league_process("promote", ref, "--expected", "1"), refs))
+        results = list(pool.map(lambda ref: league_process("promote", ref, "--yes", "--expected", "1"), refs))
     assert sorted(outcome.code for outcome in results) == [0, 1]
     loser = max(results, key=lambda outcome: outcome.code)
     winner = registry.aliases.current("tictactoe")["champion"]
@@ -119,5 +147,5 @@ def test_of_two_concurrent_promotions_one_fails(league_process: League, registry
 
 
 def test_another_alias_can_be_moved(league: League, registry: Registry) -> None:
-    league("promote", "tictactoe@2", "--alias", "candidate", "--expected", "none")
+    league("promote", "tictactoe@2", "--yes", "--alias", "candidate", "--expected", "none")
     assert registry.aliases.current("tictactoe") == {"candidate": 2}

@@ -177,10 +177,10 @@ def cut_off_database(cluster: LeagueCluster, key: str, version: int, seconds: fl
 def promote_and_wait(cluster: LeagueCluster, version: int, seconds: float) -> str:
     """Promote a version on a worker, and wait until all replicas serve it; returns what the command prints."""
     options = ("--reason", "test", "--wait", "--timeout", str(seconds))
-    return cluster.league(cluster.machines[SURVIVOR], "promote", f"{LEAGUE}@{version}", *options)
+    return cluster.league(cluster.machines[SURVIVOR], "promote", f"{LEAGUE}@{version}", "--yes", *options)
 
 
 def promote(cluster: LeagueCluster, machine: Machine, version: int) -> float:
     """Promote a version by a command on a machine; returns when it took effect."""
-    cluster.league(machine, "promote", f"{LEAGUE}@{version}", "--reason", "test")
+    cluster.league(machine, "promote", f"{LEAGUE}@{version}", "--yes", "--reason", "test")
     return float(cluster.sql("SELECT extract(epoch FROM max(at)) FROM alias_events"))
