@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from league.policies.policy import MAX_BATCH
 from league.registry.replicas import LIVENESS_TIMEOUT
 
 OWN_PATHS = frozenset(("docs", "leagues", "metrics", "openapi.json", "pages", "v1", "v2"))
@@ -46,7 +47,7 @@ class ServeSettings(BaseModel):
     """Open streams of one API key per replica; further ones are refused with 429."""
     max_listeners_per_key: int = Field(default=50, ge=1)
     """Open event streams of one API key per replica; further ones are refused with 429."""
-    max_batch: int = Field(default=1024, ge=1)
+    max_batch: int = Field(default=MAX_BATCH, ge=1)
     """Maximum observations in one request."""
     timeout: float = Field(default=4.5, gt=0)
     """Timeout of a request, from its head to its response: 504, or 408 if the body did not arrive. Must be less than

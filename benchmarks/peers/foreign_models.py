@@ -138,7 +138,7 @@ def rllib_checkpoint(directory: Path) -> ForeignModel:
             answer = module.forward_inference({Columns.OBS: torch.from_numpy(observations["observation"])})
         return answer[Columns.ACTION_DIST_INPUTS].argmax(dim=1).numpy()
 
-    options = {"kind": "rllib", "modules": {"shared": "spreader"}}
+    options = {"kind": "rllib", "modules": {"shared": "spreader"}, "trust": True}
     return ForeignModel("RLlib PPO", "simple_spread", path, act, options)
 
 
@@ -161,4 +161,4 @@ def stable_baselines_file(directory: Path) -> ForeignModel:
         actions, _ = loaded.predict(observations["observation"], deterministic=True)
         return actions
 
-    return ForeignModel("Stable-Baselines3 PPO", "simple_spread", path, act, {"kind": "sb3"})
+    return ForeignModel("Stable-Baselines3 PPO", "simple_spread", path, act, {"kind": "sb3", "trust": True})

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from league.errors import BodyTooLarge, ObservationError, one_line
+from league.policies.policy import MAX_DECODED_BYTES
 from league.spaces import Leaf
 
 B64, PNG = "b64", "png"
@@ -38,8 +39,6 @@ CHANNELS = {0: 1, 4: 2, 2: 3, 6: 4}
 """PNG colour type → channels. Type 3 is a palette, whose indices are not pixel values."""
 MAX_IMAGES = 256
 """Per leaf."""
-MAX_DECODED_BYTES = 64 * 2**20
-"""Maximum decoded size of the images of one request: a black image is a thousand times larger than its encoding."""
 
 
 def is_encoded(value: Any) -> bool:

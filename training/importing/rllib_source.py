@@ -15,6 +15,7 @@ from league.errors import ConfigError, EnvironmentMismatch, one_line
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, OBSERVATION, Box
 from training.importing.adapted_graph import check
+from training.importing.graph_bounds import bounded
 from training.importing.graph_mapping import GraphMapping, InputMapping, Kind
 from training.importing.source import Source
 from training.importing.torch_source import Examples, ModuleOriginal, converted
@@ -76,6 +77,7 @@ def rllib_source(path: Path, module_id: str, spaces: AgentInterface, origin: dic
     mapping = GraphMapping(inputs=inputs, output=OUTPUT, kind=kind)
     model = converted(graph, examples, OUTPUT, where)
     check(model, mapping, spaces, where)
+    model = bounded(model, mapping, spaces, where)
     return Source(model, mapping, ModuleOriginal(graph, examples, mapping, spaces), origin)
 
 

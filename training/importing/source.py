@@ -15,6 +15,7 @@ from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
 from league.spaces import ACTION_MASK, DictSpace
 from training.importing.adapted_graph import check, decoded
+from training.importing.graph_bounds import bounded
 from training.importing.graph_mapping import GraphMapping, graph_inputs, inferred
 
 State = dict[str, NDArray]
@@ -107,6 +108,7 @@ def onnx_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin
     file = mapping or (beside if beside.exists() else None)
     names = GraphMapping.load(file) if file else inferred(model, spaces, str(path))
     check(model, names, spaces, str(path))
+    model = bounded(model, names, spaces, str(path))
     return Source(model, names, OnnxOriginal(model, names, spaces, str(path)), origin)
 
 

@@ -15,6 +15,7 @@ from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, DictSpace
 from training.export.onnx_export import quiet
 from training.importing.adapted_graph import BATCH, check, decoded
+from training.importing.graph_bounds import bounded
 from training.importing.graph_mapping import GraphMapping, inferred
 from training.importing.source import Source, State
 
@@ -104,6 +105,7 @@ def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origi
     model = exported.model_proto
     given = GraphMapping.load(mapping) if mapping else inferred(model, spaces, str(path))
     check(model, given, spaces, str(path))
+    model = bounded(model, given, spaces, str(path))
     return Source(model, given, ModuleOriginal(_Called(program.module()), examples, given, spaces), origin)
 
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from PIL import PngImagePlugin
 
 from league.errors import BodyTooLarge, ObservationError
+from league.policies.policy import MAX_DECODED_BYTES
 from league.spaces import Box, Leaf
-from serve_app.codecs.binary_leaves import MAX_DECODED_BYTES, SIGNATURE, check_decoded_size, decode, is_encoded
+from serve_app.codecs.binary_leaves import SIGNATURE, check_decoded_size, decode, is_encoded
 from tests.support.pictures import MODES, png
 
 DTYPES = (

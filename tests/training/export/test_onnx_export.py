@@ -21,6 +21,7 @@ from training.algorithms.ppo import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
 from training.export.parity import ObservedBatch
+from training.importing.source import onnx_source
 from training.modules.actor_critic import ActorCritic
 from training.modules.policy_module import MASKED_LOGIT
 
@@ -231,6 +232,7 @@ def test_each_kind_of_policy_equals_its_module(league: LeagueConfig, tmp_path: P
         path, spaces = tmp_path / f"{policy}.onnx", interface_of_league.of_policy(policy)
         export_policy(module, spaces, path)
         check_graph(path, module, interface_of_league, policy)
+        onnx_source(path, None, spaces, {})  # it can be imported: time and memory are bounded
         proof = parity.check_parity(path, policy, module, observed[policy], spaces.action)
         assert proof.observations >= 400
         assert proof.mismatches == 0
