@@ -186,6 +186,10 @@ class DeadlineExceeded(LeagueError, code="deadline_exceeded"):
     """A request was not answered within its timeout."""
 
 
+class GraphTimeout(DeadlineExceeded, code="graph_timeout"):
+    """A run of a policy's graph took too long, and was ended."""
+
+
 class ArtifactCorrupt(LeagueError, code="artifact_corrupt"):
     """A file of a version is missing, or its digest differs from the manifest."""
 

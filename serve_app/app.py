@@ -182,7 +182,13 @@ class Replica:
         self.replica = replica
         selections = ActionSelections()
         self.versions = VersionCache(
-            partial(load, registry, inline=settings.inline, selections=selections),
+            partial(
+                load,
+                registry,
+                inline=settings.inline,
+                selections=selections,
+                timeout=min(settings.run_timeout, settings.timeout),
+            ),
             settings.cached_versions,
             settings.retry,
             settings.load_timeout,

@@ -53,6 +53,9 @@ class ServeSettings(BaseModel):
     """Timeout of a request, from its head to its response: 504, or 408 if the body did not arrive. Must be less than
     RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy responds itself. Clients can request a shorter timeout
     with `x-request-timeout-ms`."""
+    run_timeout: float = Field(default=3.0, gt=0)
+    """How long a run of a policy's graph may occupy a thread of the replica. It is then ended, after its current
+    operator, and the request gets 504. Less than `timeout`, so that the request is not answered before."""
     max_waiting: int = Field(default=256, ge=1)
     """Inference requests that may wait on the event loop, including those on connections that are not accepted yet. If
     more wait for longer than `burst_tolerance`, the excess is refused with 429."""

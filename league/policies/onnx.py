@@ -1,16 +1,17 @@
 """Runs the ONNX graph of a policy with ONNX Runtime on one thread."""
 
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
-from league.errors import ArtifactCorrupt, EnvironmentMismatch, ObservationError, one_line
+from league.errors import ArtifactCorrupt, EnvironmentMismatch, GraphTimeout, ObservationError, one_line
 from league.policies.actions import dist_inputs_size, to_environment
 from league.policies.draws import Generators, UniformNumbers, certain, sample
+from league.policies.graph_runs import end_runs, open_session, run_graph
 from league.policies.policy import Actions, Arrays
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import OBSERVATION, Discrete, Space
@@ -22,6 +23,9 @@ STATE_OUT = "state_out_"
 LAST_ACTION = "state_in_action"
 """State of a graph with the previous action as input: raw action + 1, (k, 1) float32, initially 0. The graph returns
 its greedy action here, which is replaced if another action is sampled."""
+
+RUN_TIMEOUT = 60.0
+"""Seconds after which a run is ended, where nobody waits for it."""
 
 DTYPES = {"float": "float32", "double": "float64"}
 """Element types of ONNX Runtime whose names differ from NumPy's."""
@@ -35,19 +39,26 @@ class OnnxPolicy:
         manifest: Expected inputs, outputs and action space. Without it, the graph is not checked against them.
         has_distribution: Whether actions can be sampled; see `Manifest.has_distribution`. Otherwise they are greedy,
             also with `explore`: those have the probability 1.
+        timeout: Seconds after which a run is ended. Its method then raises GraphTimeout.
 
     Raises:
         ArtifactCorrupt: The file is not an ONNX graph, or it does not match the manifest.
     """
 
     def __init__(
-        self, graph: Path | str | bytes, manifest: PolicyManifest | None = None, has_distribution: bool = True
+        self,
+        graph: Path | str | bytes,
+        manifest: PolicyManifest | None = None,
+        has_distribution: bool = True,
+        timeout: float = RUN_TIMEOUT,
     ) -> None:
         self._session = _session(graph if isinstance(graph, bytes) else Path(graph).read_bytes())
         self._inputs = {node.name: node for node in self._session.get_inputs()}
         self._outputs = {node.name: node for node in self._session.get_outputs()}
         _check_graph(self._inputs, self._outputs, manifest)
         self.has_distribution = has_distribution
+        self._timeout = timeout
+        self._owner: object | None = None
         self._action = manifest.action if manifest else _discrete(self._outputs)
         self._observed = tuple(name for name in self._inputs if not name.startswith(STATE_IN))
         self._recurrent = tuple(name for name in self._inputs if name.startswith(STATE_IN))
@@ -110,10 +121,23 @@ class OnnxPolicy:
             rows = {name: len(array) for name, array in feed.items()}
             if len(set(rows.values())) != 1:
                 raise ValueError(f"rows differ: {rows}")
-            return self._session.run(outputs, feed)
+            return run_graph(self._session, outputs, feed, self._timeout, self._owner)
+        except GraphTimeout:
+            raise
         except Exception as error:
             self._explain(observations, state)
             raise ObservationError(f"the graph does not accept its input: {one_line(error)}") from error
+
+    def within(self, timeout: float, can_end: bool = False) -> Self:
+        """Return the same policy with another timeout in seconds. can_end: whether `end_runs` ends its runs."""
+        policy = copy(self)
+        policy._timeout, policy._owner = timeout, object() if can_end else None
+        return policy
+
+    def end_runs(self) -> None:
+        """End the runs of this object in other threads: they raise GraphTimeout."""
+        assert self._owner is not None, "within(…, can_end=True) returns policies whose runs can be ended"
+        end_runs(self._owner)
 
     def initial_state(self, batch: int) -> dict[str, NDArray]:
         """Return the recurrent state at the start of `batch` episodes; empty for graphs without state."""
@@ -141,13 +165,8 @@ class OnnxPolicy:
 
 
 def _session(graph: bytes) -> Any:
-    options = onnxruntime.SessionOptions()
-    # Replicas and workers are processes; more threads would compete with them for cores.
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+        return open_session(graph)
     except Exception as error:
         raise ArtifactCorrupt(f"ONNX Runtime cannot load the graph: {one_line(error)}") from error
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, InvalidInput, InvalidState
 from league.policies.draws import probabilities
+from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions
 from league.random.seeds import generator
 from league.spaces import ACTION_MASK
@@ -191,13 +192,12 @@ async def execute(
 ) -> Actions:
     """Run the graph, in a thread if the batch is large. rng: explore, with one generator per row."""
 
-    def run() -> Actions:
+    def act(graph: OnnxPolicy) -> Actions:
         if with_distribution and rng is None:
-            return policy.policy.distribution(observations, state=state)
-        return policy.policy.act(observations, state=state, explore=rng is not None, rng=rng)
+            return graph.distribution(observations, state=state)
+        return graph.act(observations, state=state, explore=rng is not None, rng=rng)
 
-    rows = len(next(iter(observations.values())))
-    return run() if rows <= policy.inline_rows else await asyncio.to_thread(run)
+    return await policy.run(act, len(next(iter(observations.values()))))
 
 
 async def execute_request(

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 from numpy.typing import NDArray
 
 from league.errors import InvalidInput, Overloaded
-from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
+from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT, OnnxPolicy
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from serve_app.codecs.request_limits import LARGE_BODY
@@ -148,16 +148,15 @@ def _wanted(outputs: Sequence[str], signature: Signature) -> Sequence[str]:
 async def _run(
     arrays: dict[str, NDArray], wanted: Sequence[str], served: ProtocolModel, mirror: MirrorFunction | None
 ) -> dict[str, NDArray]:
-    ports, policy = served.signature.inputs, served.policy.policy
+    ports = served.signature.inputs
     state = {name: array for name, array in arrays.items() if ports[name].is_state} or None
 
-    def act() -> Actions:
+    def act(policy: OnnxPolicy) -> Actions:
         if DIST_INPUTS in wanted:
             return policy.outputs(arrays, state=state)
         return policy.act(arrays, state=state)
 
-    rows = len(next(iter(arrays.values())))
-    answer = act() if rows <= served.policy.inline_rows else await asyncio.to_thread(act)
+    answer = await served.policy.run(act, len(next(iter(arrays.values()))))
     if mirror is not None:
         mirror({name: array for name, array in arrays.items() if not ports[name].is_state}, state, answer.actions)
     return {name: _output(name, answer) for name in wanted}

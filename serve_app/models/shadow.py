@@ -3,6 +3,8 @@
     request → champion → response
                  ↘ bounded queue → thread: candidate → same action? latency? → counts
 
+A run that takes long, or continues after the shadow was switched off, is ended.
+
 Callers are unaffected. Requests are batched in a thread that pauses between batches to stay within its share of a core;
 requests that exceed it are dropped and counted. The first request of a batch runs alone and is timed in CPU time, so
 that neither other requests nor waiting for the GIL count as the candidate's latency.
@@ -11,16 +13,17 @@ that neither other requests nor waiting for the GIL count as the candidate's lat
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import random
 from time import thread_time_ns
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.errors import one_line
+from league.errors import GraphTimeout, one_line
 from league.histograms import Histogram
+from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Arrays
 from league.policies.probes import same
 from league.random.seeds import generators
@@ -81,6 +84,8 @@ class ShadowResult:
     ns: int | None = None
     """CPU time of a request that ran alone."""
     fault: str | None = None
+    is_late: bool = False
+    """Whether a run was ended."""
 
 
 class Shadow:
@@ -158,11 +163,25 @@ class Shadow:
             self._is_scheduled = False
             return
         loop = asyncio.get_running_loop()
+        candidates = list({id(request.candidate): request.candidate for request in requests}.values())
         try:
             computing = loop.run_in_executor(self._thread, compare, requests)
         except RuntimeError:  # closed in the meantime
             return
         computing.add_done_callback(self._finish_batch)
+        self._end_if_off(computing, candidates)
+
+    def _end_if_off(self, computing: asyncio.Future[Any], candidates: Sequence[LoadedVersion]) -> None:
+        """End the runs of versions that are no longer shadows, until the batch is finished."""
+        if computing.done():
+            return
+        for candidate in candidates:
+            target = self._traffic.shadows.get(candidate.league)
+            shadow = None if target is None else self._slots.get(candidate.league, target.slot)
+            if shadow is None or all(candidate is not each for each in (shadow, *shadow.members)):
+                for policy in candidate.policies.values():
+                    policy.shadow_policy.end_runs()
+        asyncio.get_running_loop().call_later(BATCH_WINDOW, self._end_if_off, computing, candidates)
 
     def _finish_batch(self, computing: asyncio.Future[tuple[list[ShadowResult], float]]) -> None:
         if computing.cancelled():
@@ -197,6 +216,9 @@ def compare(requests: Sequence[MirroredRequest]) -> tuple[list[ShadowResult], fl
     for group in alike.values():
         first, rest = group[:1], group[1:]
         outcomes.append(_compare_batch(first, is_timed=True))
+        if outcomes[-1].is_late:
+            outcomes.append(replace(outcomes[-1], failed=len(rest)))
+            continue
         outcomes += [_compare_batch(part, is_timed=False) for part in _batches(rest)]
     return outcomes, (thread_time_ns() - begun) / 1e9
 
@@ -220,11 +242,12 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
         observations = _concatenate([request.observations for request in requests])
         seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
         begun = thread_time_ns()
-        actions = _act(candidate, observations, seeds)
+        actions = _act(candidate, candidate.shadow_policy, observations, seeds)
         taken = thread_time_ns() - begun
         expected = _champion_actions(requests, requests[0].champion.policy(requests[0].policy), observations, seeds)
         outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
     except Exception as error:  # any failure is counted against the candidate
+        outcome.is_late = isinstance(error, GraphTimeout)
         outcome.failed, outcome.fault = len(requests), one_line(error, with_type=True)
         return outcome
     outcome.requests, outcome.observations = len(requests), len(actions)
@@ -232,11 +255,11 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
     return outcome
 
 
-def _act(policy: LoadedPolicy, observations: Arrays, seeds: NDArray[np.int64]) -> NDArray:
+def _act(policy: LoadedPolicy, graph: OnnxPolicy, observations: Arrays, seeds: NDArray[np.int64]) -> NDArray:
     """Actions as by default. With the same seeds, two policies sample equal actions as often as they are alike."""
     if not policy.samples:
-        return policy.policy.act(observations).actions
-    return policy.policy.act(observations, explore=True, rng=generators(seeds)).actions
+        return graph.act(observations).actions
+    return graph.act(observations, explore=True, rng=generators(seeds)).actions
 
 
 def _champion_actions(
@@ -245,7 +268,7 @@ def _champion_actions(
     """The champion's actions, recomputed if they were or are to be sampled."""
     known = [request.actions for request in requests if request.actions is not None]
     if champion.samples or len(known) < len(requests):
-        return _act(champion, observations, seeds)
+        return _act(champion, champion.policy, observations, seeds)
     return np.concatenate(known)
 
 

@@ -4,13 +4,21 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from league.errors import ArtifactCorrupt, DeadlineExceeded, InvalidInput, Overloaded, UnknownPolicy, VersionRetired
-from league.policies.onnx import OnnxPolicy
-from league.policies.policy import Policy
+from league.errors import (
+    ArtifactCorrupt,
+    DeadlineExceeded,
+    GraphTimeout,
+    InvalidInput,
+    Overloaded,
+    UnknownPolicy,
+    VersionRetired,
+)
+from league.policies.onnx import RUN_TIMEOUT, OnnxPolicy
+from league.policies.policy import Actions, Policy
 from league.policies.probes import Probes
 from league.registry.registry import Registry
 from league.registry.storage.manifest import PolicyManifest
@@ -22,11 +30,15 @@ from serve_app.codecs.request_limits import RequestLimits
 from serve_app.models.action_selections import ActionSelections
 from serve_app.models.daemon_thread import in_daemon_thread
 
+SHADOW_TIMEOUT = 1.0
+"""Seconds after which a run of a shadow is ended, and counted as failed."""
+INLINE_TIMEOUT = 0.5
+"""Seconds after which a run on the event loop is ended, and repeated in a thread."""
 WARM_BATCH = 64
 """Large enough to measure the time per row, small enough to run in milliseconds."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+@dataclass(slots=True, eq=False, weakref_slot=True)
 class LoadedPolicy:
     """One policy, ready for inference."""
 
@@ -37,9 +49,26 @@ class LoadedPolicy:
     """Recurrent inputs; empty for a feed-forward policy."""
     limits: RequestLimits
     inline_rows: int
-    """The largest batch that is fast enough to run on the event loop."""
+    """The largest batch that is fast enough to run on the event loop. 0 after one was not."""
     league: str
     selections: ActionSelections
+    inline_policy: OnnxPolicy = field(init=False)
+    """The same for runs on the event loop."""
+    shadow_policy: OnnxPolicy = field(init=False)
+    """The same for runs of a shadow, which can be ended."""
+
+    def __post_init__(self) -> None:
+        self.inline_policy = self.policy.within(INLINE_TIMEOUT)
+        self.shadow_policy = self.policy.within(SHADOW_TIMEOUT, can_end=True)
+
+    async def run(self, act: Callable[[OnnxPolicy], Actions], rows: int) -> Actions:
+        """Call `act` with the policy, in a thread if the batch is large. Raises the errors of `act`."""
+        if rows <= self.inline_rows:
+            try:
+                return act(self.inline_policy)
+            except GraphTimeout:
+                self.inline_rows = 0
+        return await asyncio.to_thread(act, self.policy)
 
     @property
     def samples(self) -> bool:
@@ -75,10 +104,18 @@ class LoadedVersion:
         return f"{self.league}.{next(name for name, one in self.policies.items() if one is policy)}"
 
 
-def load(registry: Registry, league: str, number: int, inline: float, selections: ActionSelections) -> LoadedVersion:
+def load(
+    registry: Registry,
+    league: str,
+    number: int,
+    inline: float,
+    selections: ActionSelections,
+    timeout: float = RUN_TIMEOUT,
+) -> LoadedVersion:
     """Load a version, of a mixture without its members. Blocks.
 
-    inline: time in seconds that inference may take on the event loop. selections: how it selects actions.
+    inline: time in seconds that inference may take on the event loop. selections: how it selects actions. timeout: time
+    in seconds after which a run of a graph is ended.
 
     Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
     """
@@ -95,13 +132,13 @@ def load(registry: Registry, league: str, number: int, inline: float, selections
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.
         graph = registry.artifacts.read(version.manifest, manifest.file)
-        policy = OnnxPolicy(graph, manifest, version.manifest.has_distribution)
-        if manifest.probes is not None:
-            probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
-            probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
+        policy = OnnxPolicy(graph, manifest, version.manifest.has_distribution, timeout)
         try:
+            if manifest.probes is not None:
+                probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
+                probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
             policies[name] = _warm_up(policy, manifest, inline, league, selections)
-        except InvalidInput as error:
+        except (InvalidInput, GraphTimeout) as error:
             raise ArtifactCorrupt(f"policy {name} of {version.ref} does not run: {error}") from error
     return LoadedVersion(league, number, version.sha256, policies)
 

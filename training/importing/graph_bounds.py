@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import onnx
 import onnx.inliner
-import onnxruntime
 from numpy.typing import NDArray
 from onnx import AttributeProto, NodeProto, TensorProto, TypeProto, helper, numpy_helper, shape_inference
 
 from league.errors import InvalidInput, one_line
 from league.interface import AgentInterface
+from league.policies.graph_runs import open_session
 from league.policies.policy import MAX_BATCH, MAX_DECODED_BYTES
 from league.spaces import inputs
 from training.importing.graph_mapping import GraphMapping, graph_inputs
@@ -151,7 +151,7 @@ class _BoundedGraph:
         }
         self._last_use = {name: at for at, node in enumerate(self._nodes) for name in (*node.output, *node.input)}
         self._last_use |= {result.name: len(self._nodes) for result in model.graph.output}
-        self._sessions: dict[int, onnxruntime.InferenceSession] = {}
+        self._sessions: dict[int, Any] = {}
         """Position of a node → what computes its result."""
 
     def check(self, rows: int) -> "_CheckedBatch":
@@ -230,7 +230,7 @@ class _BoundedGraph:
         except Exception as error:
             raise InvalidInput(f"{self._of(node)}: {one_line(error)[:200]}") from error
 
-    def _session(self, node: NodeProto, types: Mapping[str, TypeProto]) -> onnxruntime.InferenceSession:
+    def _session(self, node: NodeProto, types: Mapping[str, TypeProto]) -> Any:
         def free(names: Iterable[str]) -> list[onnx.ValueInfoProto]:
             kinds = {name: types[name].tensor_type for name in names if name}
             return [
@@ -240,10 +240,7 @@ class _BoundedGraph:
 
         graph = helper.make_graph([node], "node", free(node.input), free(node.output))
         model = helper.make_model(graph, opset_imports=self._opsets, ir_version=self._ir_version)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4
-        return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        return open_session(model.SerializeToString())
 
     def _of(self, node: NodeProto) -> str:
         return f"{self._source}: {_described(node)}"

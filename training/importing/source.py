@@ -7,12 +7,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import onnx
-import onnxruntime
 from numpy.typing import NDArray
 
-from league.errors import ConfigError, InvalidInput, one_line
+from league.errors import ConfigError, GraphTimeout, InvalidInput, one_line
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
+from league.policies.graph_runs import open_session, run_graph
+from league.policies.onnx import RUN_TIMEOUT
 from league.spaces import ACTION_MASK, DictSpace
 from training.importing.adapted_graph import check, decoded
 from training.importing.graph_bounds import bounded
@@ -49,13 +50,8 @@ class OnnxOriginal:
     """A foreign graph, run by ONNX Runtime. Actions are computed from its output in NumPy."""
 
     def __init__(self, model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface, source: str) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4
         try:
-            self._session = onnxruntime.InferenceSession(
-                model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-            )
+            self._session = open_session(model.SerializeToString())
         except Exception as error:
             raise InvalidInput(f"{source}: ONNX Runtime cannot load the graph: {one_line(error)}") from error
         assert not isinstance(spaces.action, DictSpace)
@@ -78,7 +74,10 @@ class OnnxOriginal:
                 value = value.transpose(0, *(axis + 1 for axis in own.transpose))
             feed[name] = value if None in shape[1:] else value.reshape(-1, *shape[1:])
         try:
-            value, *after = self._session.run([self._mapping.output, *self._mapping.state.values()], feed)
+            results = [self._mapping.output, *self._mapping.state.values()]
+            value, *after = run_graph(self._session, results, feed, RUN_TIMEOUT)
+        except GraphTimeout as error:
+            raise GraphTimeout(f"{self._source}: {error}") from error
         except Exception as error:
             raise InvalidInput(f"{self._source}: the graph fails on observations: {one_line(error)}") from error
         actions = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)

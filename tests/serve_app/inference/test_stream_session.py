@@ -476,7 +476,7 @@ def test_an_internal_error_does_not_end_the_stream(
     with open_stream(patchable_client) as stream:
         champion = server.alias_slots.champion("board")
         assert champion is not None
-        monkeypatch.setattr(champion.policies["shared"].policy, "act", fail)
+        monkeypatch.setattr(champion.policies["shared"].inline_policy, "act", fail)
         error = send(stream, BODY)
         assert (error["status"], "no room" in error["message"]) == (status, False)
         monkeypatch.undo()

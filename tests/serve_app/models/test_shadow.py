@@ -9,17 +9,21 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from league.policies import graph_runs
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.app import Replica
 from serve_app.models.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
 from tests.support.clients.actions import BOARD, act, boards
-from tests.support.leagues.served_leagues import promote
-from tests.support.policies.graphs import masked_mlp
+from tests.support.leagues.served_leagues import promote, publish
+from tests.support.policies.graphs import endless_mlp, masked_mlp
 from tests.support.servers.replicas import QUICK, local_client
 from tests.support.servers.shadows import set_shadow, wait_for
 from tests.support.waiting import until
+
+FULL = BOARD | {"observation": np.ones((6, 7, 2), int).tolist()}
+"""The observation for which `endless_mlp` does not end."""
 
 
 @pytest.fixture
@@ -73,7 +77,6 @@ def test_pinned_requests_are_not_mirrored(client: TestClient, registry: Registry
 
 
 def test_state_of_another_network_is_not_mirrored(registry: Registry, client: TestClient) -> None:
-    from tests.support.leagues.served_leagues import publish
     from tests.support.policies.graphs import counting
 
     publish(registry, "memory", {"shared": counting()}, "run/2")
@@ -95,11 +98,38 @@ def test_a_failing_candidate_is_counted_and_does_not_affect_requests(
         def act(self, *_: Any, **__: Any) -> None:
             raise MemoryError("no room")
 
-    monkeypatch.setitem(candidate.policies, "shared", type("Policy", (), {"policy": Failing()}))
+    monkeypatch.setitem(
+        candidate.policies, "shared", type("Policy", (), {"shadow_policy": Failing(), "samples": False})
+    )
     for _ in range(10):
         assert act(client, observation=BOARD)["version"] == 1
     found = wait_for(registry, lambda one: one.failed == 10)
     assert (found.requests, found.agreed) == (0, 0)
+
+
+def test_a_run_that_does_not_end_is_counted(client: TestClient, registry: Registry) -> None:
+    """Those that wait for the same version are counted without being run."""
+    endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
+    set_shadow(registry, version=endless)
+    for _ in range(20):
+        assert act(client, observation=FULL)["version"] == 1
+    found = wait_for(registry, lambda one: one.failed == 20, candidate=endless)
+    assert found.requests == 0
+    act(client, observation=BOARD)
+    wait_for(registry, lambda one: one.requests == 1, candidate=endless)
+
+
+def test_runs_end_when_the_shadow_is_switched_off(
+    client: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("serve_app.models.version_cache.SHADOW_TIMEOUT", 600.0)
+    endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
+    set_shadow(registry, version=endless)
+    act(client, observation=FULL)
+    until(lambda: len(graph_runs._runs) == 1)
+    registry.traffic.set("board", shadow=None, actor="test", reason="test")
+    until(lambda: not graph_runs._runs)
+    wait_for(registry, lambda one: one.failed == 1, candidate=endless)
 
 
 async def replica_with_shadow(registry: Registry) -> tuple[Replica, Shadow]:

@@ -46,6 +46,42 @@ def masked_mlp(
     return _serialized(nodes, inputs, outputs, constants)
 
 
+ENDLESS = 84
+"""Sum of the observation for which `endless_mlp` does not end: all of `masked_mlp`'s default shape are ones."""
+
+
+def endless_mlp(seed: int = 0) -> bytes:
+    """`masked_mlp` with a loop that does not end if the first observation of a batch sums to ENDLESS."""
+    model = onnx.load_from_string(masked_mlp(seed=seed))
+    given = [
+        helper.make_tensor_value_info("turn", TensorProto.INT64, []),
+        helper.make_tensor_value_info("on", TensorProto.BOOL, []),
+        helper.make_tensor_value_info("count", TensorProto.INT64, []),
+    ]
+    results = [
+        helper.make_tensor_value_info("still", TensorProto.BOOL, []),
+        helper.make_tensor_value_info("next", TensorProto.INT64, []),
+    ]
+    steps = [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Mul", ["count", "turn"], ["next"])]
+    body = helper.make_graph(steps, "body", given, results)
+    *nodes, last = model.graph.node
+    loop = [
+        helper.make_node("ReduceSum", ["flat", "columns"], ["sums"], keepdims=0),
+        helper.make_node("Gather", ["sums", "nothing"], ["sum"]),
+        helper.make_node("Equal", ["sum", "endless"], ["begins"]),
+        helper.make_node("Loop", ["", "begins", "nothing"], ["none"], body=body),
+        helper.make_node("Add", ["start", "none"], ["moved"]),
+    ]
+    last.input[1] = "moved"
+    del model.graph.node[:]
+    model.graph.node.extend([*nodes, *loop, last])
+    for name, value in (("columns", [1]), ("nothing", 0)):
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), name))
+    model.graph.initializer.append(numpy_helper.from_array(np.float32(ENDLESS), "endless"))
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
 def counting() -> bytes:
     """A recurrent graph: `state_out_0` is the sum of all observations; the action is whether it exceeds 2."""
     nodes = [

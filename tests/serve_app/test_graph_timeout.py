@@ -1,0 +1,51 @@
+"""A graph that does not end for an observation occupies a replica for a limited time."""
+
+import numpy as np
+import pytest
+
+from league.errors import ArtifactCorrupt
+from league.registry.registry import Registry
+from serve_app.models import version_cache
+from serve_app.models.action_selections import ActionSelections
+from tests.support.clients.actions import BOARD, act, boards
+from tests.support.leagues.served_leagues import publish
+from tests.support.policies.graphs import endless_mlp
+from tests.support.servers.exposition import value
+from tests.support.servers.replicas import QUICK, replica
+from tests.support.waiting import until
+
+FULL = BOARD | {"observation": np.ones((6, 7, 2), int).tolist()}
+
+
+def test_a_request_gets_an_error_and_others_are_answered(registry: Registry) -> None:
+    """In all protocols, on the event loop and in a thread."""
+    version = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
+    path = f"/v1/policies/board/action?version={version}"
+    infer = {
+        "inputs": [
+            {"name": name, "datatype": "INT8", "shape": [1, *np.shape(array)], "data": np.ravel(array).tolist()}
+            for name, array in FULL.items()
+        ]
+    }
+    with replica(registry.storage, QUICK.model_copy(update={"run_timeout": 0.3})) as client:
+        assert act(client, version=version, observation=BOARD)["version"] == version
+        for _ in range(2):
+            reply = client.post(path, json={"observation": FULL})
+            assert (reply.status_code, reply.json()["code"]) == (504, "graph_timeout")
+            assert "a run of the graph did not finish within 0.3 s" in reply.json()["message"]
+            assert act(client, observation=boards(1)[0])["version"] == 1
+        assert client.post(f"/v2/models/board/versions/{version}/infer", json=infer).status_code == 504
+        with client.websocket_connect(f"/v1/policies/board/stream?version={version}") as stream:
+            stream.send_json({"observation": FULL})
+            assert stream.receive_json()["code"] == "graph_timeout"
+            stream.send_json({"observation": BOARD})
+            assert stream.receive_json()["version"] == version
+        assert act(client, version=version, observation=BOARD)["version"] == version
+        until(lambda: value(client, "league_errors_total", code="graph_timeout") == 4)
+
+
+def test_a_version_that_does_not_end_is_not_loaded(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.support.policies.graphs.ENDLESS", 0)
+    version = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
+    with pytest.raises(ArtifactCorrupt, match=r"policy shared of board@4 does not run: .* within 0.2 s"):
+        version_cache.load(registry, "board", version, 0.001, ActionSelections(), timeout=0.2)
