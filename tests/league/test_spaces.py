@@ -7,7 +7,7 @@ from pydantic import TypeAdapter
 
 from league.errors import EnvironmentMismatch, IllegalMask, ObservationError
 from league.spaces import Box, Space, inputs
-from league.spaces.arrays import check, check_mask, tensors
+from league.spaces.arrays import check, check_mask, environment_actions, nested, tensors
 from league.spaces.conversion import from_gymnasium, to_gymnasium
 
 MASKED = gym.Dict({"action_mask": gym.Box(0, 1, (7,), np.int8), "observation": gym.Box(0, 1, (6, 7, 2), np.int8)})
@@ -97,3 +97,51 @@ def test_integers_are_accepted_in_any_dtype(value: int) -> None:
 def test_an_illegal_mask_is_rejected(mask: list[list[int]], message: str) -> None:
     with pytest.raises(IllegalMask, match=message):
         check_mask(np.array(mask, np.int8))
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.Discrete(3, start=2),
+        gym.Discrete(3, dtype=np.int32),
+        gym.MultiDiscrete([2, 3]),
+        gym.Box(-1, 1, (), np.float32),
+        gym.Box(-1, 1, (1,), np.float64),
+    ],
+    ids=str,
+)
+def test_environments_get_actions_as_sample_returns_them(space: gym.Space) -> None:
+    samples = [space.sample() for _ in range(3)]
+    actions = environment_actions(np.array(samples), from_gymnasium(space))
+    for action, sample in zip(actions, samples, strict=True):
+        assert type(action) is type(sample)
+        assert (action.dtype, action.shape) == (sample.dtype, sample.shape)
+        assert np.array_equal(action, sample)
+
+
+@pytest.mark.parametrize(
+    ("space", "reason"),
+    [
+        (gym.Box(-1, 1, (0,)), "has no elements: expected at least one"),
+        (gym.Dict({"a": gym.Box(-1, 1, (2, 0))}), "has no elements"),
+        (gym.Dict({}), "a Dict without keys is not supported"),
+        (gym.Discrete(10**6), "has 1,000,000 choices: expected at most 65,536"),
+        (gym.MultiDiscrete([40_000, 40_000]), "has 80,000 choices"),
+        (
+            gym.Dict({"a.b": gym.Discrete(2), "a": gym.Dict({"b": gym.Discrete(2)})}),
+            "would have the name 'observation.a.b'",
+        ),
+        (gym.Dict({1: gym.Discrete(2)}), "a Dict has the key 1: expected a string"),
+        (gym.Tuple([gym.Discrete(2)]), "is not supported: expected Box, Discrete"),
+    ],
+)
+def test_spaces_that_cannot_be_learnt_are_refused_with_the_reason(space: gym.Space, reason: str) -> None:
+    with pytest.raises(EnvironmentMismatch, match=reason):
+        from_gymnasium(space)
+
+
+def test_nested_values_are_the_inverse_of_tensors() -> None:
+    space = gym.Dict({"a.b": gym.Discrete(2), "a": gym.Dict({"c": gym.Box(-1, 1, (2,)), "": gym.MultiBinary(2)})})
+    value = space.sample()
+    again = nested(from_gymnasium(space), tensors(from_gymnasium(space), value))
+    np.testing.assert_equal(again, {key: dict(part) if isinstance(part, dict) else part for key, part in value.items()})

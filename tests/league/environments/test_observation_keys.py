@@ -67,6 +67,7 @@ class Masked:
 
     def move(self, action: Any) -> None:
         self.turn += 1
+        assert type(action) is type(self.acted.sample()), f"{action!r} is not what sample returns"
         if isinstance(self.acted, spaces.Discrete | spaces.MultiDiscrete):
             assert 1 not in np.ravel(action), f"illegal action {action}"
 
@@ -229,3 +230,24 @@ def test_masks_that_appear_only_after_a_step_are_a_fault(environment: str) -> No
     config = EnvironmentConfig(entry_point=f"{__name__}:{environment}", kwargs={"late": True})
     examination = examine(LeagueConfig(league="x", environment=config), episodes=1)
     assert "gets a mask in its info after a step, but no agent gets one after reset" in str(examination.findings)
+
+
+class Far(ParallelMasked):
+    """Observes a time in milliseconds since 1970."""
+
+    def __init__(self) -> None:
+        super().__init__("obs")
+
+    def value(self, space: Any = None, key: str = "") -> Any:
+        value = super().value(space, key)
+        return value if space else value | {"obs": np.array([1.7e12, self.rng.uniform()], np.float32)}
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_observations_for_which_gradients_overflow_are_a_fault_unless_they_are_normalised(normalized: bool) -> None:
+    environment = {"entry_point": f"{__name__}:Far"}
+    training = {"normalize_observations": normalized}
+    config = LeagueConfig.from_mapping({"league": "x", "environment": environment, "training": training})
+    found = examine(config, episodes=1)
+    assert found.passed == normalized
+    assert ("1.7e+12 in observation: training needs values of at most 1e+09" in str(found.findings)) != normalized

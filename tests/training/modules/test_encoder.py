@@ -142,3 +142,13 @@ def test_normalized_planes_are_convolved() -> None:
     standard = (planes - planes.mean(0)) / planes.std(0, correction=0)
     convolution = features.parts[0].convolutions
     assert torch.allclose(features({"observation": planes}), convolution(standard.permute(0, 3, 1, 2)), atol=1e-5)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_box_of_shape_empty_is_one_number(normalize: bool) -> None:
+    parts = {"observation.speed": spaces.Box(-1, 1, (), np.float32), "observation.position": spaces.Box(-1, 1, (2,))}
+    features = ObservationFeatures(spaces.Dict(parts), normalize=normalize)
+    observations = {"observation.speed": torch.tensor([0.5, -0.5]), "observation.position": torch.zeros(2, 2)}
+    assert features(observations).tolist() == [[0, 0, 0.5], [0, 0, -0.5]]
+    features.update_statistics(observations)
+    assert features(observations).shape == (2, 3)
