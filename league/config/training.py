@@ -44,7 +44,7 @@ class TrainingSettings(Part):
     """Wall-clock limit of training; the earlier of the two limits applies."""
     checkpoint_every: Annotated[int, Field(ge=1)] | Literal["auto"] | None = "auto"
     """Number of actions between published versions; null: none. auto: 200,000, or none if `checkpoint_minutes` is set.
-    The end of training also publishes."""
+    The end of training also publishes, unless time ends it within a quarter of an interval after the last version."""
     checkpoint_minutes: float | None = Field(default=None, gt=0)
     """Wall-clock minutes between published versions; the earlier of the two intervals applies."""
     runners: int = Field(default=1, ge=0)

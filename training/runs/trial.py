@@ -43,6 +43,8 @@ REPORT_SECONDS = 2.0
 """Interval between a trial's reports, in seconds."""
 MAX_THREADS = 4
 """More do not accelerate networks of a few hundred units."""
+NEAR_DUPLICATE = 0.25
+"""Part of an interval between checkpoints, below which the end of the time publishes no further version."""
 PROGRESS_FILE = "progress.json"
 """In a checkpoint, beside RLlib's state: steps and seconds of training so far."""
 
@@ -110,7 +112,7 @@ class Trial(tune.Trainable):
         self.algorithm.reset_episodes(start.steps)
         self.nodes = nodes_of(self.algorithm)
         self.steps = self.saved_steps = start.steps
-        self.seconds = start.seconds
+        self.seconds = self.saved_seconds = start.seconds
         self._plan_checkpoint()
 
     def step(self) -> dict[str, Any]:
@@ -131,7 +133,7 @@ class Trial(tune.Trainable):
             other = elapsed - sum(sums[phase] for phase in PHASES)
             metrics |= sums | gpu_use() | {OTHER_TIME: other, "steps_per_second": (self.steps - steps) / elapsed}
         done = self._spent() or self._stop_requested()
-        if (done or self._due()) and self.steps > self.saved_steps:
+        if (done or self._due()) and self.steps > self.saved_steps and not self._is_near_duplicate():
             saving = time.monotonic()
             metrics["checkpoint"] = str(self._save())
             metrics[CHECKPOINT_TIME] = time.monotonic() - saving
@@ -158,6 +160,18 @@ class Trial(tune.Trainable):
     def _budget_spent(self) -> float:
         return self.league.training.budget_spent(self.steps - self.plan.start.steps_before_run, self.seconds)
 
+    def _is_near_duplicate(self) -> bool:
+        """Whether time has ended the run so soon after a checkpoint that its version would be almost the same."""
+        settings, before = self.league.training, self.plan.start.steps_before_run
+        is_planned = self.steps >= self.next_steps or self.seconds >= self.next_seconds
+        is_full = settings.max_steps is not None and self.steps - before >= settings.max_steps
+        if not self._spent() or is_planned or is_full or self.saved_steps == before:
+            return False
+        shares = [(self.steps - self.saved_steps) / settings.checkpoint_steps] if settings.checkpoint_steps else []
+        if settings.checkpoint_minutes is not None:
+            shares.append((self.seconds - self.saved_seconds) / (60 * settings.checkpoint_minutes))
+        return max(shares, default=1.0) < NEAR_DUPLICATE
+
     def _stop_requested(self) -> bool:
         return self.files.exists(self.plan.stop_file)
 
@@ -179,7 +193,7 @@ class Trial(tune.Trainable):
         (draft / PROGRESS_FILE).write_text(json.dumps(progress))
         write_digests(draft)
         self.files.commit(draft, target)
-        self.saved_steps = self.steps
+        self.saved_steps, self.saved_seconds = self.steps, self.seconds
         self._plan_checkpoint()
         self.algorithm.reset_episodes(self.steps)
         return target

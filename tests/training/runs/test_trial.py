@@ -1,5 +1,6 @@
 import shutil
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,12 @@ def trial(directory: Path, start: StartState = FROM_SCRATCH, **training: Any) ->
     return Trial({"league": league.model_dump(by_alias=True), "interface": interface_.model_dump(), "plan": plan})
 
 
+@contextmanager
+def closing_trial(trial: Trial) -> Iterator[Trial]:
+    yield trial
+    trial.cleanup()
+
+
 def run(trial: Trial) -> list[dict[str, Any]]:
     """All results of a trial until it is done."""
     results = [trial.train()]
@@ -74,6 +81,37 @@ def run(trial: Trial) -> list[dict[str, Any]]:
 
 def weights(trial: Trial) -> dict[str, torch.Tensor]:
     return trial.algorithm.learner_group._learner.module["shared"].state_dict()
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(
+    ("settings", "steps", "seconds", "is_saved"),
+    [
+        ({"checkpoint_every": 256}, 10, 0.0, False),
+        ({"checkpoint_every": 256}, 100, 0.0, True),
+        ({"checkpoint_every": 256, "steps": 300}, 300, 0.0, True),
+        ({"checkpoint_every": None, "checkpoint_minutes": 59}, 200, 60.0, False),
+        ({"checkpoint_every": None, "checkpoint_minutes": 40}, 200, 1200.0, True),
+    ],
+)
+def test_the_end_of_the_time_soon_after_a_checkpoint_saves_no_near_duplicate(
+    tmp_path: Path, settings: dict[str, Any], steps: int, seconds: float, is_saved: bool
+) -> None:
+    """steps, seconds: of training since the last checkpoint. A run that ends by its steps has a checkpoint of them."""
+    with closing_trial(trial(tmp_path, minutes=60, **settings)) as ended:
+        ended.steps, ended.seconds = 128, 3600.0 - seconds
+        ended._save()
+        ended.steps += steps
+        ended.seconds = 3600.0
+        result = ended.step()
+        assert (result["done"], result["spent"], "checkpoint" in result) == (True, True, is_saved)
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_a_short_run_has_a_checkpoint_in_any_case(tmp_path: Path) -> None:
+    with closing_trial(trial(tmp_path, minutes=60, checkpoint_every=10_000)) as ended:
+        ended.steps, ended.seconds = 128, 3600.0
+        assert "checkpoint" in ended.step()
 
 
 @pytest.mark.usefixtures("ray_session")
