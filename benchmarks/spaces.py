@@ -287,7 +287,8 @@ class Game:
     def check(self, agent: str, action: Any) -> None:
         """Raise AssertionError unless an action has the type and the range of what `sample` returns."""
         space = self.case.agents[agent][1]
-        expected = type(space.sample())
+        # Gymnasium cannot sample from the whole range of float64.
+        expected = type(space.sample()) if isinstance(space, spaces.Discrete) else np.ndarray
         assert type(action) is expected, f"{agent} acts with {type(action)}, expected {expected}"
         assert space.contains(action), f"{agent} acts with {action!r}, outside of {space}"
 
