@@ -146,7 +146,7 @@ def test_traffic_is_set_over_http(promoter: TestClient, registry: Registry) -> N
         ({"canary": {"version": "champion", "share": 0.1}}, 400, "invalid_input"),
         ({"canary": {"version": 2, "share": 1.1}}, 400, "invalid_input"),
         ({"canary": {"version": 2}}, 400, "invalid_input"),
-        ({"canary": {"version": 0, "share": 0.1}}, 400, "invalid_reference"),
+        ({"canary": {"version": 0, "share": 0.1}}, 400, "invalid_input"),
         ({"canary": {"version": True, "share": 0.1}}, 400, "invalid_input"),
         ({"canarie": None}, 400, "invalid_input"),
     ],
