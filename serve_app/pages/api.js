@@ -1,6 +1,6 @@
 // JSON requests to the server, with retries and the API key that the user entered. The key is kept in sessionStorage only.
 
-import { heard } from "./connection.js";
+import { heard, unanswered } from "./connection.js";
 import { ROOT } from "./router.js";
 
 const MAX_ATTEMPTS = 4;
@@ -87,6 +87,7 @@ async function send(path, options, apiKey) {
     response = await fetch(ROOT + path, { ...options, headers, signal, cache: "no-store", redirect: "error" });
   } catch (error) {
     if (options.signal?.aborted) throw error;
+    unanswered();
     throw new ApiError(0, "network", "The server is not responding.");
   } finally {
     clearTimeout(timer);

@@ -10,10 +10,16 @@ const CHECK_TIMEOUTS = [2500, 2500]; // one lost response is no lost server
 const LOST = [502, 503, 504]; // responses of a proxy without a server
 
 let heardAt = Date.now();
+let isSuspected = false; // a request got no response, whatever an open event stream receives
 
 /** Record that the server has sent something. `status`: of a response. */
 export function heard(status = 200) {
   if (!LOST.includes(status)) heardAt = Date.now();
+}
+
+/** Record that a request got no response. */
+export function unanswered() {
+  isSuspected = true;
 }
 
 /** When the server stopped responding, in milliseconds since 1970; null while it responds. A hidden tab does not check. */
@@ -25,7 +31,7 @@ export function useLostSince() {
       for (let wasLost = false; !isClosed; ) {
         await new Promise((resolve) => setTimeout(resolve, CHECK_INTERVAL));
         if (document.hidden || isClosed) continue;
-        const isLost = Date.now() - heardAt > MAX_SILENCE && !(await responds());
+        const isLost = (wasLost || isSuspected || Date.now() - heardAt > MAX_SILENCE) && !(await responds());
         if (isLost === wasLost) continue;
         wasLost = isLost;
         setLostSince(isLost ? heardAt : null);
@@ -44,10 +50,13 @@ export function onBack(handler) {
 }
 
 async function responds() {
-  const before = heardAt;
+  isSuspected = false;
   for (const timeout of CHECK_TIMEOUTS) {
-    await fetch(`${ROOT}/v1/health/live`, { signal: AbortSignal.timeout(timeout), cache: "no-store" }).then(({ status }) => heard(status), () => {});
-    if (heardAt > before) return true;
+    const response = await fetch(`${ROOT}/v1/health/live`, { signal: AbortSignal.timeout(timeout), cache: "no-store" }).catch(() => null);
+    if (response && !LOST.includes(response.status)) {
+      heard();
+      return true;
+    }
   }
   return false;
 }

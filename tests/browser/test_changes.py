@@ -325,6 +325,16 @@ def test_each_open_page_says_that_the_server_is_not_responding(tab: Tab, served:
     tab.errors = [each for each in tab.errors if "net::ERR_" not in each]
 
 
+def test_an_open_event_stream_does_not_hide_that_requests_fail(tab: Tab) -> None:
+    page = tab.open(L)
+    expect_champion(page, 3)
+    page.context.set_offline(True)  # connections that are open stay open
+    expect(page.get_by_role("banner").get_by_text("The server is not responding")).to_be_visible()
+    page.context.set_offline(False)
+    expect(page.get_by_role("alert")).to_have_count(0)
+    tab.errors = [each for each in tab.errors if "net::ERR_" not in each]
+
+
 def test_an_invalid_key_is_rejected(tab: Tab, served: Served) -> None:
     page = tab.open(L)
     button = page.get_by_role("button", name=re.compile("^API key"))
