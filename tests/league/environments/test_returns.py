@@ -13,7 +13,7 @@ from league.environments.conformance.examination import examine
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import each_agent_alone
 from league.errors import InvalidReturn
-from tests.league.environments.test_observation_keys import AGENTS, ParallelMasked, RLlibMasked, TurnMasked
+from tests.support.environments.masked import AGENTS, ParallelMasked, RLlibMasked, TurnMasked
 
 CHANGES: dict[str, Any] = {
     "rewards None": lambda parts: (parts[0], None, *parts[2:]),
