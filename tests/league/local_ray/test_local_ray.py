@@ -149,20 +149,24 @@ def test_it_listens_on_loopback_and_requires_its_token(tmp_path: Path) -> None:
     assert not (tmp_path / ".ray").exists(), "Ray's own token would be readable by everybody"
 
 
+@pytest.mark.slow
 def test_it_starts_while_its_agents_do_not_answer(tmp_path: Path) -> None:
     assert "a task ran while 1 agent is stopped" in run(SLOW_AGENTS, tmp_path).stdout
 
 
+@pytest.mark.slow
 def test_the_person_who_waits_is_told_for_what(tmp_path: Path) -> None:
     done = run(SLOW_RAYLET, tmp_path)
     assert "a task ran" in done.stdout
     assert "Waiting for Ray to start: its raylet has not registered after 0 s" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_start_of_which_a_process_ends_is_repeated(tmp_path: Path) -> None:
     assert "a task ran after 1 was killed" in run(DEAD_RAYLETS, tmp_path, "1").stdout
 
 
+@pytest.mark.slow
 def test_a_process_that_always_ends_is_named(tmp_path: Path) -> None:
     assert "Ray did not start: its process raylet ended; see /" in run(DEAD_RAYLETS, tmp_path, "100").stdout
 
