@@ -22,6 +22,7 @@ from PIL import Image
 from evaluation.playback.environment_hooks import Declarations, EnvironmentHooks, environment_hooks
 from evaluation.playback.human_play import PERSON, GameState, human_play, playability
 from evaluation.playback.single_game import GameStep, play_game
+from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
@@ -45,10 +46,16 @@ UNSEEN = EnvironmentHooks(draws=False, has_views=False, declared=Declarations())
 
 
 @cache
-def league_and_environment(entry_point: str, **kwargs: Any) -> tuple[LeagueConfig, Interface, BatchedEnvironment]:
+def league_and_environment(
+    entry_point: str, selection: ActionSelection | None = None, **kwargs: Any
+) -> tuple[LeagueConfig, Interface, BatchedEnvironment]:
     """A league, and an environment that is reused for several games."""
     config = LeagueConfig.from_mapping(
-        {"league": "home", "environment": {"entry_point": entry_point, "kwargs": dict(kwargs)}}
+        {
+            "league": "home",
+            "environment": {"entry_point": entry_point, "kwargs": dict(kwargs)},
+            "play": {"actions": selection},
+        }
     )
     return config, interface(config), stock_stepping(config.environment, 1)
 
@@ -64,8 +71,8 @@ def scripted_players(described: Interface, name: str = "random") -> dict[str, Po
 def play_request(
     entry_point: str, players: Mapping[str, Policy], agent: str, actions: Sequence[int] = (), **options: Any
 ) -> GameState:
-    kwargs = options.pop("kwargs", {})
-    config, described, environment = league_and_environment(entry_point, **kwargs)
+    kwargs, selection = options.pop("kwargs", {}), options.pop("selection", None)
+    config, described, environment = league_and_environment(entry_point, selection, **kwargs)
     request = HumanPlayRequest(opponent="script:random", agent=agent, actions=tuple(actions), **options)
     return human_play(request, config, described, players, environment, UNSEEN)
 
@@ -113,19 +120,23 @@ def test_a_game_is_reproducible_for_any_prefix_and_equals_one_of_policies(
     assert {move.ref for step in whole.steps for move in step.moves if move.agent == agent} == {PERSON}
 
 
+@pytest.mark.parametrize("selection", ["greedy", "sampled"])
 @pytest.mark.parametrize("memory", [False, True], ids=["without memory", "with memory"])
-def test_playing_like_the_opponent_equals_self_play_of_the_opponent(memory: bool) -> None:
-    _, described, environment = league_and_environment(SPREAD, **BRIEF)
+def test_playing_like_the_opponent_equals_self_play_of_the_opponent(memory: bool, selection: ActionSelection) -> None:
+    _, described, environment = league_and_environment(SPREAD, selection, **BRIEF)
     spaces = described.of_policy("shared")
     players = all_agents(described, OnnxPolicy(tictactoe.linear(spaces, seed=3, memory=memory)))
+    played = moves_of(list(play_game(environment, players, 0, selection)))
+    drawn = [action for moves in played for agent, action in moves if agent == "agent_1"]
+    options = {"chances": True, "selection": selection, "kwargs": BRIEF}
     choices: list[int] = []
-    while not (state := play_request(SPREAD, players, "agent_1", choices, chances=True, kwargs=BRIEF)).over:
+    while not (state := play_request(SPREAD, players, "agent_1", choices, **options)).over:
         assert sum(chance for _, chance in state.chances) == pytest.approx(1, abs=1e-5)
-        choices.append(state.chances[0][0])
-    played = list(play_game(environment, players, 0))
-    assert moves_in(state) == moves_of(played)
+        choices.append(state.chances[0][0] if selection == "greedy" else drawn[len(choices)])
+    assert moves_in(state) == played
     assert len(set(choices)) > 1 or not memory
-    assert all(move.chances[0][0] == move.action for step in state.steps for move in step.moves)
+    is_likeliest = {move.chances[0][0] == move.action for step in state.steps for move in step.moves}
+    assert is_likeliest == ({True} if selection == "greedy" else {True, False})
 
 
 def next_action_graph(width: int, actions: int) -> bytes:
