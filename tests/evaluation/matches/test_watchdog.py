@@ -42,7 +42,8 @@ def config(ends: str, where: str = "step", seconds: float = SOON, vector: str | 
                 "kwargs": {"ends": ends, "where": where},
                 "vector": vector,
             },
-            "play": {"num_envs": 3, "game_seconds": seconds},
+            # Its versions take their most likely action, as a sampled one would let the fuse go out.
+            "play": {"num_envs": 3, "game_seconds": seconds, "actions": "greedy"},
             "gate": {"elo1": 100, "max_blocks": 4},
         }
     )
