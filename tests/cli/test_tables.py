@@ -34,7 +34,7 @@ COMMANDS = {
     "serving/keys": ("keys", "list"),
     "versions/retire": ("retire", "--keep=1", "--days=0", "--dry-run"),
     "doctor": ("doctor",),
-    "training/check_env": ("check-env", "tictactoe", "--episodes=1"),
+    "training/check_env": ("check-env", "simple_adversary", "--episodes=1"),
     "evaluation/exploitability": ("exploitability", "tictactoe@1", "--blocks=2", "--workers=0"),
     "evaluation/evaluate": ("evaluate", "tictactoe", "--blocks=2", "--workers=0"),
     "leagues/listing": ("list",),
