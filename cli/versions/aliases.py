@@ -67,13 +67,15 @@ def promote(
     for number in (version.number, *(version.mixture.versions if version.mixture else ())):
         registry.artifacts.check_exists(version.league, number)
     current = registry.aliases.current(version.league).get(alias)
+    before = current if wanted is None else wanted[0]
     if alias == CHAMPION and not yes and version.number != current:
+        registry.aliases.check(version.league, alias, version.number, expected=before)
         _confirm(registry, version, as_json)
     event = registry.aliases.set(
         version.league,
         alias,
         version.number,
-        expected=current if wanted is None else wanted[0],
+        expected=before,
         actor=actor or getpass.getuser(),
         reason=reason,
     )

@@ -78,6 +78,11 @@ class AliasRepository(Repository):
 
             return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
 
+    def check(self, league: str, alias: str, version: int, *, expected: int | AnyVersion | None) -> None:
+        """Raise what `set` would raise now, and change nothing: for callers that ask for confirmation first."""
+        with self._database.read() as session:
+            _check(session, league, alias, version, expected)
+
     @repeat_after_deadlock
     def rollback(
         self,
@@ -145,10 +150,7 @@ def _set(
 ) -> AliasEvent:
     if verdict is not None:
         verdicts.require_open(session, verdict)
-    require = versions.require_promotable if alias == CHAMPION else versions.require_files
-    require(session, league, version)
-    last = _in_force(session, league, alias)
-    _require(last, league, alias, expected)
+    last = _check(session, league, alias, version, expected)
     if last and last.version == version:
         return _row(last)
     event = AliasEventTable(
@@ -160,6 +162,17 @@ def _set(
         verdict=verdict,
     )
     return _record(session, league, alias, last, event)
+
+
+def _check(
+    session: Session, league: str, alias: str, version: int, expected: int | AnyVersion | None
+) -> AliasEventTable | None:
+    """Return the event in force if the alias may be moved from `expected` to `version`, else raise."""
+    require = versions.require_promotable if alias == CHAMPION else versions.require_files
+    require(session, league, version)
+    last = _in_force(session, league, alias)
+    _require(last, league, alias, expected)
+    return last
 
 
 def _roll_back(

@@ -120,6 +120,8 @@ def test_a_version_that_never_played_or_was_rejected_becomes_champion_with_yes_o
     assert refused.err.startswith("league: tictactoe@1 has played no game under the current conditions")
     assert "confirm with --yes that tictactoe@1 shall be champion" in refused.err
     assert league("promote", "tictactoe@1", "--json").code == 2
+    moved = league("promote", "tictactoe@1", "--expected", "2")
+    assert "is not set, expected tictactoe@2" in moved.err, "what fails even with --yes is said at once"
     assert registry.aliases.current("tictactoe") == {}
     assert league("promote", "tictactoe@1", "--alias", "candidate").code == 0, "other aliases are not asked about"
     league("evaluate", "tictactoe", "--blocks", "2", "--workers", "0")
