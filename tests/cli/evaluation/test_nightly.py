@@ -12,7 +12,7 @@ import pytest
 from filelock import FileLock
 
 from cli.evaluation.nightly import night_document, summary_of_night
-from league.config.gate import GateConfig
+from league.config.gate import AnchorConfig, GateConfig
 from league.registry.registry import Registry
 from league.registry.storage.rows import TrainingNightRow
 from tests.support.command import League
@@ -61,7 +61,8 @@ def test_without_an_argument_all_registered_leagues_are_run(league: League, regi
 
 def test_a_league_whose_versions_all_fail_the_gate_has_no_champion(league: League, registry: Registry) -> None:
     row = registry.leagues.get("tictactoe")
-    strict = row.config.model_copy(update={"gate": GateConfig.model_validate({"anchors": ["script:solver"]})})
+    solver = AnchorConfig(ref="script:solver", mode="at_least")
+    strict = row.config.model_copy(update={"gate": GateConfig(anchors=(solver,))})
     registry.leagues.register(strict, row.interface)
     result = league("nightly", "tictactoe", "--workers", "0")
     assert "3 tested, there is no champion, as no version has passed the gate yet." in result.out
