@@ -88,14 +88,19 @@ def refresh_earlier_results(registry: Registry, league: str) -> None:
         registry.snapshots.put(league, {earlier_part(name, part): table for part, table in found.items()}, mark)
 
 
-def tables(played: CountedGames, sides: Sequence[str]) -> dict[str, Any]:
-    """Return the documents `leaderboard` and `payoff` of some games."""
+def tables(played: CountedGames, sides: Sequence[str], not_champion: str | None = None) -> dict[str, Any]:
+    """Return the documents `leaderboard` and `payoff` of some games.
+
+    not_champion: why the best version is not the champion. None for earlier conditions: the champion is that of the
+    current ones.
+    """
     payoff = played.payoff()
     return {
         "leaderboard": {
             "sides": list(sides),
             "leaderboard": [standing.to_json() for standing in played.leaderboard],
             "by_side": {side: [each.to_json() for each in own] for side, own in played.by_side().items()},
+            "not_champion": not_champion,
         },
         "payoff": payoff.to_json() if payoff else None,
     }

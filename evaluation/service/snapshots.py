@@ -59,8 +59,6 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
     row, events = registry.leagues.get(league), registry.aliases.history(league)
     played = CountedGames(registry, row)
     sides, leaderboard = list(row.interface.sides), played.leaderboard
-    results = tables(played, sides)
-    results["leaderboard"]["not_champion"] = why_not_champion(registry, league, leaderboard)
     versions = [rated_version(version, leaderboard, events).to_json() for version in registry.versions.all(league)]
     return {
         SUMMARY: {
@@ -74,7 +72,7 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
             "environment_digest": row.environment_digest,
             "earlier": [each.to_json() for each in earlier_results(registry, row)],
         },
-        **results,
+        **tables(played, sides, why_not_champion(registry, league, leaderboard)),
         "ratings": {"versions": versions},
     }
 

@@ -30,7 +30,7 @@ from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 6
+FORMAT = 7
 """Version of the document format. A new format invalidates all snapshots."""
 
 

@@ -78,6 +78,7 @@ def test_snapshots_equal_the_report(registry: Registry, report: LeagueReport) ->
         "sides": ["player_1", "player_2"],
         "leaderboard": expected["leaderboard"],
         "by_side": {},
+        "not_champion": expected["not_champion"],
     }
     assert snapshot(registry, "payoff").document == expected["payoff"]
     assert snapshot(registry, "ratings").document == {"versions": expected["versions"]}
@@ -87,6 +88,15 @@ def test_snapshots_equal_the_report(registry: Registry, report: LeagueReport) ->
     for verdict in expected["verdicts"]:
         verdict["curve"] = [[block, llr] for block, llr in enumerate(verdict["curve"], start=1)]
         assert snapshot(registry, f"verdict/{verdict['verdict']}").document == verdict
+
+
+def test_a_rollback_changes_why_the_best_version_is_not_champion_as_in_the_report(registry: Registry) -> None:
+    assert snapshot(registry, "leaderboard").document["not_champion"] is None
+    registry.aliases.rollback(LEAGUE, actor="ada", reason="it was slow")
+    refresh(registry, LEAGUE)
+    explanation = snapshot(registry, "leaderboard").document["not_champion"]
+    assert "it was rolled back" in explanation
+    assert explanation == league_report(registry, LEAGUE, pictures=False).not_champion
 
 
 def test_current_snapshots_are_not_recomputed(registry: Registry) -> None:
