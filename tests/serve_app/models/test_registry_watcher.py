@@ -341,10 +341,15 @@ def test_an_idle_replica_has_one_connection_and_replaces_a_lost_one(registry: Re
         pytest.skip("SQLite has no server")
     with replica(named(registry.storage, "idle")) as client:
         assert client.get("/v1/leagues").status_code == 200
-        until(lambda: len(processes(registry, "idle")) == 1)
+        lost: list[int] = []
+
+        def has_one_connection() -> bool:
+            lost[:] = processes(registry, "idle")
+            return len(lost) == 1
+
+        until(has_one_connection)
         with registry.database.write() as session:
-            (lost,) = processes(registry, "idle")
-            session.execute(text("SELECT pg_terminate_backend(:process)"), {"process": lost})
+            session.execute(text("SELECT pg_terminate_backend(:process)"), {"process": lost[0]})
+        until(lambda: lost[0] not in processes(registry, "idle"))
         promote(registry, "board", 2)
         until(lambda: serves(registry, 2))
-        assert lost not in processes(registry, "idle")
