@@ -26,6 +26,8 @@ from league.interface import Interface
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check_mask, mask_size
 
+REPETITIONS = 4
+"""Further new environments, for those that draw from a common generator: tosses of a coin are often equal."""
 FIRST, RETURNS, OPENINGS = 0.2, 0.7, 0.9
 """Shares of the time after which no further episodes are played: the first ones, which are repeated; those that compare
 returns; random openings."""
@@ -109,7 +111,7 @@ class Examiner:
         return episode
 
     def _check_seeding(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
-        """Play the same episodes again, in reverse order, and the first one in a new environment."""
+        """Play the same episodes again, in reverse order, and the first one in new environments."""
         # After the timing, because a global state may be a large image.
         again = [
             self._episode(adapter, seed + i, "the same episodes again", first[i].steps, states=True)
@@ -117,15 +119,17 @@ class Examiner:
         ][::-1]
         before = _global_generators()
         anew = self._anew(first[0], seed)
-        after = _global_generators()
-        pairs = [*zip(first, again, strict=True), (first[0], anew)]
+        drawn = [name for name, state in _global_generators().items() if state != before[name]]
+        more: list[Episode] = []
+        while drawn and len(more) < REPETITIONS and not self._budget.is_spent(FIRST):
+            more.append(self._anew(first[0], seed))
+        pairs = [*zip(first, again, strict=True), *((first[0], episode) for episode in (anew, *more))]
         change = next((change for one, other in pairs if (change := self._change(one, other))), None)
         if change is None:
             return
-        if not self._change(self._anew(first[0], seed), anew):
+        if not any(self._change(episode, anew) for episode in more or [self._anew(first[0], seed)]):
             text = "the same seed gives another episode after other episodes: reset must clear all state"
         else:
-            drawn = [name for name, state in after.items() if state != before[name]]
             text = (
                 "the same seed gives another episode in each new environment: all randomness must follow the seed of"
                 " reset"
