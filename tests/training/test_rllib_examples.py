@@ -60,4 +60,6 @@ def test_each_is_accepted_or_refused_as_listed(name: str) -> None:
     if reason is None:
         assert faults == []
     else:
-        assert any(reason in fault for fault in faults), faults
+        # Another thread of this process may draw from a generator meanwhile, which is then named too.
+        parts = reason.split(", and ")
+        assert any(all(part in fault for part in parts) for fault in faults), faults
