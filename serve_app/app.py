@@ -1,9 +1,9 @@
 """Composes a replica, and builds the Ray Serve application that deploy.yaml names.
 
-    HAProxy → replica: uvicorn → Ray Serve → the Starlette application below
-                                               └ requests that need an environment → the evaluation service, by handle
+    HAProxy → replica: uvicorn → the Starlette application below
+                                   └ requests that need an environment → the evaluation service, by handle
 
-A request is answered in the process that it reaches first. Inference requests bypass Ray Serve's request path
+A request is answered in the process that it reaches first, and bypasses Ray Serve's request path
 (serve_app.runtime.serve_bypass).
 """
 

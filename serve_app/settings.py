@@ -38,7 +38,7 @@ class ServeSettings(BaseModel):
     max_incomplete: int = Field(default=32 * 2**20, ge=1024)
     """Bytes of incomplete messages of all streams of a replica; a stream that exceeds them is closed with 1013."""
     max_in_flight: int = Field(default=256, ge=1)
-    """Inference requests in flight per replica; further ones are refused with 429."""
+    """Inference requests in flight per replica, and likewise other HTTP requests; further ones are refused with 429."""
     max_streams: int = Field(default=10_000, ge=1)
     """Open streams per replica, at most three quarters of its file descriptors; further ones are refused with 429."""
     max_listeners: int = Field(default=200, ge=1)

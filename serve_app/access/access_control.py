@@ -9,7 +9,9 @@ The timeout applies to HTTP requests only: gRPC calls have their own deadlines, 
 long-lived.
 """
 
+import re
 from collections.abc import Awaitable, Iterable
+from contextlib import nullcontext
 from time import monotonic
 from typing import Any, NamedTuple
 
@@ -19,6 +21,7 @@ from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError
 from serve_app.access import permissions
 from serve_app.access.access_log import LOG_ENTRY, AccessLog
 from serve_app.access.api_keys import ApiKey, ApiKeyCache, TokenBucket
+from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.access.errors import BodyTooSlow, ErrorHandlers
 from serve_app.access.load_shedding import Backlog
 from serve_app.access.permissions import RequiredPermission
@@ -26,7 +29,6 @@ from serve_app.access.request_body import BODY_READ
 from serve_app.access.request_origin import ORIGIN_HEADERS, reject_cross_site, reject_foreign_host
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.runtime.haproxy_script import KEY_ACCEPTED
-from serve_app.runtime.serve_bypass import is_event_stream
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
 
@@ -41,6 +43,10 @@ NO_SNIFFING = (b"x-content-type-options", b"nosniff")
 DENIAL = "websocket.http.response"
 """ASGI extension that sends an HTTP response when a WebSocket handshake is refused."""
 POLICY_VIOLATION = 1008
+EVENT_STREAM_PATH = re.compile("/v1/leagues/[^/]+/(evaluations/[^/]+/)?events")
+"""Paths of event streams."""
+UNLIMITED = ("/v1/policies/", "/v2/models/", "/v1/health/", "/v2/health/")
+"""Paths of inference, which limits its requests in flight itself, and of health checks, which answer at once."""
 FRAMES = 2000.0
 """Control frames and fragments per second that a replica handles for all streams without a key: a few percent of a
 core, and four times the pings of 10,000 idle clients."""
@@ -200,6 +206,7 @@ class AccessControlMiddleware:
         self._access = access
         self._errors = errors
         self._timeout = settings.timeout
+        self._in_flight = ConnectionLimit("requests", settings.max_in_flight, settings.max_in_flight)
         self._is_first = True
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -221,12 +228,14 @@ class AccessControlMiddleware:
                 response.add_header(KEY_ACCEPTED.encode(), b"1")
                 if self._log is not None:
                     scope[LOG_ENTRY]["key"] = key.name
-            if kind != "http" or is_event_stream(_path(scope)):
+            path = _path(scope)
+            if kind != "http" or is_event_stream(path):
                 await self._application(scope, receive, response.send)
                 return
             timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
             scope[DEADLINE] = monotonic() + timeout
-            await run_within(timeout, self._application(scope, receive, response.send))
+            with nullcontext() if path.startswith(UNLIMITED) else self._in_flight.opened(None):
+                await run_within(timeout, self._application(scope, receive, response.send))
         except LeagueError as error:
             if response.has_started:
                 raise
@@ -262,6 +271,11 @@ class ResponseTracker:
             self.has_started = True
             message["headers"] = [*message.get("headers", ()), *self._headers]
         return self._send(message)
+
+
+def is_event_stream(path: str) -> bool:
+    """Whether a path is that of an event stream, which has no end of its own."""
+    return path.endswith("/events") and EVENT_STREAM_PATH.fullmatch(path) is not None
 
 
 def _check_league(key: ApiKey, need: RequiredPermission) -> None:

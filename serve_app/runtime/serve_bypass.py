@@ -1,33 +1,29 @@
-"""Bypasses Ray Serve's request path for inference.
+"""Bypasses Ray Serve's request path.
 
-    HAProxy → uvicorn ┬→ /v1/policies/…, /v2/models/…, …/events → the application
-                      └→ other paths → Ray Serve → the application
+    HAProxy → uvicorn ┬→ SERVES_OWN → Ray Serve
+                      └→ other paths → the application
 
-Serve's work per request takes as long as everything else together, and inference needs none of it: it finishes before
-it could be cancelled, and the routes limit concurrency themselves. A server that stops finishes requests in progress
-and closes streams with 1012. Event streams bypass Serve because it would wait for them to end.
+Serve's work per request takes as long as everything else together, also for a caller who is then refused. The
+application limits concurrency and time itself. A server that stops finishes requests in progress, ends event streams,
+and closes WebSocket streams with 1012.
 
 RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH names `middlewares`; without it, all requests go through Serve.
 """
-
-import re
 
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from serve_app.runtime.grpc_servers import limit_unknown_callers
 
-INFERENCE_PREFIXES = ("/v1/policies/", "/v2/models/")
-"""Paths of actions, streams and the Open Inference Protocol."""
-EVENT_STREAM_PATH = re.compile("/v1/leagues/[^/]+/(evaluations/[^/]+/)?events")
-"""Paths of event streams."""
+SERVES_OWN = ("/-/healthz", "/-/routes")
+"""Paths that Ray Serve answers itself; the first is HAProxy's health check."""
 PROTOCOLS = ("http", "websocket")
 _application: ASGIApp | None = None
 _root_path = ""
 
 
 def install(application: ASGIApp, root_path: str = "") -> None:
-    """Send requests that bypass Serve in this process to `application`, and remove `root_path` from all paths."""
+    """Send the requests of this process to `application`, and remove `root_path` from their paths."""
     global _application, _root_path
     _application, _root_path = application, root_path
 
@@ -42,7 +38,7 @@ def middlewares() -> list[Middleware]:
 
 
 class ServeBypass:
-    """Sends inference requests to the application of this process, and others to Ray Serve."""
+    """Sends requests to the application of this process, if it has one."""
 
     def __init__(self, onward: ASGIApp) -> None:
         self._onward = onward
@@ -51,15 +47,10 @@ class ServeBypass:
         """Dispatch a request."""
         if _root_path and scope["type"] in PROTOCOLS:
             scope = _below_root(scope)
-        if _application is not None and scope["type"] in PROTOCOLS and _bypasses_serve(scope["path"]):
+        if _application is not None and scope["type"] in PROTOCOLS and scope["path"] not in SERVES_OWN:
             await _application(scope, receive, send)
         else:
             await self._onward(scope, receive, send)
-
-
-def is_event_stream(path: str) -> bool:
-    """Whether a path is that of an event stream, which has no end of its own."""
-    return path.endswith("/events") and EVENT_STREAM_PATH.fullmatch(path) is not None
 
 
 def _below_root(scope: Scope) -> Scope:
@@ -68,7 +59,3 @@ def _below_root(scope: Scope) -> Scope:
     if not (raw + b"/").startswith(_root_path.encode() + b"/"):
         return scope
     return {**scope, "path": path[len(_root_path) :] or "/", "raw_path": raw[len(_root_path) :] or b"/"}
-
-
-def _bypasses_serve(path: str) -> bool:
-    return path.startswith(INFERENCE_PREFIXES) or is_event_stream(path)

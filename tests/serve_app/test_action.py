@@ -3,6 +3,7 @@
 import asyncio
 import gzip
 import json
+import threading
 import zlib
 from collections.abc import AsyncIterator
 from typing import Any
@@ -281,9 +282,28 @@ async def test_the_number_of_concurrent_requests_is_limited(registry: Registry) 
         reply = await client.post("/v1/policies/board/action", json={"observation": BOARD})
         assert (reply.status_code, reply.json()["code"]) == (429, "overloaded")
         assert reply.headers["retry-after"] == "1"
+        assert (await client.get("/v1/leagues")).status_code == 200
         resume.set()
         assert [(await each).status_code for each in slow] == [200, 200]
         assert (await client.post("/v1/policies/board/action", json={"observation": BOARD})).status_code == 200
+
+
+@pytest.mark.anyio
+async def test_the_number_of_other_concurrent_requests_is_limited(registry: Registry) -> None:
+    server = Replica(registry, QUICK.model_copy(update={"max_in_flight": 2}), "replica-1")
+    resume = threading.Event()
+    transport = httpx.ASGITransport(server.application())
+    async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
+        blocked = [asyncio.create_task(server.models.query(lambda _: resume.wait(60))) for _ in range(4)]
+        slow = [asyncio.create_task(client.get("/v1/leagues")) for _ in range(3)]
+        refused, _ = await asyncio.wait(slow, return_when=asyncio.FIRST_COMPLETED)
+        (reply,) = [request.result() for request in refused]
+        assert (reply.status_code, reply.json()["code"]) == (429, "overloaded")
+        assert (await client.get("/v1/health/live")).status_code == 200
+        assert (await client.post("/v1/policies/board/action", json={"observation": BOARD})).status_code == 200
+        resume.set()
+        await asyncio.gather(*blocked)
+        assert sorted([(await request).status_code for request in slow]) == [200, 200, 429]
 
 
 def test_strings_do_not_use_memory(read_only_client: TestClient) -> None:

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from schemathesis.schemas import APIOperation
 
+from serve_app.access.access_control import is_event_stream
 from serve_app.openapi.document import document
-from serve_app.runtime.serve_bypass import is_event_stream
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.leagues.match_results import SCHEDULE, WON
 from tests.support.servers.replicas import QUICK

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from schemathesis import Case, GenerationMode
 from schemathesis.schemas import APIOperation
 
+from serve_app.access.access_control import is_event_stream
 from serve_app.openapi.document import document
-from serve_app.runtime.serve_bypass import is_event_stream
 from tests.support.leagues.match_results import PENDING, SCHEDULE, WON
 from tests.support.servers.replicas import LOCALHOST, QUICK
 

@@ -25,6 +25,7 @@ from ray._private.worker import global_worker
 from ray._raylet import PythonFunctionDescriptor
 from ray.serve._private import common, grpc_util, http_util, replica
 from ray.serve._private.common import RequestProtocol
+from ray.serve._private.constants import SERVE_HTTP_REQUEST_ID_HEADER
 from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
 from ray.serve._private.replica import SERVE_BUILD_ASGI_APP_METHOD
 from ray.serve.config import HTTPOptions, gRPCOptions
@@ -452,15 +453,17 @@ class TestServer:
             until(lambda: "x-request-id" not in act(client).headers, seconds=120)
         return ray_server.url
 
-    def test_action_requests_bypass_ray_serve(self, url: str) -> None:
+    def test_requests_bypass_ray_serve(self, url: str) -> None:
         with httpx.Client(base_url=url, trust_env=False) as client:
-            through_serve = client.get("/v1/leagues")
-            assert "x-request-id" in through_serve.headers, "Ray Serve no longer marks the responses that it handles"
-            for path, body in (
-                ("/v1/policies/board/action", {"observation": BOARD}),
-                ("/v2/models/board/infer", {"inputs": []}),
+            assert client.get("/-/routes").json() == {"/": "policy-league"}, "Ray Serve answers its own paths"
+            assert SERVE_HTTP_REQUEST_ID_HEADER == "x-request-id", "Ray Serve marks the responses that it handles"
+            for method, path, body in (
+                ("POST", "/v1/policies/board/action", {"observation": BOARD}),
+                ("POST", "/v2/models/board/infer", {"inputs": []}),
+                ("GET", "/v1/leagues", None),
+                ("GET", "/v1/health/live", None),
             ):
-                direct = client.post(path, json=body)
+                direct = client.request(method, path, json=body)
                 assert direct.headers["content-type"] == "application/json"
                 assert "x-request-id" not in direct.headers, f"{path} does not bypass Ray Serve: see serve_bypass.py"
 
