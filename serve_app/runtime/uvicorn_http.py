@@ -170,8 +170,12 @@ class HttpProtocol(HttpToolsProtocol):
             begun.add_done_callback(self.server_state.tasks.discard)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Count the connection no longer."""
+        """Count the connection no longer, and forget it.
+
+        uvicorn keeps a connection that the client has reset until its keep-alive time has passed: 9 kB for 75 s.
+        """
         super().connection_lost(exc)
+        self._unset_keepalive_if_required()
         self._release()
 
     def on_headers_complete(self) -> None:

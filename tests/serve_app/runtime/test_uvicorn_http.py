@@ -1,9 +1,12 @@
 """Concurrent clients are accepted at once, however long the event loop was busy, and idle ones have limits."""
 
 import asyncio
+import gc
 import resource
 import socket
+import struct
 import threading
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -11,6 +14,7 @@ import pytest
 from starlette.types import Receive, Scope, Send
 
 from serve_app.runtime import uvicorn_http
+from serve_app.runtime.uvicorn_http import HttpProtocol
 from tests.support.servers.http_protocol import serving
 from tests.support.waiting import until
 
@@ -123,6 +127,20 @@ def test_a_connection_without_a_request_is_closed(monkeypatch: pytest.MonkeyPatc
                 client.sendall(sent)
                 client.settimeout(20)
                 assert client.recv(1) == b""
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
+def test_a_connection_that_the_client_resets_is_forgotten(loop: str) -> None:
+    with serving(TurnCounting(), loop) as address:
+        client = socket.create_connection(address)
+        client.sendall(KEEP_ALIVE)
+        answered(client)
+        connections = [item for item in gc.get_objects() if isinstance(item, HttpProtocol)]
+        assert len(connections) == 1
+        forgotten = weakref.ref(connections.pop())
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        client.close()
+        until(lambda: gc.collect() >= 0 and forgotten() is None)
 
 
 def test_an_address_of_another_machine_has_a_part_of_the_connections(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,15 @@ from serve_app.runtime.uvicorn_http import HttpProtocol
 def serving(application: ASGIApp, loop: str) -> Iterator[tuple[str, int]]:
     """The address of a server in a thread that has ended afterwards. loop: uvicorn's name of the event loop."""
     protocol = partial(HttpProtocol, lambda: None)
-    config = uvicorn.Config(application, port=0, loop=loop, http=protocol, lifespan="off", log_config=None)  # type: ignore[arg-type]
+    config = uvicorn.Config(
+        application,
+        port=0,
+        loop=loop,
+        http=protocol,  # type: ignore[arg-type]
+        timeout_keep_alive=3600,
+        lifespan="off",
+        log_config=None,
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
