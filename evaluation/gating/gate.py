@@ -149,8 +149,8 @@ def shadow_shortfall(
         return f"as a shadow it failed to answer {failed} requests"
     if settings.shadow_agreement is not None and agreement < settings.shadow_agreement:
         return (
-            f"as a shadow it agreed with the champion on {agreement:.1%} of {observations} observations,"
-            f" but the gate requires {settings.shadow_agreement:.1%}"
+            f"as a shadow it agreed with the champion on {100 * agreement:.1f} % of {observations} observations,"
+            f" but the gate requires {100 * settings.shadow_agreement:.1f} %"
         )
     if settings.latency_ms is not None and latency_ms > settings.latency_ms:
         return (

@@ -69,7 +69,7 @@ class Mixture(BaseModel):
         return self.members[self.index_at(episode_position(league, episode))].version
 
     def __str__(self) -> str:
-        return ", ".join(f"@{member.version} {member.probability:.1%}" for member in self.members)
+        return ", ".join(f"@{member.version} {100 * member.probability:.1f} %" for member in self.members)
 
 
 def episode_position(league: str, episode: bytes) -> float:

@@ -14,8 +14,8 @@ def test_a_mixture_is_promoted_shown_and_rolled_back(league: League, registry: R
     league("promote", "tictactoe@1", "--yes")
     out = league("promote", "tictactoe@1:0.6,tictactoe@3:0.4", "--yes", "--to", "champion").out
     assert "tictactoe@champion now points to version 4 (before: version 1)." in out
-    assert "mixture of @1 60.0%, @3 40.0%" in league("versions", "tictactoe").out
-    assert "4 (@1 60.0%, @3 40.0%)" in league("history", "tictactoe").out
+    assert "mixture of @1 60.0 %, @3 40.0 %" in league("versions", "tictactoe").out
+    assert "4 (@1 60.0 %, @3 40.0 %)" in league("history", "tictactoe").out
     event = league("history", "tictactoe", "--json").json["events"][0]
     assert (event["version"], [member["version"] for member in event["members"]]) == (4, [1, 3])
     assert league("promote", "tictactoe@3:0.4,@1:0.6", "--yes", "--json").json["id"] == event["id"], "nothing changes"
@@ -43,7 +43,7 @@ def test_replicas_are_waited_for(league: League, registry: Registry) -> None:
         ("tictactoe@1:x,tictactoe@2:0.4", "'x' is not a probability: expected tictactoe@1:PROBABILITY"),
         ("tictactoe@1:0.5,tictactoe@1:0.5", "tictactoe@1 is twice in the mixture"),
         ("tictactoe@1:1", "a mixture has 1 version, expected at least two"),
-        ("tictactoe@mixed:0.5,@1:0.5", "tictactoe@4 is a mixture (@1 50.0%, @2 50.0%): the members of a mixture"),
+        ("tictactoe@mixed:0.5,@1:0.5", "tictactoe@4 is a mixture (@1 50.0 %, @2 50.0 %): the members of a mixture"),
     ],
 )
 def test_an_invalid_mixture_changes_nothing(league: League, registry: Registry, ref: str, message: str) -> None:
@@ -98,6 +98,6 @@ def test_scores_are_those_against_the_mixture_that_is_shown(
 
 def test_what_needs_one_policy_names_the_members(league: League, registry: Registry) -> None:
     league("promote", "tictactoe@1:0.5,@2:0.5", "--yes")
-    message = "league: tictactoe@4 is a mixture (@1 50.0%, @2 50.0%): name one of its members\n"
+    message = "league: tictactoe@4 is a mixture (@1 50.0 %, @2 50.0 %): name one of its members\n"
     assert league("export", "tictactoe@champion").err == message
     assert league("act", "tictactoe@champion", "--local", "--json").json["version"] in (1, 2)

@@ -213,7 +213,7 @@ SHADOW_GATE = GateConfig(shadow_agreement=0.9, latency_ms=2.0, shadow_observatio
         ((100, 0, 0.9, 2.0), None),
         ((99, 0, 1.0, 0.1), "99 observations .* requires 100"),
         ((0, 0, None, None), "has 0 observations"),
-        ((100, 0, 0.899, 2.0), "on 89.9% of 100 observations, .* 90.0%"),
+        ((100, 0, 0.899, 2.0), "on 89.9 % of 100 observations, .* 90.0 %"),
         ((100, 0, 1.0, 5.0), "within 5 ms, .* 2 ms"),
         ((100, 1, 1.0, 0.1), "failed to answer 1 requests"),
     ],

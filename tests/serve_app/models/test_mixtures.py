@@ -131,7 +131,7 @@ def test_a_local_policy_is_the_member_that_the_server_selects(client: TestClient
         loaded = load("board@champion", registry=registry, episode=key)
         expected = graphs[version_for(client, key)].act(arrays).actions
         np.testing.assert_array_equal(loaded.act(arrays).actions, expected)
-    with pytest.raises(InvalidInput, match=r"board@4 is a mixture \(@1 50.0%, @3 50.0%\)"):
+    with pytest.raises(InvalidInput, match=r"board@4 is a mixture \(@1 50.0 %, @3 50.0 %\)"):
         load("board@champion", registry=registry)
 
 
