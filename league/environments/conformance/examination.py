@@ -28,7 +28,8 @@ from league.spaces import Box, Discrete, MultiDiscrete, Space
 
 CYCLES = 50
 """Number of cycles of PettingZoo's API tests."""
-
+BARE_SECONDS = 10.0
+"""Maximum duration of the search for a wrong return below wrappers."""
 COMPARED_COPIES, COMPARED_STEPS = 32, 20_000
 """Size of the comparison of a vectorised environment with its stock environment."""
 MEASURED_COPIES, MEASURED_SECONDS = 1024, 1.0
@@ -90,9 +91,7 @@ def examine(
     except LeagueError as error:
         found.add("fault", str(error))
     except Exception as error:
-        where = "".join(f"{place}, " for place in [raised_at(error)] if place)
-        reason = one_line(error, with_type=True)
-        found.add("fault", f"the environment raised an exception ({where}{examiner.place}): {reason}")
+        found.add("fault", _explained(error, config, seed, str(examiner.place)))
     finally:
         env.close()
     if found.passed:
@@ -106,6 +105,32 @@ def examine(
             f" {1 / found.steps_per_second:.2g} s per step: {', '.join(budget.skipped)} (--seconds)",
         )
     return found
+
+
+def _explained(error: Exception, config: LeagueConfig, seed: int, place: str) -> str:
+    """The fault that an exception shows. A wrapper's own exception does not say what it was given."""
+    if (returned := _return_below_wrappers(config, seed)) is not None:
+        return f"{returned} (below its wrappers, {place})"
+    where = "".join(f"{line}, " for line in [raised_at(error)] if line)
+    return f"the environment raised an exception ({where}{place}): {one_line(error, with_type=True)}"
+
+
+def _return_below_wrappers(config: LeagueConfig, seed: int) -> str | None:
+    """What the environment returned to its first wrapper that does not fit; None if it has no wrappers, or nothing is
+    found in one episode.
+    """
+    if not config.environment.wrappers:
+        return None
+    bare = config.model_copy(update={"environment": config.environment.model_copy(update={"wrappers": ()})})
+    try:
+        with contextlib.closing(build(bare.environment)) as env:
+            interface = describe(env, bare)
+            Examiner(env, interface, bare, Examination(), None, TimeBudget(BARE_SECONDS)).examine(1, seed)
+    except InvalidReturn as error:
+        return str(error)
+    except Exception:
+        return None
+    return None
 
 
 def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: Examination, seed: int) -> None:

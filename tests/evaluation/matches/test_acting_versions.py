@@ -125,5 +125,7 @@ def test_a_live_game_is_played_by_one_member(registry: Registry) -> None:
 
 
 def test_a_mixture_has_no_policies_of_its_own(registry: Registry) -> None:
-    with pytest.raises(InvalidInput, match=r"tictactoe@4 is a mixture \(@1 50.0 %, @3 50.0 %\): name one of its members"):
+    with pytest.raises(
+        InvalidInput, match=r"tictactoe@4 is a mixture \(@1 50.0 %, @3 50.0 %\): name one of its members"
+    ):
         contestant("tictactoe@4", registry, INTERFACE)

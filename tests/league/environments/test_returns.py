@@ -21,6 +21,7 @@ CHANGES: dict[str, Any] = {
     "a reward array": lambda parts: (parts[0], {"ann": 1.0, "bob": np.array([1.0])}, *parts[2:]),
     "rewards list": lambda parts: (parts[0], [1.0, 1.0], *parts[2:]),
     "four values": lambda parts: (parts[0], parts[1], parts[2], parts[4]),
+    "raises": lambda parts: 1 / 0,
     "flag array": lambda parts: (*parts[:2], {agent: [False] for agent in AGENTS}, *parts[3:]),
     "no infos": lambda parts: (*parts[:4], None),
     "no observation": lambda parts: ({**parts[0], "bob": None}, *parts[1:]),
@@ -103,6 +104,31 @@ def test_check_env_says_what_was_returned_by_whom_and_what_was_expected(
     (fault,) = [str(each) for each in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
     assert "raised an exception" not in fault
     assert re.search(message, fault), fault
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("a reward None", "agent bob got the reward None: expected a number (below its wrappers, "),
+        ("four values", f"step returned 4 values: expected {STEP}"),
+    ],
+)
+def test_check_env_says_what_a_wrapper_failed_on(change: str, message: str) -> None:
+    config = EnvironmentConfig(
+        entry_point=f"{__name__}:WrongParallel", kwargs={"change": change}, wrappers=("clip_reward_v0",)
+    )
+    (fault,) = [str(finding) for finding in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
+    assert message in fault
+    assert "raised an exception" not in fault
+
+
+def test_an_exception_of_a_wrapped_environment_stays_one() -> None:
+    config = EnvironmentConfig(
+        entry_point=f"{__name__}:WrongParallel", kwargs={"change": "raises"}, wrappers=("clip_reward_v0",)
+    )
+    (fault,) = [str(finding) for finding in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
+    assert "the environment raised an exception" in fault
+    assert "division by zero" in fault
 
 
 @pytest.mark.parametrize(

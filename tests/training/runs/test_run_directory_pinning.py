@@ -63,7 +63,9 @@ def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) ->
     assert [each.ref for each in played] == ["tictactoe@1", "tictactoe@2", "script:random"]
     assert [each.share for each in played] == pytest.approx([0.075, 0.225, 0.3])
     magnet = tictactoe.config().with_training(magnet={"ref": "@champion", "weight": 0.1})
-    with pytest.raises(InvalidInput, match=r"tictactoe@3 is a mixture \(@1 25.0 %, @2 75.0 %\): name one of its members"):
+    with pytest.raises(
+        InvalidInput, match=r"tictactoe@3 is a mixture \(@1 25.0 %, @2 75.0 %\): name one of its members"
+    ):
         pin_opponents(magnet, registry, spaces)
 
 
