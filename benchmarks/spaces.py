@@ -66,7 +66,7 @@ SHAPES = ((), (), (1,), (2,), (3,), (2, 2), (4, 4, 3), (1, 1, 1, 2))
 RARE_SHAPES = ((0,), (2, 0))
 STEPS = 6
 """Actions of an agent in a game."""
-REPLICA = ServeSettings(poll=5.0, poll_slowest=5.0, heartbeat=5.0)
+REPLICA = ServeSettings(poll=5.0, poll_slowest=5.0, heartbeat=5.0, timeout=120.0, run_timeout=60.0)
 
 
 class Generator:

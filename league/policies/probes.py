@@ -46,8 +46,11 @@ def _differs(actions: NDArray, expected: NDArray, space: Space, tolerance: float
     """Elementwise difference, (k, elements of an action) bool."""
     if isinstance(space, Box):
         low, high = bounds(space)
-        span = np.where(np.isfinite(low) & np.isfinite(high), high - low, 1 + np.abs(expected))
-        differs = ~(np.abs(actions - expected) <= tolerance * span)
+        size = np.abs(expected, dtype=np.float64)
+        span = np.where(np.isfinite(low) & np.isfinite(high), high - low, 1 + size)
+        # Equal outputs may be rounded to neighbouring numbers, which differ by more in float16.
+        rounding = float(np.finfo(space.dtype).eps) * size
+        differs = ~(np.abs(actions - expected) <= np.maximum(tolerance * span, rounding))
     else:
         differs = actions != expected
     return differs.reshape(len(actions), -1)

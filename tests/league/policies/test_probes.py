@@ -8,8 +8,8 @@ import pytest
 
 from league.errors import ArtifactCorrupt
 from league.policies.onnx import OnnxPolicy
-from league.policies.probes import Probes
-from league.spaces import Discrete
+from league.policies.probes import Probes, same
+from league.spaces import Box, Discrete
 from tests.support.policies.graphs import counting, masked_mlp
 from tests.support.policies.probes import probes
 
@@ -55,6 +55,14 @@ def test_probes_that_do_not_fit_the_graph_are_rejected() -> None:
     wrong_actions = replace(probes(), actions=np.zeros((16, 2), np.int64))
     with pytest.raises(ArtifactCorrupt, match="actions"):
         wrong_actions.check(OnnxPolicy(masked_mlp()), SPACE, "probes")
+
+
+@pytest.mark.parametrize(("dtype", "is_same"), [("float16", [True, False]), ("float32", [False, False])])
+def test_actions_that_are_rounded_to_neighbouring_numbers_are_the_same(dtype: str, is_same: list[bool]) -> None:
+    space = Box(low=None, high=None, shape=(1,), dtype=dtype)
+    expected = np.array([[3000], [3000]], dtype)
+    actions = expected + np.array([[2], [8]], dtype)  # float16 has every second integer here
+    assert same(actions, expected, space).tolist() == is_same
 
 
 def archive(**arrays: np.ndarray) -> bytes:
