@@ -66,15 +66,15 @@ def _passed(findings: list[Check]) -> bool:
 
 
 def _python() -> Iterator[Check]:
-    found = ".".join(str(part) for part in sys.version_info[:3])
+    version = ".".join(str(part) for part in sys.version_info[:3])
     good = sys.version_info >= (3, 11)
-    yield Check("Python", "ok" if good else "fail", found, "" if good else "install Python 3.11 or newer")
+    yield Check("Python", "ok" if good else "fail", version, "" if good else "install Python 3.11 or newer")
 
 
 def _stack() -> Iterator[Check]:
-    found = installed()
+    installed_versions = installed()
     for package, verified in VERIFIED.items():
-        version = found.get(package)
+        version = installed_versions.get(package)
         if version is None and package in OPTIONAL:
             yield Check(package, "note", "not installed", "pip install 'policy-league[environments]' for Leduc hold'em")
         elif version is None:
@@ -138,12 +138,12 @@ def _object_store() -> Iterator[Check]:
 
 def _disk(what: str, path: Path, variable: str) -> Check:
     disk = shutil.disk_usage(path)
-    found = f"{disk.free / GIGABYTE:.1f} GB free"
+    free_space = f"{disk.free / GIGABYTE:.1f} GB free"
     if disk.free < MINIMUM_DISK:
         advice = f"free {MINIMUM_DISK / GIGABYTE:.0f} GB with `league retire`, or set {variable} to another disk"
-        return Check(what, "fail", found, advice)
+        return Check(what, "fail", free_space, advice)
     is_low = disk.free < LOW_SHARE * (disk.used + disk.free)
-    return Check(what, "note" if is_low else "ok", found, "`league retire` removes old files" if is_low else "")
+    return Check(what, "note" if is_low else "ok", free_space, "`league retire` removes old files" if is_low else "")
 
 
 def _registry() -> Iterator[Check]:
@@ -201,10 +201,10 @@ def _ports() -> Iterator[Check]:
     for name, section, option in (("HTTP", "http_options", "--port"), ("gRPC", "grpc_options", "--grpc-port")):
         if section in document:
             port = document[section]["port"]
-            taken = _is_taken(port)
-            found = f"port {port} is {'in use' if taken else 'free'}"
-            advice = f"unless this is your policy server, use `league serve {option} PORT`" if taken else ""
-            yield Check(f"serving {name}", "note" if taken else "ok", found, advice)
+            is_taken = _is_taken(port)
+            port_state = f"port {port} is {'in use' if is_taken else 'free'}"
+            advice = f"unless this is your policy server, use `league serve {option} PORT`" if is_taken else ""
+            yield Check(f"serving {name}", "note" if is_taken else "ok", port_state, advice)
 
 
 def _is_taken(port: int) -> bool:

@@ -34,7 +34,7 @@ notes are untrusted: text after them could look like another one."""
 def emit(document: Any) -> None:
     """Print one JSON document and nothing else."""
     text = orjson.dumps(document, option=orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY).decode()
-    print(CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text), file=_documents, flush=True)
+    print(CONTROL.sub(lambda match: f"\\u{ord(match[0]):04x}", text), file=_documents, flush=True)
 
 
 _documents: TextIO | None = None
@@ -97,14 +97,14 @@ def table(
         optional: Columns that are left out if no row has a value.
     """
     by_column = list(zip(*rows, strict=True)) or [()] * len(columns)
-    first, *others = [
+    first, *other_columns = [
         _Column(name, values)
         for name, values in zip(columns, by_column, strict=True)
         if name not in optional or any(value not in (None, "") for value in values)
     ]
     label = min(first.width, console.width // 2)
     blocks: list[list[tuple[_Column, int]]] = [[(first, label)]]
-    for column in others:
+    for column in other_columns:
         width = min(column.least if column.name in prose else column.width, console.width - label - GAP)
         if len(blocks[-1]) > 1 and _total(blocks[-1]) + GAP + width > console.width:
             blocks.append([(first, label)])
@@ -133,12 +133,12 @@ def _total(block: Sequence[tuple[_Column, int]]) -> int:
 
 def _widened(block: Sequence[tuple[_Column, int]], limit: int) -> list[tuple[_Column, int]]:
     """Give the rest of the line to the columns that are narrower than their text, from left to right."""
-    spare, found = limit - _total(block), []
+    spare, widened_block = limit - _total(block), []
     for column, width in block:
         more = min(spare, column.width - width)
         spare -= more
-        found.append((column, width + more))
-    return found
+        widened_block.append((column, width + more))
+    return widened_block
 
 
 def _print_block(block: Sequence[tuple[_Column, int]]) -> None:
@@ -269,7 +269,16 @@ def show_leaderboard(leaderboard: "tuple[Standing, ...]", explanation: str | Non
     """Print a leaderboard. explanation: why its first is not the champion."""
     table(
         ("contestant", "rating [95 %]", "score", "mean return", "games"),
-        [(each.ref, elo(each.rating, each.interval), each.score, each.mean_return, each.games) for each in leaderboard],
+        [
+            (
+                standing.ref,
+                elo(standing.rating, standing.interval),
+                standing.score,
+                standing.mean_return,
+                standing.games,
+            )
+            for standing in leaderboard
+        ],
     )
     if explanation:
         say(explanation)
@@ -282,9 +291,9 @@ def verdict(report: "VerdictReport") -> str:
     games = f"after {report.games} games ({report.unique_games} unique), score {score}"
     place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
     gap = f", returns differ by {difference(report.difference)}" if report.difference else ""
-    anchors = "".join(f"; {wording.against_anchor(each, report.opponent, report.model)}" for each in report.anchors)
+    anchors = "".join(f"; {wording.against_anchor(anchor, report.opponent, report.model)}" for anchor in report.anchors)
     exploiters = "".join(
-        f"; {wording.against_exploiter(each, report.opponent, report.model)}" for each in report.exploiters
+        f"; {wording.against_exploiter(exploiter, report.opponent, report.model)}" for exploiter in report.exploiters
     )
     exploiters += "" if report.exploitability is None else f"; {_exploitability(report.exploitability, report.model)}"
     who = f"{short_verdict(report.verdict)}: {report.candidate} against {report.opponent}"
@@ -294,11 +303,11 @@ def verdict(report: "VerdictReport") -> str:
 
 def _exploitability(test: "ExploitabilityReport", model: str) -> str:
     """`not more exploitable than connect_four@1 by … after 600 games: a best response scores at least 0.48 (…), …`"""
-    found = wording.exploitability(test, model)
+    sentence = wording.exploitability(test, model)
     if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
-        return found
+        return sentence
     return (
-        f"{found}: a best response scores at least {test.candidate.bound:.3f} (that to {test.ref}:"
+        f"{sentence}: a best response scores at least {test.candidate.bound:.3f} (that to {test.ref}:"
         f" {test.champion.bound:.3f}), its exploiters achieve {difference(test.difference_over_exploiters)} more"
     )
 

@@ -81,11 +81,11 @@ def default_selection(is_unseen: bool, sides: int) -> ActionSelection:
 
 def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
     """Return a human-readable sentence: how versions select actions, and why."""
-    chosen, algorithm = action_selection(config, interface), config.training.algorithm
-    if chosen == "sampled" and algorithm in VALUE_BASED:
+    selection, algorithm = action_selection(config, interface), config.training.algorithm
+    if selection == "sampled" and algorithm in VALUE_BASED:
         return f"Versions play with greedy actions: those of {algorithm} have no action distribution."
     if config.play.actions is not None:
-        return f"Versions play with {chosen} actions, as play.actions says."
+        return f"Versions play with {selection} actions, as play.actions says."
     if len(interface.sides) == 1:
         reason = "there is only one side"
     elif interface.hidden_information:
@@ -94,7 +94,7 @@ def describe_selection(config: "LeagueConfig", interface: "Interface") -> str:
         reason = "opponents act at once, without seeing the other's action"
     else:
         reason = "the environment is not known to hide information"
-    return f"Versions play with {chosen} actions: {reason} (play.actions)."
+    return f"Versions play with {selection} actions: {reason} (play.actions)."
 
 
 def declares_information(env: Any) -> bool:

@@ -78,7 +78,7 @@ def import_entry_point(key: str, entry_point: str, folder: str | None = None) ->
 def missing(module: ModuleType, name: str) -> str:
     """`'game' (/home/ann/game.py) has no 'make_en', did you mean 'make_env'?`"""
     close = difflib.get_close_matches(name, vars(module), n=1)
-    guess = "".join(f", did you mean {each!r}?" for each in close)
+    guess = "".join(f", did you mean {similar_name!r}?" for similar_name in close)
     return f"{module.__name__!r} ({getattr(module, '__file__', 'built in')}) has no {name!r}{guess}"
 
 
@@ -104,15 +104,15 @@ def _several(key: str, module: str, files: Iterable[str]) -> str:
 
 def _import_own(key: str, package: str, folders: Sequence[str]) -> None:
     """Import a top-level module or package if one of the folders contains it."""
-    found = {os.path.realpath(str(spec.origin)): spec for folder in folders if (spec := module_in(folder, package))}
+    specs = {os.path.realpath(str(spec.origin)): spec for folder in folders if (spec := module_in(folder, package))}
     present = sys.modules.get(package)
     loaded = getattr(present, "__file__", None)
-    files = dict.fromkeys([*found, *([os.path.realpath(loaded)] if loaded and found else [])])
+    files = dict.fromkeys([*specs, *([os.path.realpath(loaded)] if loaded and specs else [])])
     if len(files) > 1:
         raise ConfigError(_several(key, package, files))
-    if not found or present is not None:
+    if not specs or present is not None:
         return
-    (spec,) = found.values()
+    (spec,) = specs.values()
     module = module_from_spec(spec)
     sys.modules[package] = module
     try:

@@ -46,8 +46,8 @@ class EnvironmentCode:
 
 def module_in(folder: str, name: str) -> ModuleSpec | None:
     """Find a module or package in a folder, without importing it; None if the folder does not contain it."""
-    found = FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name)
-    return found if found is not None and found.loader is not None else None
+    spec = FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name)
+    return spec if spec is not None and spec.loader is not None else None
 
 
 @cache
@@ -65,14 +65,14 @@ def environment_code(entry_point: str, folder: str | None = None) -> Environment
     package = start.partition(".")[0]
     is_in_folder = folder is not None and module_in(folder, package) is not None
     libraries, files, texts = dict[str, str](), dict[str, str](), dict[str, str]()
-    seen, waiting = set[str](), [start]
+    visited_names, waiting = set[str](), [start]
     while waiting:
         name = waiting.pop()
         top = name.partition(".")[0]
         is_own = top == package and is_in_folder
-        if name in seen or top in WITHOUT_INFLUENCE or (top in sys.stdlib_module_names and not is_own):
+        if name in visited_names or top in WITHOUT_INFLUENCE or (top in sys.stdlib_module_names and not is_own):
             continue
-        seen.add(name)
+        visited_names.add(name)
         spec = _spec(name, folder, is_own=is_own)
         if spec is None or not spec.origin or not Path(spec.origin).is_file():
             continue
@@ -113,11 +113,11 @@ def _spec(name: str, folder: str | None, *, is_own: bool) -> ModuleSpec | None:
         if in_folder is not None and is_own:
             return in_folder
         try:
-            found = find_spec(name)
+            spec = find_spec(name)
         except ValueError:  # A module without a specification, such as __main__.
-            found = None
-        is_library = found is not None and found.origin is not None and bool(_versions(name, Path(found.origin)))
-        return found if in_folder is None or is_library else in_folder
+            spec = None
+        is_library = spec is not None and spec.origin is not None and bool(_versions(name, Path(spec.origin)))
+        return spec if in_folder is None or is_library else in_folder
     above = _spec(parent, folder, is_own=is_own)
     folders = above.submodule_search_locations if above else None
     specs = (FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(name) for folder in folders or ())

@@ -86,8 +86,8 @@ def file_sha256(path: Path) -> str:
 
 def files_in(directory: Path) -> list[str]:
     """Return the relative paths of all files in `directory`, sorted. A symbolic link counts as a file."""
-    found = [path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir()]
-    return sorted(path.relative_to(directory).as_posix() for path in found)
+    paths = [path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir()]
+    return sorted(path.relative_to(directory).as_posix() for path in paths)
 
 
 def digests_of(directory: Path, names: Iterable[str]) -> dict[str, str]:

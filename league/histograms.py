@@ -27,7 +27,7 @@ class Histogram:
 
     def merge(self, counts: Sequence[int], ns: int) -> None:
         """Add the counts and the sum of another histogram."""
-        self.counts = [mine + other for mine, other in zip(self.counts, counts, strict=True)]
+        self.counts = [count + other_count for count, other_count in zip(self.counts, counts, strict=True)]
         self.ns += ns
 
     @property
@@ -40,11 +40,11 @@ class Histogram:
 
         None if the histogram is empty; infinity in the last bucket.
         """
-        wanted, seen = share * self.count, 0
+        rank, cumulative_count = share * self.count, 0
         if not self.count:
             return None
         for bound, count in zip(BOUNDS, self.counts, strict=False):
-            seen += count
-            if seen >= wanted:
+            cumulative_count += count
+            if cumulative_count >= rank:
                 return bound / 1000
         return float("inf")

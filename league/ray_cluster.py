@@ -264,24 +264,24 @@ def check_stacks() -> None:
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    here, others = ray.get_runtime_context().get_node_id(), []
+    local_node_id, remote_reads = ray.get_runtime_context().get_node_id(), []
     read = ray.remote(num_cpus=0, max_retries=0)(installed_with_this)
     for node in usable_nodes():
-        if node["NodeID"] != here:
+        if node["NodeID"] != local_node_id:
             there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-            others.append(
+            remote_reads.append(
                 (node["NodeID"], node["NodeManagerAddress"], read.options(scheduling_strategy=there).remote())
             )
-    for node_id, address, ref in others:
+    for node_id, address, ref in remote_reads:
         try:
-            found = ray.get(ref, timeout=NODE_TIMEOUT)
+            remote_stack = ray.get(ref, timeout=NODE_TIMEOUT)
         except ray.exceptions.TaskUnschedulableError:  # it is drained, or has left
             continue
         except ray.exceptions.RayError as error:
             if node_id not in node_ids():
                 continue
             raise ConfigError(f"node {address} does not run this program: {one_line(error)}") from error
-        check_stack(found, address)
+        check_stack(remote_stack, address)
 
 
 def check_stack(found: dict[str, str], machine: str) -> None:

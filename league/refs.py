@@ -156,10 +156,10 @@ class RemoteRef:
     def parse(cls, text: str) -> "RemoteRef":
         if len(text) > MAX_MODEL_URL:
             raise InvalidReference(f"{text[:32]!r}… has {len(text)} characters, expected at most {MAX_MODEL_URL}")
-        found = MODEL_URL.fullmatch(text)
-        if found is None or re.search(r"[{}]", found["model"].replace(POLICY, "")):
+        match = MODEL_URL.fullmatch(text)
+        if match is None or re.search(r"[{}]", match["model"].replace(POLICY, "")):
             raise InvalidReference(f"{text!r} is not the URL of a model: expected http://HOST:PORT/v2/models/NAME")
-        return cls(found["server"], found["model"], found["version"], found["digest"])
+        return cls(match["server"], match["model"], match["version"], match["digest"])
 
     @property
     def default(self) -> "RemoteRef":
@@ -213,22 +213,22 @@ def parse_mixture(text: str) -> dict[CheckpointRef, float]:
 
     Raises InvalidReference. The probabilities are not checked.
     """
-    found: dict[CheckpointRef, float] = {}
+    probabilities: dict[CheckpointRef, float] = {}
     for part in text.split(","):
         written, colon, share = part.strip().rpartition(":")
         if not colon:
             raise InvalidReference(f"{part.strip()!r} has no probability: expected LEAGUE@VERSION:PROBABILITY")
-        first = next(iter(found), None)
+        first = next(iter(probabilities), None)
         ref = CheckpointRef.parse(written if first is None else of_league(written, first.league))
         if first is not None and ref.league != first.league:
             raise InvalidReference(f"{ref} is not a version of league {first.league}: a mixture has one league")
-        if ref in found:
+        if ref in probabilities:
             raise InvalidReference(f"{ref} is twice in the mixture")
         try:
-            found[ref] = float(share)
+            probabilities[ref] = float(share)
         except ValueError:
             raise InvalidReference(f"{share!r} is not a probability: expected {ref}:PROBABILITY") from None
-    return found
+    return probabilities
 
 
 def of_league(ref: str, league: str) -> str:

@@ -82,6 +82,6 @@ def _artifacts(value: str) -> Path | str:
     if not separator:
         return Path(value).expanduser().absolute()
     if scheme not in OBJECT_STORES or not location.strip("/"):
-        known = ", ".join(f"{each}://BUCKET/PREFIX" for each in OBJECT_STORES)
-        raise ConfigError(f"LEAGUE_ARTIFACTS={value}: expected a directory or one of {known}")
+        expected_forms = ", ".join(f"{store}://BUCKET/PREFIX" for store in OBJECT_STORES)
+        raise ConfigError(f"LEAGUE_ARTIFACTS={value}: expected a directory or one of {expected_forms}")
     return value.rstrip("/")

@@ -50,8 +50,8 @@ def difference(found: dict[str, str]) -> tuple[str, str, str] | None:
 
 
 def _versions(*packages: str) -> dict[str, str]:
-    found = {package: _installed_version(package) for package in packages}
-    return {package: number for package, number in found.items() if number is not None}
+    versions = {package: _installed_version(package) for package in packages}
+    return {package: number for package, number in versions.items() if number is not None}
 
 
 @cache

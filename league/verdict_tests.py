@@ -109,11 +109,12 @@ class CompanionTests:
         trained = settings.get("exploitability")
         return cls(
             anchors=tuple(
-                AnchorTest(each["ref"], each["margin"], each["schedule"], each.get("mode", "at_least"))
-                for each in anchors
+                AnchorTest(anchor["ref"], anchor["margin"], anchor["schedule"], anchor.get("mode", "at_least"))
+                for anchor in anchors
             ),
             exploiters=tuple(
-                ExploiterTest(each["ref"], each["exploits"], each["margin"], each["schedule"]) for each in exploiters
+                ExploiterTest(exploiter["ref"], exploiter["exploits"], exploiter["margin"], exploiter["schedule"])
+                for exploiter in exploiters
             ),
             exploitability=None if trained is None else ExploitabilityTest.of_record(trained),
             awaits_exploiters="exploitability" in settings and trained is None,
@@ -123,8 +124,8 @@ class CompanionTests:
     def to_settings(self) -> dict[str, Any]:
         """Return the settings in which the tests are recorded. The inverse of `of_settings`."""
         settings: dict[str, Any] = {
-            "anchors": [asdict(each) for each in self.anchors],
-            "exploiters": [asdict(each) for each in self.exploiters],
+            "anchors": [asdict(anchor) for anchor in self.anchors],
+            "exploiters": [asdict(exploiter) for exploiter in self.exploiters],
         }
         if self.exploitability is not None:
             settings["exploitability"] = self.exploitability.to_record()
@@ -155,4 +156,4 @@ class CompanionTests:
         """References of all anchors and exploiters."""
         last = self.exploitability
         trained = () if last is None else (*last.of_candidate, *last.of_champion)
-        return {*(each.ref for each in self.anchors), *(each.ref for each in self.exploiters), *trained}
+        return {*(anchor.ref for anchor in self.anchors), *(exploiter.ref for exploiter in self.exploiters), *trained}

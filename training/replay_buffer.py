@@ -63,13 +63,13 @@ class SumTree:
     def find(self, sums: NDArray) -> NDArray:
         """Return the leaves (k,) in which cumulative sums (k,), each in [0, total), lie."""
         nodes = np.ones(len(sums), dtype=np.int64)
-        rest = np.array(sums, dtype=np.float64)
+        remainders = np.array(sums, dtype=np.float64)
         for _ in range(self._depth):
             nodes <<= 1
-            left, right = self._nodes[nodes], self._nodes[nodes + 1]
+            left_sums, right_sums = self._nodes[nodes], self._nodes[nodes + 1]
             # Rounded sums may slightly exceed the total: never select a subtree of sum 0.
-            goes_right = (rest >= left) & (right > 0)
-            rest -= left * goes_right
+            goes_right = (remainders >= left_sums) & (right_sums > 0)
+            remainders -= left_sums * goes_right
             nodes += goes_right
         return nodes - self._first
 
@@ -208,14 +208,14 @@ class ReplayBuffer:
     def rows(self, indices: NDArray, *, n_step: int = 1, gamma: float = 1.0) -> Rows:
         """Return the transitions that start at `indices`, (k,)."""
         lasts, steps, rewards = self._returns(indices, n_step, gamma)
-        found: Rows = {}
+        rows: Rows = {}
         for name, column in self._columns.items():
             if name.startswith(REWARDS):
-                found[name] = rewards[name]
+                rows[name] = rewards[name]
             else:
-                found[name] = column[lasts if name.startswith((NEXT, *FLAGS)) else indices]
-        found[DISCOUNTS] = (gamma**steps).astype(np.float32)
-        return found
+                rows[name] = column[lasts if name.startswith((NEXT, *FLAGS)) else indices]
+        rows[DISCOUNTS] = (gamma**steps).astype(np.float32)
+        return rows
 
     def prioritize(self, indices: NDArray, errors: NDArray) -> None:
         """Set the priorities of rows (k,) to (|error| + MIN_PRIORITY)^α. Does nothing if uniform."""
@@ -258,8 +258,8 @@ class ReplayBuffer:
             self._newest = dict(zip(streams.tolist(), newest.tolist(), strict=True))
             if self._tree is not None:
                 # Without saved priorities, all rows have the same.
-                known = kept["priorities"] if "priorities" in kept.files else self._largest
-                self._tree.set(np.arange(len(self)), known)
+                priorities = kept["priorities"] if "priorities" in kept.files else self._largest
+                self._tree.set(np.arange(len(self)), priorities)
 
     def _link(self, block: TransitionBlock) -> None:
         """Store each row as the successor of the previous one in its stream, and its position in the episode."""

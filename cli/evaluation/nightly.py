@@ -252,11 +252,11 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
         from training.runs.parent import start_version
         from training.runs.train import train as run
 
-        wanted = None if parent is None else CheckpointRef(config.league, parent)
+        parent_ref = None if parent is None else CheckpointRef(config.league, parent)
         exploited = None if target is None else CheckpointRef.parse(target)
-        start = None if wanted is None else start_version(registry, wanted, config, exploited)
-        if start != wanted and exploited is None and not quiet:
-            say(f"{wanted} was imported and cannot be trained further: training starts from {start or 'scratch'}")
+        start = None if parent_ref is None else start_version(registry, parent_ref, config, exploited)
+        if start != parent_ref and exploited is None and not quiet:
+            say(f"{parent_ref} was imported and cannot be trained further: training starts from {start or 'scratch'}")
         with games.paused(), strength_process(registry.storage) as measure:
             run(
                 config,
@@ -286,12 +286,12 @@ def summary_of_night(night: "TrainingNightRow") -> list[str]:
     versions = night.steps["train"]["versions"]
     start = "from scratch" if night.start is None else f"from {night.league}@{night.start}"
     sentences = [f"{night.league}: night {night.number} trained {', '.join(versions) or 'no version'} {start}."]
-    if (found := night.steps["measure"]["exploitability"]) is not None:
-        best = found["exploiters"][0]
+    if (exploitability := night.steps["measure"]["exploitability"]) is not None:
+        best = exploitability["exploiters"][0]
         gain = "" if best["gain"] is None else f", return gain {difference(Difference(**best['gain']))}"
         sentences.append(
-            f"{found['ref']}: {best['ref']} scores {best['score']:.3f} [{best['low']:.3f}, {best['high']:.3f}] against"
-            f" it{gain}. A best response scores at least {found['bound']:.3f}."
+            f"{exploitability['ref']}: {best['ref']} scores {best['score']:.3f} [{best['low']:.3f}, {best['high']:.3f}]"
+            f" against it{gain}. A best response scores at least {exploitability['bound']:.3f}."
         )
     return sentences
 

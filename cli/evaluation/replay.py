@@ -89,7 +89,12 @@ def _ending(source: "GameSource", done: "VideoSummary") -> str:
         got = [f"{agent} ({ref}) {done.returns[agent]:+g}" for agent, ref in source.controllers.items()]
     else:
         controllers = source.controllers
-        own = {ref: [agent for agent in controllers if controllers[agent] == ref] for ref in controllers.values()}
-        got = [f"{ref} {sum(map(done.returns.__getitem__, a)) / len(a):+.3g} on average" for ref, a in own.items()]
+        agents_by_ref = {
+            ref: [agent for agent in controllers if controllers[agent] == ref] for ref in controllers.values()
+        }
+        got = [
+            f"{ref} {sum(map(done.returns.__getitem__, a)) / len(a):+.3g} on average"
+            for ref, a in agents_by_ref.items()
+        ]
     note = f"; {source.note}" if source.note and done.is_whole else ""
     return f"{done.steps} steps; returns: {', '.join(got)}{note}"

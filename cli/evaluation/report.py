@@ -38,11 +38,11 @@ def report(
         return
     out = out or Path(f"{league}-report.html")
     with console.status(f"reading {league}"):
-        found = league_report(registry, league)
-    write(found, out)
-    counts = (found.games, "game"), (len(found.verdicts), "verdict"), (len(found.upsets), "upset")
+        content = league_report(registry, league)
+    write(content, out)
+    counts = (content.games, "game"), (len(content.verdicts), "verdict"), (len(content.upsets), "upset")
     say(f"{out}: {', '.join(counted(number, noun) for number, noun in counts)}.")
-    if found.games:
+    if content.games:
         warn_of_changed_game(registry, league)
-    for sentence in found.left_out:
+    for sentence in content.left_out:
         say(sentence)

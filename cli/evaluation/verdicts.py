@@ -22,18 +22,21 @@ def verify(
     from evaluation.gating.verification import verify as run
     from league.registry.verdicts import VOID
 
-    found = run(verdict, registry=open_registry(), replays=replays)
+    verification = run(verdict, registry=open_registry(), replays=replays)
     if as_json:
-        emit(found.to_json())
+        emit(verification.to_json())
         return
-    say(f"{found.outcome}: {found.matches} matches follow the schedule, {found.numbers} recorded numbers reproduced.")
-    say(found.reason)
-    if found.remedy:
-        say(found.remedy)
-    if found.replayed:
-        say(f"{counted(found.replayed, 'game')} replayed with identical results.")
-    if not found.is_current:
-        games = "Its" if found.outcome == VOID else "The verdict stands, but its"
+    say(
+        f"{verification.outcome}: {verification.matches} matches follow the schedule,"
+        f" {verification.numbers} recorded numbers reproduced."
+    )
+    say(verification.reason)
+    if verification.remedy:
+        say(verification.remedy)
+    if verification.replayed:
+        say(f"{counted(verification.replayed, 'game')} replayed with identical results.")
+    if not verification.is_current:
+        games = "Its" if verification.outcome == VOID else "The verdict stands, but its"
         say(f"The league's game or selection of actions has changed since. {games} games count in no current rating.")
 
 

@@ -25,11 +25,11 @@ def compare(
     """
     from evaluation.reporting.run_comparison import compare_runs
 
-    found = compare_runs(open_registry(), run_a, run_b)
+    comparison = compare_runs(open_registry(), run_a, run_b)
     if as_json:
-        emit(found.to_json())
+        emit(comparison.to_json())
     else:
-        _show(found)
+        _show(comparison)
 
 
 def _show(found: "RunComparison") -> None:

@@ -55,7 +55,7 @@ def init(
     from league.environments.conformance.proposal import propose
     from league.files import disk_errors, replacing
 
-    kwargs = dict(_pair(each) for each in argument or ())
+    kwargs = dict(_pair(text) for text in argument or ())
     league = check_slug("league", name or _name(entry_point, kwargs))
     path = output or Path(f"{league}.yaml")
     folder = path.resolve().parent
@@ -75,19 +75,19 @@ def init(
         )
     with disk_errors(path, action="written"), replacing(path) as part:
         part.write_text(proposal.text, encoding="utf-8")
-    found = proposal.found
-    say(found.policies)
-    say(found.actions)
-    if found.views and len(proposal.config.sides or ()) != 1:
-        say(found.views)
-    if proposal.config.play.actions == "greedy" and found.openings is not None:
-        say(str(found.openings))
-    for finding in found.findings:
+    examination = proposal.found
+    say(examination.policies)
+    say(examination.actions)
+    if examination.views and len(proposal.config.sides or ()) != 1:
+        say(examination.views)
+    if proposal.config.play.actions == "greedy" and examination.openings is not None:
+        say(str(examination.openings))
+    for finding in examination.findings:
         if "play.opening_plies" not in finding.text:  # the file sets it
             say(f"Note: {finding}")
-    if team is None and found.is_team:
+    if team is None and examination.is_team:
         say("The file makes all agents one team. If they are opponents, use --no-team.")
-    elif team is None and any("one team" in finding.text for finding in found.findings):
+    elif team is None and any("one team" in finding.text for finding in examination.findings):
         say("The file makes each agent a side of its own. If they are one team, use --team.")
     say(f"Wrote {path}. Next: league train {shlex.quote(str(path))}")
 
@@ -120,7 +120,7 @@ def _search(entry_point: str, folder: Path) -> tuple[str, str | None]:
     """
     from league.environment_code import module_in
 
-    package, here = entry_point.partition(":")[0].partition(".")[0], Path.cwd()
-    if package.isidentifier() and not module_in(str(folder), package) and module_in(str(here), package):
-        return str(here), os.path.relpath(here, folder)
+    package, working_directory = entry_point.partition(":")[0].partition(".")[0], Path.cwd()
+    if package.isidentifier() and not module_in(str(folder), package) and module_in(str(working_directory), package):
+        return str(working_directory), os.path.relpath(working_directory, folder)
     return str(folder), None

@@ -29,15 +29,15 @@ def list_(as_json: AsJson = False) -> None:
         ("league", "versions", "champion", "last verdict", "last night", "state"),
         [
             (
-                each["league"],
-                each["versions"],
-                None if each["champion"] is None else f"@{each['champion']}",
-                each["last_verdict"]
-                and f"{short_verdict(each['last_verdict']['verdict'])} {each['last_verdict']['outcome']}",
-                each["last_night"] and f"{each['last_night'].astimezone():%Y-%m-%d}",
-                each["archived_at"] and "archived",
+                document["league"],
+                document["versions"],
+                None if document["champion"] is None else f"@{document['champion']}",
+                document["last_verdict"]
+                and f"{short_verdict(document['last_verdict']['verdict'])} {document['last_verdict']['outcome']}",
+                document["last_night"] and f"{document['last_night'].astimezone():%Y-%m-%d}",
+                document["archived_at"] and "archived",
             )
-            for each in documents
+            for document in documents
         ],
         optional=("state",),
     )

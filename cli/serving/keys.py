@@ -105,7 +105,7 @@ def revoke(
         emit(_document(key))
     else:
         say(f"Revoked the key {key.name}.")
-        if not any(_state(each) == "valid" for each in keys.all()):
+        if not any(_state(stored_key) == "valid" for stored_key in keys.all()):
             say("No valid key is left. Servers continue to require one: league keys create NAME --scope SCOPE")
 
 
@@ -122,15 +122,15 @@ def _state(key: "KeyRow") -> str:
 
 
 def _duration(text: str) -> timedelta:
-    found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
-    if not found:
+    match = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
+    if not match:
         raise InvalidInput(f"--expires {text!r}: expected a number of minutes, hours, days or weeks, such as 30d")
-    return int(found[1]) * DURATIONS[found[2]]
+    return int(match[1]) * DURATIONS[match[2]]
 
 
 def _rate(text: str) -> float:
     """Requests per second."""
-    found = re.fullmatch(r"([1-9][0-9]{0,8})/([smh])", text)
-    if not found:
+    match = re.fullmatch(r"([1-9][0-9]{0,8})/([smh])", text)
+    if not match:
         raise InvalidInput(f"--rate {text!r}: expected a number per second, minute or hour, such as 100/s")
-    return int(found[1]) / PERIODS[found[2]]
+    return int(match[1]) / PERIODS[match[2]]

@@ -24,11 +24,11 @@ def replicas(
     from league.registry.replicas import LIVENESS_TIMEOUT
 
     repository = open_registry().replicas
-    found = {each.replica: each for each in repository.registered()}
+    registrations = {registration.replica: registration for registration in repository.registered()}
     if remove is not None:
-        if remove not in found:
-            raise NotFound(f"there is no replica {remove!r}; known: {', '.join(found) or 'none'}")
-        if (silence := found[remove].silence) < LIVENESS_TIMEOUT:
+        if remove not in registrations:
+            raise NotFound(f"there is no replica {remove!r}; known: {', '.join(registrations) or 'none'}")
+        if (silence := registrations[remove].silence) < LIVENESS_TIMEOUT:
             raise Conflict(f"replica {remove} reported {silence.total_seconds():.0f} s ago: stop it instead")
         repository.remove(remove)
         say(f"Removed replica {remove}.")
@@ -38,18 +38,22 @@ def replicas(
             {
                 "replicas": [
                     {
-                        "replica": each.replica,
-                        "seen_at": each.seen_at,
-                        "silent_seconds": each.silence.total_seconds(),
-                        "silent": each.silence >= LIVENESS_TIMEOUT,
+                        "replica": registration.replica,
+                        "seen_at": registration.seen_at,
+                        "silent_seconds": registration.silence.total_seconds(),
+                        "silent": registration.silence >= LIVENESS_TIMEOUT,
                     }
-                    for each in found.values()
+                    for registration in registrations.values()
                 ]
             }
         )
         return
     rows = [
-        (each.replica, each.seen_at, "silent" if each.silence >= LIVENESS_TIMEOUT else "reports")
-        for each in found.values()
+        (
+            registration.replica,
+            registration.seen_at,
+            "silent" if registration.silence >= LIVENESS_TIMEOUT else "reports",
+        )
+        for registration in registrations.values()
     ]
     table(("replica", "last report", "state"), rows)

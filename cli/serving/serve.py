@@ -73,7 +73,7 @@ def hints(registry: "Registry", url: str) -> str:
 
     The league is the one whose champion was promoted last.
     """
-    promoted = {league: found.event for (league, alias), found in registry.aliases.all().items() if alias == CHAMPION}
+    promoted = {league: target.event for (league, alias), target in registry.aliases.all().items() if alias == CHAMPION}
     newest = max(promoted, key=lambda league: promoted[league], default=None)
     model = newest or "LEAGUE"
     called = url.replace("//0.0.0.0:", "//127.0.0.1:")

@@ -62,17 +62,17 @@ def traffic(
     """
     registry = open_registry()
     check_slug("league", league)
-    given = (canary, share, shadow, shadow_share)
-    if off and any(option is not None for option in given):
+    options = (canary, share, shadow, shadow_share)
+    if off and any(option is not None for option in options):
         raise InvalidInput("--off removes canary and shadow and cannot be combined with their options")
-    if not off and all(option is None for option in given):
+    if not off and all(option is None for option in options):
         _show(registry, league, as_json)
         return
-    now = registry.traffic.current(league)
+    current = registry.traffic.current(league)
     setting = registry.traffic.set(
         league,
-        canary=None if off else _portion(league, "--canary", canary, share, now.canary, CANARY_SHARE),
-        shadow=None if off else _portion(league, "--shadow", shadow, shadow_share, now.shadow, SHADOW_SHARE),
+        canary=None if off else _portion(league, "--canary", canary, share, current.canary, CANARY_SHARE),
+        shadow=None if off else _portion(league, "--shadow", shadow, shadow_share, current.shadow, SHADOW_SHARE),
         actor=actor or getpass.getuser(),
         reason=reason,
     )

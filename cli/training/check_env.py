@@ -37,17 +37,17 @@ def check_env(
 
     league = LeagueConfig.load(find(config))
     with progress(f"checking {league.environment.entry_point}") as show:
-        found = examine(league, episodes, steps, seed, seconds=seconds, progress=show)
-    if found.interface is not None:
-        for error in errors_of_contestants(league, found.interface, open_registry):
-            found.add("fault", str(error))
+        examination = examine(league, episodes, steps, seed, seconds=seconds, progress=show)
+    if examination.interface is not None:
+        for error in errors_of_contestants(league, examination.interface, open_registry):
+            examination.add("fault", str(error))
     if as_json:
-        document = asdict(replace(found, interface=None))
+        document = asdict(replace(examination, interface=None))
         del document["interface"]
-        emit(document | {"passed": found.passed})
+        emit(document | {"passed": examination.passed})
     else:
-        _show(league, found)
-    raise typer.Exit(0 if found.passed else 1)
+        _show(league, examination)
+    raise typer.Exit(0 if examination.passed else 1)
 
 
 def _show(league: "LeagueConfig", found: "Examination") -> None:

@@ -42,7 +42,7 @@ def runs(
                 row.role if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}",
                 row.steps,
                 f"{row.seconds / 60:.1f}",
-                "; ".join(_score(each, league) for each in strength[row.id]),
+                "; ".join(_score(measurement, league) for measurement in strength[row.id]),
             )
             for row in rows
         ],
@@ -64,5 +64,5 @@ def _score(row: "StrengthRow", league: str) -> str:
 def _run_document(row: "RunRow", strength: "Sequence[StrengthRow]") -> dict[str, object]:
     names = "state", "role", "exploits", "algorithm", "seed", "steps", "target", "seconds", "parent", "error"
     times = "began_at", "heartbeat_at", "ended_at"
-    scores = [asdict(each) for each in strength]
+    scores = [asdict(measurement) for measurement in strength]
     return {"run": row.id} | {name: getattr(row, name) for name in (*names, *times)} | {"strength": scores}

@@ -62,12 +62,12 @@ def promote(
     """
     registry = open_registry()
     check_alias(alias)
-    wanted = None if expected is None else (_expected(expected),)
+    expectation = None if expected is None else (_expected(expected),)
     version = _mixture(registry, ref) if is_mixture(ref) else registry.versions.resolve(CheckpointRef.parse(ref))
     for number in (version.number, *(version.mixture.versions if version.mixture else ())):
         registry.artifacts.check_exists(version.league, number)
     current = registry.aliases.current(version.league).get(alias)
-    before = current if wanted is None else wanted[0]
+    before = current if expectation is None else expectation[0]
     if alias == CHAMPION and not yes and version.number != current:
         registry.aliases.check(version.league, alias, version.number, expected=before)
         _confirm(registry, version, as_json)
@@ -140,20 +140,30 @@ def mixture(
     registry = open_registry()
     conditions = registry.leagues.get(check_slug("league", league)).conditions
     refs = [row.ref for row in eligible(registry, league)]
-    found = meta_strategy(refs, Ledger(registry).results(league, conditions), method)
-    probable = ((ref, share) for ref, share in zip(found.refs, found.probabilities, strict=True) if share > 0)
+    equilibrium = meta_strategy(refs, Ledger(registry).results(league, conditions), method)
+    probable = (
+        (ref, share) for ref, share in zip(equilibrium.refs, equilibrium.probabilities, strict=True) if share > 0
+    )
     kept = {ref: share for ref, share in probable if share >= at_least}
     if not kept:
-        highest = max(found.probabilities, default=0.0)
+        highest = max(equilibrium.probabilities, default=0.0)
         raise InvalidInput(
             f"--at-least {at_least:g}: no version is as probable; the highest probability is {highest:.3f}"
         )
     shares = {ref: share / sum(kept.values()) for ref, share in kept.items()}
     if not as_json:
-        _show(found, shares)
+        _show(equilibrium, shares)
     if alias is None:
         if as_json:
-            emit({"league": league, "method": method, "games": found.games, "unmet": found.unmet, "members": shares})
+            emit(
+                {
+                    "league": league,
+                    "method": method,
+                    "games": equilibrium.games,
+                    "unmet": equilibrium.unmet,
+                    "members": shares,
+                }
+            )
         return
     if not yes:
         if as_json or not sys.stdin.isatty():
@@ -249,7 +259,7 @@ def history(
     events = registry.aliases.history(check_slug("league", league), check_alias(alias), when)
     mixtures = registry.versions.mixtures(league, {event.version for event in events})
     if as_json:
-        members = {number: [each.model_dump() for each in one.members] for number, one in mixtures.items()}
+        members = {number: [member.model_dump() for member in one.members] for number, one in mixtures.items()}
         documents = [asdict(event) | {"members": members.get(event.version)} for event in events]
         emit({"league": league, "alias": alias, "events": documents})
         return

@@ -45,7 +45,7 @@ def import_model(
 
     registry = open_registry()
     interface = registry.leagues.get(check_slug("league", league)).interface
-    modules = dict(_pair(each) for each in policy or ())
+    modules = dict(_pair(text) for text in policy or ())
     kind: SourceKind | None = "rllib" if rllib else "sb3" if sb3 else None
     sources, digest = open_sources(source, interface, kind=kind, mapping=mapping, modules=modules, trust=trust)
     version = publish(league, sources, digest=digest, registry=registry)

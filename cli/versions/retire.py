@@ -42,7 +42,7 @@ def retire(
     before = datetime.now(UTC) - timedelta(days=days)
     names = [check_slug("league", name) for name in leagues or ()] or list(registry.leagues.names())
     plans = [registry.retention.plan(name, keep=keep, before=before) for name in names]
-    replicas = {each.replica for each in registry.replicas.registered()}
+    replicas = {registration.replica for registration in registry.replicas.registered()}
     old_logs = former_logs(registry.storage.home / logs, replicas, before)
     is_empty = not old_logs and not any(plan.versions or plan.training for plan in plans)
     if not dry_run and not is_empty:
@@ -79,10 +79,10 @@ def retire(
 
 def former_logs(directory: Path, replicas: set[str], before: datetime) -> list[Path]:
     """Return the access logs of replicas that are not registered and that nobody has written to since `before`."""
-    found = directory.glob("access-*.jsonl*")
+    log_files = directory.glob("access-*.jsonl*")
     return sorted(
         path
-        for path in found
+        for path in log_files
         if path.name.removeprefix("access-").partition(".jsonl")[0] not in replicas
         and path.stat().st_mtime < before.timestamp()
     )

@@ -59,7 +59,9 @@ def explain(
         note: Why it is void, or was not applied.
         champion_scores: Anchor → mean score of the champion against it in other games.
     """
-    failed = next((each for each in seen.companions if each.decision.outcome in ("reject", "inconclusive")), None)
+    failed = next(
+        (companion for companion in seen.companions if companion.decision.outcome in ("reject", "inconclusive")), None
+    )
     scores = _scores(verdict, seen, champion_scores)
     reason = " ".join((_finding(gate, seen, outcome, promoted, note), *scores))
     return Explanation(reason, _remedy(verdict, gate, seen, failed, outcome, promoted))
@@ -93,17 +95,26 @@ def _scores(verdict: VerdictRow, seen: GateResult, champion_scores: Mapping[str,
     if decision.score is None:
         return []
     scores = [f"It scored {percent(decision.score)} against {champion}, which scored {percent(1 - decision.score)}."]
-    for each in seen.companions:
-        match each:
+    for companion in seen.companions:
+        match companion:
             case AnchorResult(test=test, decision=Decision(score=float(score), games=games)):
                 its = champion_scores.get(test.ref)
-                rest = f"{champion} has not played it" if its is None else f"{champion} {percent(its)} in other games"
-                scores.append(f"Against {test.ref} it scored {percent(score)} in {games} games; {rest}.")
-            case PairedResult(test=test, scores=(own, its)):
-                scores.append(f"Against {test.ref} it scored {percent(own)}, and {champion} {percent(its)}.")
+                comparison = (
+                    f"{champion} has not played it" if its is None else f"{champion} {percent(its)} in other games"
+                )
+                scores.append(f"Against {test.ref} it scored {percent(score)} in {games} games; {comparison}.")
+            case PairedResult(test=test, scores=(candidate_score, its)):
+                scores.append(
+                    f"Against {test.ref} it scored {percent(candidate_score)}, and {champion} {percent(its)}."
+                )
             case ExploitabilityResult(sample=sample) if sample:
-                mine, others = (_mean_score(sample, ref) for ref in (verdict.candidate_ref, champion))
-                scores.append(f"Against its exploiters it scored {percent(mine)}, and {champion} {percent(others)}.")
+                candidate_score, champion_score = (
+                    _mean_score(sample, ref) for ref in (verdict.candidate_ref, champion)
+                )
+                scores.append(
+                    f"Against its exploiters it scored {percent(candidate_score)},"
+                    f" and {champion} {percent(champion_score)}."
+                )
     return scores
 
 
@@ -128,15 +139,15 @@ def _remedy(
     if seen.champion.outcome == "promote" and seen.forfeits:
         return "It must return a legal action in each game. With gate.forfeits: true, forfeits are only lost games."
     if failed is None:
-        wanted, decision = _wanted_of_champion(verdict, gate, seen.champion), seen.champion
+        requirement, decision = _wanted_of_champion(verdict, gate, seen.champion), seen.champion
         hypotheses = "gate.return0 and gate.return1" if gate.model == "returns" else "gate.elo0 and gate.elo1"
         wider = f"{hypotheses} that are further apart"
     else:
-        wanted, decision = _wanted(gate, failed), failed.decision
+        requirement, decision = _wanted(gate, failed), failed.decision
         wider = f"a larger {_setting(failed)}"
     if outcome == "inconclusive" and decision.blocks:
-        return f"{wanted} {_more_games(gate, decision, wider)}"
-    return wanted
+        return f"{requirement} {_more_games(gate, decision, wider)}"
+    return requirement
 
 
 def _wanted_of_champion(verdict: VerdictRow, gate: GateConfig, decision: Decision) -> str:

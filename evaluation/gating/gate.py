@@ -115,8 +115,8 @@ def decide_matches(test: SequentialTest, matches: Sequence[Match]) -> Decision:
 
     A comparison of candidate and champion against exploiters has no estimate in Elo.
     """
-    seen = observe(test, matches)
-    decision = decide(test.settings, seen.scores, seen.comparisons, seen.differences)
+    observations = observe(test, matches)
+    decision = decide(test.settings, observations.scores, observations.comparisons, observations.differences)
     counted = matches[: decision.blocks * test.matches_each]
     games = len(counted) * GAMES_PER_BLOCK
     estimate = decision.estimate if test.champion is None else None
@@ -179,10 +179,10 @@ class SequentialMonitor:
 
         matches: all matches of the schedule so far, in order.
         """
-        each, most = self._test.matches_each, self._test.settings.max_blocks
-        end = min(len(matches) // each, most)
+        round_size, most = self._test.matches_each, self._test.settings.max_blocks
+        end = min(len(matches) // round_size, most)
         if end > self._seen:
-            curve = self._curve(observe(self._test, matches[self._seen * each : end * each]))
+            curve = self._curve(observe(self._test, matches[self._seen * round_size : end * round_size]))
             self.llr, self._seen = float(curve[-1]), end
             self._is_decided = self._is_decided or bool(_crossed(curve, self.bounds).size)
         is_sufficient = self._is_decided and self._seen >= self._test.at_least

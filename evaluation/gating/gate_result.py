@@ -146,11 +146,11 @@ def _paired_result(
 ) -> PairedResult:
     if not counted:
         return PairedResult(test, champion, decision, None, None)
-    own, other = (
-        sum(match.score(match.contestants.index(each)) for match in counted if each in match.contestants)
-        for each in (sequential.candidate, sequential.champion)
+    candidate_total, champion_total = (
+        sum(match.score(match.contestants.index(ref)) for match in counted if ref in match.contestants)
+        for ref in (sequential.candidate, sequential.champion)
     )
-    scores = own / decision.blocks, other / decision.blocks
+    scores = candidate_total / decision.blocks, champion_total / decision.blocks
     return PairedResult(test, champion, decision, scores, student_interval(observe(sequential, counted).gaps))
 
 
@@ -161,7 +161,7 @@ def _exploitability_result(
     by_block = by_exploiter = None
     if sample:
         pair = replace(sequential, pairs=1)
-        gaps = -np.array([observe(pair, each).gaps for each in _pairs(sample, sequential.pairs)])
+        gaps = -np.array([observe(pair, pair_matches).gaps for pair_matches in _pairs(sample, sequential.pairs)])
         by_block, by_exploiter = student_interval(gaps.mean(axis=0).tolist()), crossed_interval(gaps)
     return ExploitabilityResult(test, sequential.champion, decision, sample, by_block, by_exploiter)
 
@@ -188,17 +188,17 @@ class GateResult:
 
     @property
     def anchors(self) -> tuple[AnchorResult | PairedResult, ...]:
-        results = (each for each in self.companions if isinstance(each, AnchorResult | PairedResult))
-        return tuple(each for each in results if isinstance(each.test, AnchorTest))
+        results = (result for result in self.companions if isinstance(result, AnchorResult | PairedResult))
+        return tuple(result for result in results if isinstance(result.test, AnchorTest))
 
     @property
     def exploiters(self) -> tuple[PairedResult, ...]:
-        results = (each for each in self.companions if isinstance(each, PairedResult))
-        return tuple(each for each in results if isinstance(each.test, ExploiterTest))
+        results = (result for result in self.companions if isinstance(result, PairedResult))
+        return tuple(result for result in results if isinstance(result.test, ExploiterTest))
 
     @property
     def exploitability(self) -> ExploitabilityResult | None:
-        return next((each for each in self.companions if isinstance(each, ExploitabilityResult)), None)
+        return next((result for result in self.companions if isinstance(result, ExploitabilityResult)), None)
 
     @property
     def outcome(self) -> Outcome | None:

@@ -92,10 +92,10 @@ def nightly(
     """
     began = time.monotonic()
     with registry.exclusive_lock(f"nightly-{config.league}"), ray_session():
-        found = interface(config)
-        check_contestants(config, found, registry)
-        check_exploiters(config, found)
-        registry.leagues.register(config, found)
+        league_interface = interface(config)
+        check_contestants(config, league_interface, registry)
+        check_exploiters(config, league_interface)
+        registry.leagues.register(config, league_interface)
         nightly_run = _NightlyRun(registry, registry.leagues.get(config.league), train, workers, listener)
         nightly_run.find_missing_files()
         before = nightly_run.champion()
@@ -220,14 +220,14 @@ class _NightlyRun:
         """Play the missing or unfinished rating gauntlet of each version."""
         ledger = Ledger(self._registry)
         conditions = self._league.conditions
-        begun = {
+        gauntlets = {
             schedule.contestants[0]: schedule
             for schedule in ledger.schedules(self._league.slug)
             if schedule.kind == "gauntlet" and schedule.conditions == conditions
         }
         versions = eligible(self._registry, self._league.slug)
         for previous, version in zip([None, *versions], versions, strict=False):
-            schedule = begun.get(version.ref) or self._gauntlet(version, previous)
+            schedule = gauntlets.get(version.ref) or self._gauntlet(version, previous)
             if len(ledger.positions(schedule.id)) < schedule.length:
                 with self._faults_of(version.ref):
                     tournament.play_schedule(
@@ -236,7 +236,7 @@ class _NightlyRun:
 
     def _untested(self) -> list[VersionRow]:
         """Versions without a verdict, oldest first."""
-        return [each for each in eligible(self._registry, self._league.slug) if not self._is_tested(each)]
+        return [version for version in eligible(self._registry, self._league.slug) if not self._is_tested(version)]
 
     def _is_tested(self, version: VersionRow) -> bool:
         """Whether a version is champion, was rolled back, or has an effective verdict."""
@@ -256,7 +256,7 @@ class _NightlyRun:
 
     def _gauntlet(self, version: VersionRow, previous: VersionRow | None) -> Schedule:
         """Schedule against the baselines, the champion and the previous version."""
-        versions = {each.ref for each in eligible(self._registry, self._league.slug)} - {version.ref}
+        versions = {row.ref for row in eligible(self._registry, self._league.slug)} - {version.ref}
         rivals = (self.champion(), previous.ref if previous else None)
         opponents = fixed_baselines(self._registry, self._league)
         opponents += [ref for ref in rivals if ref and ref in versions]

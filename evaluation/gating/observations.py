@@ -50,11 +50,14 @@ def observe(test: SequentialTest, matches: Sequence[Match]) -> Observations:
     if champion is None:
         return _blocks(settings, matches, test.candidate)
     whole = matches[: len(matches) // test.matches_each * test.matches_each]
-    mine, others = _blocks(settings, whole[::2], test.candidate), _blocks(settings, whole[1::2], champion)
+    candidate_blocks, champion_blocks = (
+        _blocks(settings, whole[::2], test.candidate),
+        _blocks(settings, whole[1::2], champion),
+    )
     return Observations(
-        scores=[(1 + gap) / 2 for gap in _mean_gaps(mine.scores, others.scores, pairs)],
-        comparisons=2 * pairs * mine.comparisons,
-        differences=[gap / 2 for gap in _mean_gaps(mine.differences, others.differences, pairs)],
+        scores=[(1 + gap) / 2 for gap in _mean_gaps(candidate_blocks.scores, champion_blocks.scores, pairs)],
+        comparisons=2 * pairs * candidate_blocks.comparisons,
+        differences=[gap / 2 for gap in _mean_gaps(candidate_blocks.differences, champion_blocks.differences, pairs)],
     )
 
 
@@ -80,9 +83,9 @@ def _differences(settings: GateConfig, matches: Sequence[Match], contestant: str
         if (ruled := forfeit_difference(match, contestant)) is not None:
             gaps.append(ruled * bound)
             continue
-        own = match.contestants.index(contestant)
-        mine, other = match.mean_return(own), match.mean_return(1 - own)
-        assert mine is not None
-        assert other is not None
-        gaps.append(mine - other)
+        index = match.contestants.index(contestant)
+        own_return, other_return = match.mean_return(index), match.mean_return(1 - index)
+        assert own_return is not None
+        assert other_return is not None
+        gaps.append(own_return - other_return)
     return gaps

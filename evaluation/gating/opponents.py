@@ -22,17 +22,17 @@ def resolve_anchors(registry: Registry, league: LeagueRow, candidate: int, champ
     """
     gate = league.config.gate
     former = earlier_champions(registry, league, gate.earlier_champions)
-    wanted = [*gate.anchors, *(AnchorConfig(ref=ref) for ref in former)]
-    found: dict[str, AnchorConfig] = {}
-    for anchor in wanted:
+    anchors = [*gate.anchors, *(AnchorConfig(ref=ref) for ref in former)]
+    pinned_anchors: dict[str, AnchorConfig] = {}
+    for anchor in anchors:
         try:
             ref = pinned(of_league(anchor.ref, league.slug), league.slug, registry)
         except UnknownAlias:
             continue
         check_eligible(ref, registry, league.config)
         if ref not in (f"{league.slug}@{candidate}", champion):
-            found.setdefault(ref, anchor.model_copy(update={"ref": ref}))
-    return list(found.values())
+            pinned_anchors.setdefault(ref, anchor.model_copy(update={"ref": ref}))
+    return list(pinned_anchors.values())
 
 
 def earlier_champions(registry: Registry, league: LeagueRow, most: int) -> list[str]:
@@ -42,10 +42,10 @@ def earlier_champions(registry: Registry, league: LeagueRow, most: int) -> list[
     """
     events, refused = registry.aliases.history(league.slug), rolled_back(registry, league.slug)
     reigned = dict.fromkeys(event.version for event in events)
-    now = events[0].version if events else None
+    champion = events[0].version if events else None
     refs: list[str] = []
     for number in reigned:
-        if number == now or number in refused or len(refs) == most:
+        if number == champion or number in refused or len(refs) == most:
             continue
         if registry.versions.get(league.slug, number).manifest.environment_digest == league.environment_digest:
             refs.append(f"{league.slug}@{number}")
@@ -69,8 +69,8 @@ def recent_exploiters(registry: Registry, league: LeagueRow, champion: str) -> l
         return []
     targets = [champion, *earlier_champions(registry, league, number - 1)]
     newest = {
-        each.exploits: each
-        for each in registry.versions.exploiters(league.slug, targets)
-        if each.manifest.environment_digest == league.environment_digest
+        exploiter.exploits: exploiter
+        for exploiter in registry.versions.exploiters(league.slug, targets)
+        if exploiter.manifest.environment_digest == league.environment_digest
     }
     return [newest[target] for target in targets if target in newest]

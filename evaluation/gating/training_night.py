@@ -92,10 +92,10 @@ def training_night(
         LeagueError: The errors of `nightly`.
     """
     with registry.exclusive_lock(f"training-night-{config.league}"):
-        found = interface(config)
-        check_contestants(config, found, registry)
-        check_exploiters(config, found)
-        registry.leagues.register(config, found)
+        league_interface = interface(config)
+        check_contestants(config, league_interface, registry)
+        check_exploiters(config, league_interface)
+        registry.leagues.register(config, league_interface)
         row = registry.training_nights.open(config.league)
         night = _Night(config, registry, row, train, workers, listener, announce)
         for number, (name, step) in enumerate(STEPS.items(), 1):
@@ -188,8 +188,8 @@ def _exploiter(night: _Night) -> dict[str, Any]:
     if (earlier := night.earlier_exploiters(target)) is not None:
         return earlier
     run, config = night.row.exploiter_run, night.config.of_night(_seed(night, "exploiter"), share)
-    if not night.versions(run) and (known := trained_exploiters(night.registry, league, target, config)):
-        return {"target": target, "versions": known}
+    if not night.versions(run) and (exploiters := trained_exploiters(night.registry, league, target, config)):
+        return {"target": target, "versions": exploiters}
     parent = CheckpointRef.parse(target).version
     assert isinstance(parent, int)
     error = _attempt(night, config, run, trainable_version(night.registry, league.slug, parent), target)
@@ -207,7 +207,7 @@ def _measure(night: _Night) -> dict[str, Any]:
         return {"target": target, "exploitability": None}
     last = {row.run: row.ref for row in night.registry.versions.all(night.config.league) if row.ref in versions}
     try:
-        found = exploitability(
+        estimate = exploitability(
             CheckpointRef.parse(target),
             list(last.values()),
             registry=night.registry,
@@ -218,7 +218,7 @@ def _measure(night: _Night) -> dict[str, Any]:
         raise
     except LeagueError as error:
         return {"target": target, "exploitability": None, "error": one_line(error)}
-    return {"target": target, "exploitability": found.to_json()}
+    return {"target": target, "exploitability": estimate.to_json()}
 
 
 STEPS: dict[str, Callable[[_Night], dict[str, Any]]] = {

@@ -76,10 +76,10 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
     """Compute the evidence of a verdict. events: history of the champion alias."""
     candidate = f"{verdict.league}@{verdict.candidate}"
     gate = gate_of(verdict)
-    seen = gate_result(registry, verdict)
-    decision = seen.champion
+    result = gate_result(registry, verdict)
+    decision = result.champion
     promoted = any(event.verdict == verdict.id for event in events)
-    explanation = explained(registry, verdict, verdict.outcome, seen, promoted, (verdict.evidence or {}).get("note"))
+    explanation = explained(registry, verdict, verdict.outcome, result, promoted, (verdict.evidence or {}).get("note"))
     return VerdictEvidence(
         verdict=verdict.id,
         candidate=candidate,
@@ -96,8 +96,8 @@ def verdict_evidence(registry: Registry, verdict: VerdictRow, events: Sequence[A
         curve=decision.curve,
         difference=difference_of_returns(registry, verdict, decision.blocks),
         alpha=verdict.alpha,
-        anchors=tuple(map(anchor_report, seen.anchors)),
-        exploiters=tuple(map(exploiter_report, seen.exploiters)),
-        exploitability=exploitability_report(seen.exploitability, candidate),
+        anchors=tuple(map(anchor_report, result.anchors)),
+        exploiters=tuple(map(exploiter_report, result.exploiters)),
+        exploitability=exploitability_report(result.exploitability, candidate),
         confirmation=confirmation(registry, verdict),
     )

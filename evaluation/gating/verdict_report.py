@@ -88,12 +88,12 @@ def gate_result(registry: Registry, verdict: VerdictRow) -> GateResult:
     companions: list[CompanionResult] = []
     for test in tests.ready:
         matches = _matches(registry, verdict, test.schedule)
-        found = companion_result(gate, test, candidate_ref, verdict.champion, matches)
-        companions.append(found)
-        forfeited += forfeits(matches[: found.decision.games // GAMES_PER_BLOCK], candidate_ref)
+        result = companion_result(gate, test, candidate_ref, verdict.champion, matches)
+        companions.append(result)
+        forfeited += forfeits(matches[: result.decision.games // GAMES_PER_BLOCK], candidate_ref)
     opponent = name_of_champion(verdict.champion)
-    shown = f"it beat {opponent}" if gate.requires_gain else f"it is not inferior to {opponent}"
-    return combine_results(champion, companions, tests.number, None if gate.forfeits else forfeited, shown)
+    finding = f"it beat {opponent}" if gate.requires_gain else f"it is not inferior to {opponent}"
+    return combine_results(champion, companions, tests.number, None if gate.forfeits else forfeited, finding)
 
 
 def difference_of_returns(
@@ -150,7 +150,7 @@ def explained(
     registry: Registry, verdict: VerdictRow, outcome: str | None, seen: GateResult, promoted: bool, note: str | None
 ) -> Explanation:
     """Explain a verdict with this gate result. outcome: None while it is open. note: as in a VerdictReport."""
-    absolute = [each.test.ref for each in seen.companions if isinstance(each, AnchorResult)]
+    absolute = [companion.test.ref for companion in seen.companions if isinstance(companion, AnchorResult)]
     scores = {ref: score for ref in absolute if (score := _champion_score(registry, verdict, ref)) is not None}
     return explain(
         verdict, gate_of(verdict), seen, outcome=outcome, promoted=promoted, note=note, champion_scores=scores
@@ -215,7 +215,11 @@ def exploitability_report(result: ExploitabilityResult | None, candidate: str) -
         return None
     test, champion = result.test, result.champion
     exploiters = {candidate: test.of_candidate, champion: test.of_champion}
-    bounds = {ref: exploitability_bound(ref, own, result.sample) for ref, own in exploiters.items() if result.sample}
+    bounds = {
+        ref: exploitability_bound(ref, own_exploiters, result.sample)
+        for ref, own_exploiters in exploiters.items()
+        if result.sample
+    }
     outcomes = IMPROVEMENT_OUTCOMES if test.improvement else EXPLOITABILITY_OUTCOMES
     return ExploitabilityReport(
         ref=champion,

@@ -120,16 +120,16 @@ def _opened_tests(
     for anchor in resolve_anchors(registry, league, candidate, opponent):
         mode = anchor.tested_mode
         play = companion if mode == "at_least" else paired_test
-        own = play(config, interface, "anchor", schedule, anchor.ref, gate.max_blocks)
-        anchors.append(AnchorTest(anchor.ref, gate.margin_of(anchor), ledger.open(own).id, mode))
+        test_schedule = play(config, interface, "anchor", schedule, anchor.ref, gate.max_blocks)
+        anchors.append(AnchorTest(anchor.ref, gate.margin_of(anchor), ledger.open(test_schedule).id, mode))
     for exploiter in recent_exploiters(registry, league, opponent):
         assert exploiter.exploits is not None, "it is an exploiter"
-        own = paired_test(config, interface, "exploiter", schedule, exploiter.ref, gate.max_blocks)
+        test_schedule = paired_test(config, interface, "exploiter", schedule, exploiter.ref, gate.max_blocks)
         margin = gate.margin_against_exploiters
-        exploiters.append(ExploiterTest(exploiter.ref, exploiter.exploits, margin, ledger.open(own).id))
+        exploiters.append(ExploiterTest(exploiter.ref, exploiter.exploits, margin, ledger.open(test_schedule).id))
     if gate.confirmation_blocks:
-        own = companion(config, interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
-        confirmation = ledger.open(own).id
+        test_schedule = companion(config, interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
+        confirmation = ledger.open(test_schedule).id
     return CompanionTests(
         anchors=tuple(anchors),
         exploiters=tuple(exploiters),
@@ -170,20 +170,20 @@ def conclude(
         if registry.verdicts.get(verdict.id).outcome is not None or gate_result(registry, verdict).outcome is not None:
             break
     verdict = registry.verdicts.get(verdict.id)
-    seen = gate_result(registry, verdict)
+    result = gate_result(registry, verdict)
     if verdict.outcome is not None:
-        return report_of(registry, verdict, verdict.outcome, seen, (verdict.evidence or {}).get("note"))
+        return report_of(registry, verdict, verdict.outcome, result, (verdict.evidence or {}).get("note"))
     if is_applied(registry, verdict):
         obstacle = None
-    elif seen.outcome == "promote":
+    elif result.outcome == "promote":
         obstacle = _changed_conditions(registry, verdict)  # `promote` finds out whether the champion has moved
     else:
         obstacle = _obstacle(registry, verdict)
     if obstacle is not None:
-        return _close(registry, verdict, VOID, seen, note=obstacle)
-    assert seen.outcome is not None, "a schedule ends with its test"
-    refused = promote(registry, verdict, _reason(verdict, seen)) if seen.outcome == "promote" else seen.note
-    return _close(registry, verdict, seen.outcome, seen, note=refused)
+        return _close(registry, verdict, VOID, result, note=obstacle)
+    assert result.outcome is not None, "a schedule ends with its test"
+    refused = promote(registry, verdict, _reason(verdict, result)) if result.outcome == "promote" else result.note
+    return _close(registry, verdict, result.outcome, result, note=refused)
 
 
 def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bool = False) -> VerdictRow:
@@ -250,23 +250,26 @@ def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
     """Why this verdict cannot continue: the champion or the environment has changed, or its promotion is impossible."""
     if is_applied(registry, verdict):
         return None
-    now = registry.aliases.current(verdict.league).get(CHAMPION)
-    if now != tested_champion(verdict):
-        holder = "there is no champion" if now is None else f"the champion is {verdict.league}@{now}"
+    champion = registry.aliases.current(verdict.league).get(CHAMPION)
+    if champion != tested_champion(verdict):
+        holder = "there is no champion" if champion is None else f"the champion is {verdict.league}@{champion}"
         return f"{holder} now, but the test was against {verdict.champion}"
     if (changed := _changed_conditions(registry, verdict)) is not None:
         return changed
-    return None if now is None else _below_floor(registry, verdict, now)
+    return None if champion is None else _below_floor(registry, verdict, champion)
 
 
 def _changed_conditions(registry: Registry, verdict: VerdictRow) -> str | None:
     """Why the games of this verdict do not count any more: the league's game or selection of actions has changed."""
-    then = Ledger(registry).schedule(verdict.schedule).conditions
-    now = registry.leagues.get(verdict.league).conditions
-    if then.game_digest != now.game_digest:
+    tested_conditions = Ledger(registry).schedule(verdict.schedule).conditions
+    current_conditions = registry.leagues.get(verdict.league).conditions
+    if tested_conditions.game_digest != current_conditions.game_digest:
         return "the league's game has changed"
-    if then.actions != now.actions:
-        return f"the league plays with {now.actions} actions now, but the test was with {then.actions} ones"
+    if tested_conditions.actions != current_conditions.actions:
+        return (
+            f"the league plays with {current_conditions.actions} actions now,"
+            f" but the test was with {tested_conditions.actions} ones"
+        )
     return None
 
 
@@ -279,24 +282,24 @@ def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str 
     candidates, champions = (
         mixtures[number].versions if number in mixtures else (number,) for number in (verdict.candidate, champion)
     )
-    found = [
+    shadow_counts = [
         counts
         for counts in registry.traffic.shadow_counts(verdict.league)
         if counts.candidate in candidates and counts.champion in champions
     ]
-    observations = sum(each.observations for each in found)
-    agreement = sum(each.agreed for each in found) / observations if observations else None
+    observations = sum(counts.observations for counts in shadow_counts)
+    agreement = sum(counts.agreed for counts in shadow_counts) / observations if observations else None
     latency = Histogram()
-    for each in found:
-        latency.merge(each.latency, each.ns)
-    failed = sum(each.failed for each in found)
+    for counts in shadow_counts:
+        latency.merge(counts.latency, counts.ns)
+    failed = sum(counts.failed for counts in shadow_counts)
     return shadow_shortfall(gate_of(verdict), observations, failed, agreement, latency.quantile(0.95))
 
 
 def _reason(verdict: VerdictRow, seen: GateResult) -> str:
     decision = seen.champion
-    strong = ", ".join(each.test.ref for each in seen.companions if isinstance(each, AnchorResult))
-    paired = ", ".join(each.test.ref for each in seen.companions if isinstance(each, PairedResult))
+    strong = ", ".join(test_result.test.ref for test_result in seen.companions if isinstance(test_result, AnchorResult))
+    paired = ", ".join(test_result.test.ref for test_result in seen.companions if isinstance(test_result, PairedResult))
     anchors = f", and is not inferior to {strong}" if strong else ""
     no_worse = f", and does no worse than it against {paired}" if paired else ""
     exploitability = ""
@@ -304,9 +307,9 @@ def _reason(verdict: VerdictRow, seen: GateResult) -> str:
         exploitability = (
             f", and is {'less' if result.test.improvement else 'not more'} exploitable by its own exploiters"
         )
-    shown = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
+    comparison = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
     return (
-        f"{shown} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
+        f"{comparison} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
         f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{no_worse}{exploitability}"
     )
 

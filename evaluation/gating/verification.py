@@ -68,11 +68,11 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     if row.outcome is None or row.evidence is None:
         raise InvalidInput(f"verdict {row.short_id} is still open: `league nightly` resumes it")
     matches = [match for name in row.tested_schedules for match in _checked_matches(registry, row, name)]
-    seen = gate_result(registry, row)
+    result = gate_result(registry, row)
     # A verdict can be voided for reasons outside its games, at any point.
-    outcome = VOID if row.outcome == VOID else str(seen.outcome)
-    note = seen.note if outcome not in (VOID, "promote") else row.evidence.get("note")
-    report = report_of(registry, row, outcome, seen, note)
+    outcome = VOID if row.outcome == VOID else str(result.outcome)
+    note = result.note if outcome not in (VOID, "promote") else row.evidence.get("note")
+    report = report_of(registry, row, outcome, result, note)
     computed = report.to_json()
     # Sentences, in the words of the release that wrote them.
     del computed["reason"], computed["remedy"]
@@ -99,8 +99,8 @@ def _omit_later_fields(computed: dict[str, Any], recorded: dict[str, Any]) -> No
     """Remove the fields that the release that recorded the evidence did not have."""
     for name in {"model", "forfeits"} - recorded.keys():
         del computed[name]
-    for anchor, known in zip(computed["anchors"], recorded.get("anchors", ()), strict=False):
-        if "mode" not in known:
+    for anchor, recorded_anchor in zip(computed["anchors"], recorded.get("anchors", ()), strict=False):
+        if "mode" not in recorded_anchor:
             del anchor["mode"]
 
 
@@ -130,19 +130,19 @@ def _same(recorded: Any, computed: Any) -> bool:
 
 def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], replays: int) -> int:
     games = [(match, index) for match in matches for index in range(len(match.games))]
-    wanted = min(replays, len(games))
-    if not wanted:
+    count = min(replays, len(games))
+    if not count:
         return 0
     league = registry.leagues.get(row.league)
     with closing(stock_stepping(league.config.environment, 1)) as environment:
-        for number in np.linspace(0, len(games) - 1, wanted).astype(int):
+        for number in np.linspace(0, len(games) - 1, count).astype(int):
             match, index = games[number]
             try:
                 for _ in replay(environment, league.config, league.interface, match, index):
                     pass
             except EnvironmentMismatch as error:
                 raise VerdictRefuted(f"verdict {row.short_id}: {error}{_cause(registry, league, match)}") from error
-    return wanted
+    return count
 
 
 def _cause(registry: Registry, league: LeagueRow, match: Match) -> str:

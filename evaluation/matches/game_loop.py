@@ -269,9 +269,9 @@ class _GameLoop:
 
     def _hung(self, envs: Indices) -> GameHung:
         """The error for games of which one hangs."""
-        others = f", or one of {len(envs) - 1} others that are stepped with it," if len(envs) > 1 else ""
+        peers = f", or one of {len(envs) - 1} others that are stepped with it," if len(envs) > 1 else ""
         return GameHung(
-            f"{self._describe(int(envs[0]))}{others} has not ended after {self._max_seconds:g} s of environment time"
+            f"{self._describe(int(envs[0]))}{peers} has not ended after {self._max_seconds:g} s of environment time"
         )
 
     def _describe(self, env: int) -> str:

@@ -43,9 +43,9 @@ def forfeit_difference(match: Match, contestant: str) -> float | None:
 
     -1 if only this contestant forfeited a game, +1 if only the other did, 0 if both did.
     """
-    own = forfeits([match], contestant) > 0
-    other = any(forfeits([match], ref) for ref in match.contestants if ref != contestant)
-    return float(other) - float(own) if own or other else None
+    own_forfeit = forfeits([match], contestant) > 0
+    rival_forfeit = any(forfeits([match], ref) for ref in match.contestants if ref != contestant)
+    return float(rival_forfeit) - float(own_forfeit) if own_forfeit or rival_forfeit else None
 
 
 def unique_games(matches: Iterable[Match], contestant: str | None = None) -> int:
@@ -112,14 +112,14 @@ class UpsetFinder:
             return
         kept = self._kept[tuple(sorted(match.contestants))]
         for index, game in enumerate(match.games):
-            found = _upset_of(match, index, game, self._ratings)
-            if found is None or (len(kept) == self._most and _order(found) >= max(map(_order, kept.values()))):
+            upset = _upset_of(match, index, game, self._ratings)
+            if upset is None or (len(kept) == self._most and _order(upset) >= max(map(_order, kept.values()))):
                 continue
             key = identity(match, game)
             # The first by name represents equal games.
-            kept[key] = min(found, kept.get(key, found), key=_order)
+            kept[key] = min(upset, kept.get(key, upset), key=_order)
             if len(kept) > self._most:
-                del kept[max(kept, key=lambda each: _order(kept[each]))]
+                del kept[max(kept, key=lambda game_key: _order(kept[game_key]))]
 
     def greatest(self) -> list[Upset]:
         """At most `most` upsets, greatest first. The greatest of each pair takes precedence over any pair's second."""
@@ -128,22 +128,22 @@ class UpsetFinder:
             for kept in self._kept.values()
             for rank, upset in enumerate(sorted(kept.values(), key=_order))
         ]
-        chosen = sorted(ranked, key=lambda item: (item[0], _order(item[1])))[: self._most]
-        return sorted((upset for _, upset in chosen), key=_order)
+        selection = sorted(ranked, key=lambda item: (item[0], _order(item[1])))[: self._most]
+        return sorted((upset for _, upset in selection), key=_order)
 
 
 def _upset_of(match: Match, index: int, game: Game, ratings: Mapping[str, float]) -> Upset | None:
     """The upset from the view of the contestant that exceeded its expectation; None below MIN_UPSET."""
-    found = None
-    for own, score in enumerate(game.scores):
+    greatest = None
+    for contestant, score in enumerate(game.scores):
         if score is None:
             continue
-        better, other = match.contestants[own], match.contestants[1 - own]
+        better, other = match.contestants[contestant], match.contestants[1 - contestant]
         expected = score_of(ratings[better] - ratings[other])
-        each = Upset(match.id, index, better, other, expected, score)
-        if each.size > (found.size if found else MIN_UPSET):
-            found = each
-    return found
+        upset = Upset(match.id, index, better, other, expected, score)
+        if upset.size > (greatest.size if greatest else MIN_UPSET):
+            greatest = upset
+    return greatest
 
 
 def _order(upset: Upset) -> tuple[float, str, int]:

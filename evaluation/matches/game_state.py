@@ -28,12 +28,12 @@ class AgentGenerators:
 
         seeds, indices: of the games, and their numbers in their blocks, (k,).
         """
-        found = self._kept[batch.envs, batch.agents]
-        if len(missing := np.flatnonzero(found == None)):  # noqa: E711  elementwise
+        row_generators = self._kept[batch.envs, batch.agents]
+        if len(missing := np.flatnonzero(row_generators == None)):  # noqa: E711  elementwise
             agents = batch.agents[missing]
-            found[missing] = generators(seeds[missing], "policy", indices[missing], agents)
-            self._kept[batch.envs[missing], agents] = found[missing]
-        return found.tolist()
+            row_generators[missing] = generators(seeds[missing], "policy", indices[missing], agents)
+            self._kept[batch.envs[missing], agents] = row_generators[missing]
+        return row_generators.tolist()
 
     def forget(self, envs: Indices) -> None:
         """The games in `envs` are over."""
@@ -71,8 +71,8 @@ def action_keys(seeds: Indices, indices: Indices, agents: int) -> NDArray[np.uin
 
     seeds, indices: of the games, and their numbers in their blocks, (g,).
     """
-    each = np.repeat(seeds, agents), np.repeat(indices, agents), np.tile(np.arange(agents), len(seeds))
-    return generate_state(each[0], spawn_key("action", *each[1:]))[0].reshape(len(seeds), agents)
+    columns = np.repeat(seeds, agents), np.repeat(indices, agents), np.tile(np.arange(agents), len(seeds))
+    return generate_state(columns[0], spawn_key("action", *columns[1:]))[0].reshape(len(seeds), agents)
 
 
 class AgentStates:

@@ -28,7 +28,7 @@ def compute_leaderboard(registry: Registry, league: str) -> tuple[Standing, ...]
 
 def rated_version(version: VersionRow, leaderboard: Sequence[Standing], events: Sequence[AliasEvent]) -> RatedVersion:
     """A version with its rating and the times when it became champion. events: history of the champion alias."""
-    standing = next((each for each in leaderboard if each.ref == version.ref), None)
+    standing = next((row for row in leaderboard if row.ref == version.ref), None)
     return RatedVersion(
         ref=version.ref,
         number=version.number,
@@ -56,16 +56,16 @@ def by_side(
             part = replace(match, games=tuple(game for game in games if game is not None))
             if part.games:
                 results[side].append(part.result())
-    return {side: rank_contestants(own, unrated=unrated) for side, own in results.items()}
+    return {side: rank_contestants(side_results, unrated=unrated) for side, side_results in results.items()}
 
 
 def _on_side(game: Game, side: int) -> Game | None:
     """The part of a game that concerns one side, if its contestant played no other side."""
-    own = game.sides[side]
-    if only_side(game, own) != side:
+    contestant = game.sides[side]
+    if only_side(game, contestant) != side:
         return None
     scores, returns = (
-        tuple(v if c == own else None for c, v in enumerate(each)) for each in (game.scores, game.returns)
+        tuple(v if c == contestant else None for c, v in enumerate(values)) for values in (game.scores, game.returns)
     )
     return replace(game, scores=scores, returns=returns)
 
@@ -153,7 +153,9 @@ class CountedGames:
             for match in ledger.walk(schedule):
                 self._add(match)
         self.unique_games = len(self._seen)
-        self.leaderboard = tuple(replace(each, unique_games=self._distinct[each.ref]) for each in leaderboard)
+        self.leaderboard = tuple(
+            replace(standing, unique_games=self._distinct[standing.ref]) for standing in leaderboard
+        )
 
     def payoff(self) -> Payoff | None:
         """Payoff matrix of the best contestants; None before their first game."""

@@ -63,15 +63,23 @@ class MatchRecorder:
             losers = [{forfeit.contestant for forfeit in forfeits[game]} for game in block]
             points = scores([values[game] for game in block], schedule.scoring, losers)
             records = [
-                Game(sides[game], seeds[game], *actions[game], values[game], own, forfeits[game], self._members[game])
-                for game, own in zip(block, points, strict=True)
+                Game(
+                    sides[game],
+                    seeds[game],
+                    *actions[game],
+                    values[game],
+                    game_scores,
+                    forfeits[game],
+                    self._members[game],
+                )
+                for game, game_scores in zip(block, points, strict=True)
             ]
             matches.append(schedule.match(int(plans.positions[first]), records, seeds[first]))
         return matches
 
     def _forfeits(self, game: int) -> tuple[Forfeit, ...]:
-        found: dict[int, Forfeit] = {}
+        forfeits: dict[int, Forfeit] = {}
         for agent, fault in sorted(self._faults[game].items()):
             contestant = int(self._plans.sides[game, self._side_of[agent]])
-            found.setdefault(contestant, Forfeit(contestant, self._agents[agent], fault.reason, fault.detail))
-        return tuple(found.values())
+            forfeits.setdefault(contestant, Forfeit(contestant, self._agents[agent], fault.reason, fault.detail))
+        return tuple(forfeits.values())

@@ -23,7 +23,9 @@ class OpeningMoves:
     def __init__(self, interface: Interface, agents: int, seeds: Indices, plies: int) -> None:
         """seeds: of the games, (g,). plies: length of the openings in environment steps."""
         spaces = {policy: interface.of_policy(policy) for policy in interface.policy_ids if plies}
-        self._scripts = {policy: Random(own.observation, own.action) for policy, own in spaces.items()}
+        self._scripts = {
+            policy: Random(policy_spaces.observation, policy_spaces.action) for policy, policy_spaces in spaces.items()
+        }
         self._seeds, self._agents = seeds, agents
         self._count = plies * max((script.numbers_per_action for script in self._scripts.values()), default=0)
         self._numbers = self._computed(np.arange(len(seeds)), np.zeros(len(seeds), np.int64))

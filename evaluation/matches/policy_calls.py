@@ -53,14 +53,14 @@ def call_policy(policy: Policy, batch: Batch, space: Leaf, state: State | None, 
     reached or fails. Neither is the contestant's fault.
     """
     generators = () if randomness is None or isinstance(randomness, ActionNumbers) else randomness
-    before = [each.bit_generator.state for each in generators]
+    before = [generator.bit_generator.state for generator in generators]
     try:
         answer = _call_batch(policy, batch, space, state, randomness)
     except (MemoryError, RemoteError):
         raise
     except Exception:
-        for each, mark in zip(generators, before, strict=True):
-            each.bit_generator.state = mark
+        for generator, mark in zip(generators, before, strict=True):
+            generator.bit_generator.state = mark
         answer = _call_rows(policy, batch, space, state, randomness)
     mask = batch.observations.get(ACTION_MASK)
     legal = legal_rows(answer.actions, space, mask)
@@ -98,35 +98,35 @@ def _call_batch(policy: Policy, batch: Batch, space: Leaf, state: State | None, 
     """Call the policy and check the form of its output. Raises whatever the policy raises."""
     if isinstance(randomness, ActionNumbers):
         assert isinstance(policy, OnnxPolicy), "scripts have generators"
-        given = policy.act(batch.observations, state=state, explore=True, rng=randomness)
+        output = policy.act(batch.observations, state=state, explore=True, rng=randomness)
     else:
-        given = policy.act(batch.observations, state=state, rng=randomness)
-    _check_form(given, len(batch), space)
-    return PolicyOutput(given.actions, given.state, {row: fault_of(error) for row, error in given.faults.items()})
+        output = policy.act(batch.observations, state=state, rng=randomness)
+    _check_form(output, len(batch), space)
+    return PolicyOutput(output.actions, output.state, {row: fault_of(error) for row, error in output.faults.items()})
 
 
 def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
     rows = len(batch)
-    given: dict[int, NDArray] = {}
+    row_actions: dict[int, NDArray] = {}
     states: State = {}
     faults: dict[int, PolicyFault] = {}
     for row in range(rows):
-        own = None if state is None else {name: array[[row]] for name, array in state.items()}
+        row_state = None if state is None else {name: array[[row]] for name, array in state.items()}
         draws = _of_row(randomness, row)
         try:
-            answer = _call_batch(policy, batch.rows(np.array([row])), space, own, draws)
+            answer = _call_batch(policy, batch.rows(np.array([row])), space, row_state, draws)
         except (MemoryError, RemoteError):
             raise
         except Exception as error:
             faults[row] = fault_of(error)
         else:
-            given[row] = answer.actions[0]
+            row_actions[row] = answer.actions[0]
             faults |= {row + index: fault for index, fault in answer.faults.items()}
             for name, own_state in (answer.states or {}).items():
                 states.setdefault(name, np.zeros((rows, *own_state.shape[1:]), own_state.dtype))[row] = own_state[0]
     # The policy's own dtype, as for a whole batch, because actions are recorded in it.
-    actions = np.zeros((rows, *space.shape), np.result_type(*given.values()) if given else space.dtype)
-    for row, action in given.items():
+    actions = np.zeros((rows, *space.shape), np.result_type(*row_actions.values()) if row_actions else space.dtype)
+    for row, action in row_actions.items():
         actions[row] = action
     return PolicyOutput(actions, states or None, faults)
 
@@ -142,8 +142,8 @@ def _check_form(given: Actions, rows: int, space: Leaf) -> None:
     kinds = "iu" if isinstance(space, Discrete | MultiDiscrete) else "iuf" if isinstance(space, Box) else "biuf"
     actions = given.actions
     if not isinstance(actions, np.ndarray) or actions.dtype.kind not in kinds or actions.shape != (rows, *space.shape):
-        found = f"{actions.dtype} {list(actions.shape)}" if isinstance(actions, np.ndarray) else type(actions).__name__
-        raise MalformedAction(f"actions are {found}, expected {space.dtype} {[rows, *space.shape]}")
+        form = f"{actions.dtype} {list(actions.shape)}" if isinstance(actions, np.ndarray) else type(actions).__name__
+        raise MalformedAction(f"actions are {form}, expected {space.dtype} {[rows, *space.shape]}")
     for name, array in (given.state or {}).items():
         if len(array) != rows:
             raise MalformedAction(f"{name} has {len(array)} rows, expected {rows}")

@@ -31,10 +31,10 @@ def contestant_returns(
     of_side: list[list[float]] = [[] for _ in sides]
     for value, side in zip(returns, side_of, strict=True):
         of_side[side].append(value)
-    own: list[list[float]] = [[] for _ in range(contestants)]
+    of_contestant: list[list[float]] = [[] for _ in range(contestants)]
     for values, contestant in zip(of_side, sides, strict=True):
-        own[contestant].append(_mean(values))
-    return tuple(_mean(values) if values else None for values in own)
+        of_contestant[contestant].append(_mean(values))
+    return tuple(_mean(values) if values else None for values in of_contestant)
 
 
 def returns_of_games(returns: NDArray[np.float64], side_of: Sequence[int], sides: NDArray[np.int64]) -> list[Returns]:
@@ -44,7 +44,8 @@ def returns_of_games(returns: NDArray[np.float64], side_of: Sequence[int], sides
         of_contestant = np.argsort(np.asarray(sides)[:, side_of], axis=1)
         return list(map(tuple, np.take_along_axis(returns, of_contestant, axis=1).tolist()))
     return [
-        contestant_returns(own, side_of, seating) for own, seating in zip(returns.tolist(), sides.tolist(), strict=True)
+        contestant_returns(agent_returns, side_of, seating)
+        for agent_returns, seating in zip(returns.tolist(), sides.tolist(), strict=True)
     ]
 
 

@@ -198,7 +198,9 @@ def evaluate(
     row = registry.leagues.follow_code(league, building.interface)
     _check_options(schedule, against, budget)
     check_anchors(row.config, registry)
-    requested = [pinned(ref, league, registry) for ref in refs] or [each.ref for each in eligible(registry, league)]
+    requested = [pinned(ref, league, registry) for ref in refs] or [
+        version.ref for version in eligible(registry, league)
+    ]
     opponents: list[str] = []
     if schedule == "gauntlet":
         opponents = [pinned(ref, league, registry) for ref in against] or _opponents(registry, row)
@@ -301,14 +303,14 @@ def chunks_of(length: int, played: int, num_envs: int) -> list[range]:
 
 
 def _describe(schedule: Schedule) -> str:
-    first, *others = schedule.contestants
+    first, *rivals = schedule.contestants
     if schedule.kind == "exploitability":
-        return f"{first} and {others[0]} against their exploiters"
+        return f"{first} and {rivals[0]} against their exploiters"
     if schedule.common_seeds:
-        return f"{first} and {others[0]} against {others[1]}"
-    if len(others) == 1:
-        return f"{first} against {others[0]}"
-    return f"{first} against {len(others)} others" if schedule.kind == "gauntlet" else f"{len(others) + 1} contestants"
+        return f"{first} and {rivals[0]} against {rivals[1]}"
+    if len(rivals) == 1:
+        return f"{first} against {rivals[0]}"
+    return f"{first} against {len(rivals)} others" if schedule.kind == "gauntlet" else f"{len(rivals) + 1} contestants"
 
 
 def _here(schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str) -> Generator[list[Match]]:
@@ -346,11 +348,11 @@ class _Places:
         """Record the node of a finished chunk and update the nodes and CPUs in use."""
         self._latest.append(node)
         cpus = node_cpus(set(self._latest))
-        alive = [each for each in self._latest if each in cpus]
+        alive = [node_id for node_id in self._latest if node_id in cpus]
         self._latest = deque(alive, maxlen=self.at_once)
         if alive:
             used = set(self._latest)
-            self.nodes, self.cpus = len(used), min(self.at_once, int(sum(cpus[each] for each in used)))
+            self.nodes, self.cpus = len(used), min(self.at_once, int(sum(cpus[node_id] for node_id in used)))
 
 
 def _in_ray(

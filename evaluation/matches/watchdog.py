@@ -69,7 +69,7 @@ def enforce_deadline(check: Callable[[], None], deadline: Deadline) -> Iterator[
 
     began = time.monotonic()
     handler = signal.signal(signal.SIGALRM, tick)
-    rest, interval = signal.setitimer(signal.ITIMER_REAL, every, every)
+    delay, interval = signal.setitimer(signal.ITIMER_REAL, every, every)
     _extend_deadline(deadline)
     try:
         yield
@@ -79,8 +79,8 @@ def enforce_deadline(check: Callable[[], None], deadline: Deadline) -> Iterator[
         if deadline.expendable:
             faulthandler.cancel_dump_traceback_later()
         signal.signal(signal.SIGALRM, handler)
-        if rest:
-            signal.setitimer(signal.ITIMER_REAL, max(rest - (time.monotonic() - began), MOST_OFTEN), interval)
+        if delay:
+            signal.setitimer(signal.ITIMER_REAL, max(delay - (time.monotonic() - began), MOST_OFTEN), interval)
 
 
 def _extend_deadline(deadline: Deadline) -> None:

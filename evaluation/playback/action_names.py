@@ -34,15 +34,15 @@ def direction_keys(names: Mapping[str, str]) -> dict[str, int]:
     If several names contain a direction, the one with the fewest words has its keys; equal ones have none. Names with
     two directions are diagonals, and have no keys.
     """
-    found: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+    named_actions: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
     for action, name in names.items():
         words = re.findall(r"[a-z]+", name.lower())
         directions = {DIRECTIONS[word] for word in words if word in DIRECTIONS}
         if len(directions) == 1:
-            found[directions.pop()].append((len(words), int(action)))
+            named_actions[directions.pop()].append((len(words), int(action)))
     keys: dict[str, int] = {}
-    for direction, candidates in found.items():
-        fewest, chosen = min(candidates)
+    for direction, candidates in named_actions.items():
+        fewest, keyed_action = min(candidates)
         if [words for words, _ in candidates].count(fewest) == 1:
-            keys |= dict.fromkeys(KEYS[direction], chosen)
+            keys |= dict.fromkeys(KEYS[direction], keyed_action)
     return keys

@@ -84,7 +84,8 @@ class Captions:
         for agent in agents:
             crowds.setdefault((self._controllers[agent], self._interface.policies[agent]), []).append(agent)
         return [
-            (f"{policy} ({len(own)} agents)" if len(own) > 1 else own[0], own) for (_, policy), own in crowds.items()
+            (f"{policy} ({len(crowd)} agents)" if len(crowd) > 1 else crowd[0], crowd)
+            for (_, policy), crowd in crowds.items()
         ]
 
     def _line(self, name: str, agents: Sequence[str], step: GameStep, acting: set[str]) -> Line:
@@ -131,10 +132,10 @@ def chances(move: Move, space: Space, most: int = MOST_CHANCES) -> tuple[tuple[i
             best = np.argsort(-likely, kind="stable")[:most]
             return tuple((index + start, float(likely[index])) for index in best.tolist())
         case MultiDiscrete():
-            chosen, raw = np.ravel(move.action), np.ravel(move.action) - np.ravel(space.start)
+            actions, raw = np.ravel(move.action), np.ravel(move.action) - np.ravel(space.start)
             parts = np.split(inputs, np.cumsum(np.ravel(space.nvec))[:-1])
             odds = [float(softmax(part)[index]) for part, index in zip(parts, raw, strict=True)]
-            return tuple(zip(chosen.tolist(), odds, strict=True))[:most]
+            return tuple(zip(actions.tolist(), odds, strict=True))[:most]
     return ()
 
 

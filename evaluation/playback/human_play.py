@@ -115,11 +115,11 @@ def _playable_agents(config: LeagueConfig, interface: Interface, declared: Decla
     for agent, spaces in interface.agents.items():
         if not isinstance(space := spaces.action, Discrete):
             continue
-        own = names.get(agent, {})
-        keys = direction_keys(own) | declared.action_keys
+        own_names = names.get(agent, {})
+        keys = direction_keys(own_names) | declared.action_keys
         fitting = {key: action for key, action in keys.items() if space.start <= action < space.start + space.n}
         color = declared.agent_colors.get(agent)
-        agents.append(PlayableAgent(agent, side_of[agent], space.n, space.start, own, fitting, color))
+        agents.append(PlayableAgent(agent, side_of[agent], space.n, space.start, own_names, fitting, color))
     return tuple(agents)
 
 
@@ -340,14 +340,14 @@ class _Opponent:
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
         try:
-            given = policy_output(self._policy, observations, state, rng, explore)
+            output = policy_output(self._policy, observations, state, rng, explore)
         except (MemoryError, RemoteError):
             raise
         except Exception as error:
             raise _Forfeited(self._agent, fault_of(error)) from error
-        if fault := action_fault(given, self._space, observations.get(ACTION_MASK)):
+        if fault := action_fault(output, self._space, observations.get(ACTION_MASK)):
             raise _Forfeited(self._agent, fault)
-        return given if self._with_probabilities else replace(given, dist_inputs=None)
+        return output if self._with_probabilities else replace(output, dist_inputs=None)
 
 
 def _score(
@@ -358,8 +358,8 @@ def _score(
         return None
     agents = list(interface.agents)
     side_of = agent_sides(agents, interface)
-    own = side_of[agents.index(agent)]
-    sides = [int(side != own) for side in range(len(interface.sides))]
+    own_side = side_of[agents.index(agent)]
+    sides = [int(side != own_side) for side in range(len(interface.sides))]
     forfeited = {sides[side_of[agents.index(forfeit.agent)]]} if forfeit else set()
-    values = contestant_returns([returns[each] for each in agents], side_of, sides)
+    values = contestant_returns([returns[name] for name in agents], side_of, sides)
     return scores([values], "game", [forfeited])[0][0]

@@ -122,6 +122,6 @@ def recorded_steps(
 
 def _forfeits(match: Match, game: int) -> tuple[dict[str, str], ...]:
     return tuple(
-        {"agent": each.agent, "ref": match.contestants[each.contestant], "reason": each.reason}
-        for each in match.games[game].forfeits
+        {"agent": forfeit.agent, "ref": match.contestants[forfeit.contestant], "reason": forfeit.reason}
+        for forfeit in match.games[game].forfeits
     )

@@ -210,12 +210,12 @@ def recorded_game(match: str, game: int, registry: Registry, chances: bool = Fal
 
 def _graphs(controllers: Mapping[str, str], registry: Registry, interface: Interface) -> dict[str, Policy]:
     """agent → policy, for agents controlled by versions that still exist."""
-    found: dict[str, Mapping[str, tuple[str, Policy]]] = {}
+    contestants: dict[str, Mapping[str, tuple[str, Policy]]] = {}
     for ref in set(controllers.values()):
         if isinstance(parse_ref(ref), CheckpointRef):
             with suppress(LeagueError):
-                found[ref] = contestant(ref, registry, interface)
-    return {agent: found[ref][agent][1] for agent, ref in controllers.items() if ref in found}
+                contestants[ref] = contestant(ref, registry, interface)
+    return {agent: contestants[ref][agent][1] for agent, ref in controllers.items() if ref in contestants}
 
 
 def _forfeits(match: Match, game: int) -> str | None:

@@ -66,7 +66,7 @@ def play_game(
     yield GameStep(step, (), (), dict(returns), not turn.batches, _acting(turn, agents))
     while turn.batches:
         answers = {agent: policies[agent].act(batch) for agent, batch in turn.batches.items()}
-        turn = environment.step({agent: chosen for agent, (chosen, _) in answers.items()})
+        turn = environment.step({agent: action for agent, (action, _) in answers.items()})
         step += 1
         for agent, batch in turn.batches.items():
             returns[agents[agent]] += float(batch.rewards[0])
@@ -116,13 +116,13 @@ class _AgentPolicy:
 
     def act(self, batch: Batch) -> tuple[NDArray, Move]:
         """Actions (1, …) for a batch of this agent alone, and the move."""
-        given = policy_output(self._policy, batch.observations, self._state, [self._draws], self._explore)
-        for fault in given.faults.values():
+        output = policy_output(self._policy, batch.observations, self._state, [self._draws], self._explore)
+        for fault in output.faults.values():
             raise GameCrashed(f"{self._agent} has no action{cause(fault)}") from fault
-        self._state, inputs = given.state, given.dist_inputs
-        seen = {name: array[0] for name, array in batch.observations.items()}
-        move = Move(self._agent, seen, given.actions[0].tolist(), None if inputs is None else inputs[0])
-        return given.actions, move
+        self._state, inputs = output.state, output.dist_inputs
+        observation = {name: array[0] for name, array in batch.observations.items()}
+        move = Move(self._agent, observation, output.actions[0].tolist(), None if inputs is None else inputs[0])
+        return output.actions, move
 
 
 def _acting(turn: Turn, agents: Sequence[str]) -> tuple[str, ...]:

@@ -274,7 +274,7 @@ def render_modes(config: EnvironmentConfig) -> list[str]:
     environment = build(config)
     metadata = getattr(environment, "metadata", None) or {}
     environment.close()
-    return [str(known) for known in metadata.get("render_modes") or ()]
+    return [str(mode) for mode in metadata.get("render_modes") or ()]
 
 
 def _require(source: GameSource, mode: str) -> None:
@@ -291,13 +291,13 @@ def _write(spool: IO[bytes], out: Path, seconds: Sequence[float]) -> None:
     with disk_errors(out, action="written"), replacing(out) as part, Image.open(spool) as frames:
         # GIF: Pillow's own choice of colours, a median cut, loses those of the small discs of the legend.
         few = (frame.quantize(method=Image.Quantize.FASTOCTREE) for frame in ImageSequence.Iterator(frames))
-        first, rest = (next(few), few) if kind == "GIF" else (frames, ())
+        first, later_frames = (next(few), few) if kind == "GIF" else (frames, ())
         first.save(
             part,
             kind,
             save_all=True,
-            append_images=rest,
-            duration=[round(1000 * each) for each in seconds],
+            append_images=later_frames,
+            duration=[round(1000 * duration) for duration in seconds],
             loop=0,
             quality=85,
         )

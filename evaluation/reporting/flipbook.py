@@ -132,7 +132,9 @@ class _Kept:
         self.steps.append(step)
         while self._are_too_many():
             self.every *= 2
-            self.steps = [each for each in self.steps if self.wants(each.step) or (is_last and each is step)]
+            self.steps = [
+                kept_step for kept_step in self.steps if self.wants(kept_step.step) or (is_last and kept_step is step)
+            ]
 
     def _are_too_many(self) -> bool:
         size = sum(len(step.picture or "") for step in self.steps)

@@ -20,7 +20,9 @@ def why_not_champion(registry: Registry, league: str, leaderboard: Sequence[Stan
 
     A script, bot or remote model cannot become champion: the explanation is about the best version.
     """
-    versions = [each for each in leaderboard if each.rating is not None and _is_version_of(league, each.ref)]
+    versions = [
+        standing for standing in leaderboard if standing.rating is not None and _is_version_of(league, standing.ref)
+    ]
     champion = registry.aliases.current(league).get(CHAMPION)
     if not versions or versions[0].ref == f"{league}@{champion}":
         return None
@@ -37,7 +39,9 @@ def _is_version_of(league: str, ref: str) -> bool:
 
 def _overlap(best: Standing, leaderboard: Sequence[Standing], champion: int | None) -> str:
     """Whether the difference of the two ratings may be chance."""
-    holder = next((each for each in leaderboard if each.ref == f"{best.ref.partition('@')[0]}@{champion}"), None)
+    holder = next(
+        (standing for standing in leaderboard if standing.ref == f"{best.ref.partition('@')[0]}@{champion}"), None
+    )
     if champion is None:
         return ""
     if holder is None or holder.rating is None:

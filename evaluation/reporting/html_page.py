@@ -171,7 +171,12 @@ def _span(row: Standing) -> str:
 def _whisker(row: Standing, rows: Sequence[Standing]) -> Markup | str:
     if row.rating is None:
         return ""
-    values = [value for each in rows if each.rating is not None for value in (each.rating, *(each.interval or ()))]
+    values = [
+        value
+        for standing in rows
+        if standing.rating is not None
+        for value in (standing.rating, *(standing.interval or ()))
+    ]
     return charts.whisker(row.rating, row.interval, (min(values), max(values)))
 
 
@@ -275,8 +280,8 @@ def _players(game: Flipbook) -> list[str]:
     if len(game.players) <= 6:
         crowds = {agent: [agent] for agent in game.players}
     lines = []
-    for own in crowds.values():
-        mean = sum(game.returns[agent] for agent in own) / len(own)
-        names = own[0] if len(own) == 1 else f"{own[0]} and {len(own) - 1} more"
-        lines.append(f"{names}: {game.players[own[0]]}, return {_signed(mean)}")
+    for crowd in crowds.values():
+        mean = sum(game.returns[agent] for agent in crowd) / len(crowd)
+        names = crowd[0] if len(crowd) == 1 else f"{crowd[0]} and {len(crowd) - 1} more"
+        lines.append(f"{names}: {game.players[crowd[0]]}, return {_signed(mean)}")
     return lines

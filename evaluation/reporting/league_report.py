@@ -83,7 +83,7 @@ def league_report(
     verdicts, events = registry.verdicts.all(league), registry.aliases.history(league)
     played = CountedGames(registry, row, MAX_UPSETS)
     table = played.payoff()
-    shown = {verdict.id for verdict in verdicts[-MOST_VERDICTS:]}
+    reported_ids = {verdict.id for verdict in verdicts[-MOST_VERDICTS:]}
     champion = registry.aliases.current(league).get(CHAMPION)
     leaderboard = played.leaderboard
     return LeagueReport(
@@ -105,7 +105,7 @@ def league_report(
         versions=tuple(rated_version(version, leaderboard, events) for version in versions),
         roles={version.ref: role for version in versions if (role := _role(version))},
         verdicts=tuple(
-            verdict_evidence(registry, verdict, events) for verdict in reversed(verdicts) if verdict.id in shown
+            verdict_evidence(registry, verdict, events) for verdict in reversed(verdicts) if verdict.id in reported_ids
         ),
         promotions=tuple(_promotion(event) for event in events),
         upsets=flipbooks(registry, league, played.greatest_upsets(), pictures),

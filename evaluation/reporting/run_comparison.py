@@ -87,7 +87,9 @@ def compare_runs(registry: Registry, first: str, second: str) -> RunComparison:
 
 
 def _compared(registry: Registry, row: RunRow) -> ComparedRun:
-    published = [each.ref for each in registry.versions.all(row.league) if each.source.partition("/")[0] == row.id]
+    published = [
+        version.ref for version in registry.versions.all(row.league) if version.source.partition("/")[0] == row.id
+    ]
     return ComparedRun(
         league=row.league,
         run=row.id,

@@ -36,5 +36,5 @@ def margin_unit(model: str) -> str:
 def _compared(test: CompanionReport, preposition: str, other: str, by: str) -> str:
     """An undecided test shows nothing about the margin."""
     is_decided = test.outcome not in ("inconclusive", "open")
-    found = f"{preposition} {other} {by}".rstrip() if is_decided else f"compared with {other}"
-    return f"{test.outcome} {found} after {test.games} games"
+    comparison = f"{preposition} {other} {by}".rstrip() if is_decided else f"compared with {other}"
+    return f"{test.outcome} {comparison} after {test.games} games"

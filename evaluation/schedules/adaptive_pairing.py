@@ -70,21 +70,21 @@ def _chosen(points: Floats, games: Floats, number: int, comparisons: int) -> lis
     gap = strength[first] - strength[second]
     at_once = math.ceil(number / (STEPS * len(games)))
     information = at_once * comparisons * expit(gap) * expit(-gap)
-    chosen: list[Pairing] = []
-    while len(chosen) < number:
+    pairings: list[Pairing] = []
+    while len(pairings) < number:
         covariance = _inverse(precision)
-        own = np.diag(covariance)
-        variance = own[first] + own[second] - 2 * covariance[first, second]
+        diagonal = np.diag(covariance)
+        variance = diagonal[first] + diagonal[second] - 2 * covariance[first, second]
         gain = information * variance
         value = ndtr(-np.abs(gap) / np.sqrt(variance)) * gain / (1 + gain)
         for pair in _disjoint(value, first, second):
             i, j = int(first[pair]), int(second[pair])
-            chosen += [(i, j)] * at_once
+            pairings += [(i, j)] * at_once
             precision[[i, j], [i, j]] += information[pair]
             precision[[i, j], [j, i]] -= information[pair]
-            if len(chosen) >= number:
+            if len(pairings) >= number:
                 break
-    return chosen[:number]
+    return pairings[:number]
 
 
 def tally(contestants: Mapping[str, int], results: Iterable[BlockResult]) -> tuple[Floats, Floats]:

@@ -65,16 +65,16 @@ class GamePlans:
 
 def game_plans(schedule: Schedule, positions: Sequence[int]) -> GamePlans:
     """Return the games of the matches at `positions` of `schedule`, in order."""
-    each = np.repeat(np.asarray(positions, dtype=np.int64), GAMES_PER_BLOCK)
+    game_positions = np.repeat(np.asarray(positions, dtype=np.int64), GAMES_PER_BLOCK)
     indices = np.tile(np.arange(GAMES_PER_BLOCK), len(positions))
     pairings = np.array(schedule.pairings, dtype=np.int64)
     seats = np.repeat([schedule.seat_at(position) for position in positions], GAMES_PER_BLOCK)
     has_seat = np.arange(len(schedule.sides)) == seats[:, np.newaxis]
     return GamePlans(
-        positions=each,
+        positions=game_positions,
         indices=indices,
         seeds=np.repeat(np.array(schedule.seeds_at(positions), dtype=np.int64), GAMES_PER_BLOCK),
-        contestants=pairings[each % len(pairings)],
+        contestants=pairings[game_positions % len(pairings)],
         sides=np.where(has_seat, indices[:, np.newaxis], 1 - indices[:, np.newaxis]),
     )
 
@@ -258,8 +258,8 @@ def _turns(interface: Interface) -> int:
 def too_few(league: str, contestants: Sequence[str]) -> EnvironmentMismatch:
     """Return the error for a schedule without a pair of contestants."""
     different = list(dict.fromkeys(contestants))
-    given = f"{len(different)}: {', '.join(different)}" if different else "none"
-    return EnvironmentMismatch(f"a schedule of league {league} needs at least two contestants, got {given}")
+    summary = f"{len(different)}: {', '.join(different)}" if different else "none"
+    return EnvironmentMismatch(f"a schedule of league {league} needs at least two contestants, got {summary}")
 
 
 def _schedule(

@@ -59,12 +59,12 @@ def earlier_results(registry: Registry, league: LeagueRow) -> list[EarlierResult
         is_earlier = schedule.conditions != league.conditions and schedule.scoring != "team"
         if is_earlier and schedule.id not in purged and schedule.id in played:
             matches[schedule.conditions] += played[schedule.id]
-    found = []
+    results = []
     for conditions, number in reversed(matches.items()):
         game = games.get(conditions.game_digest)
         same_game = conditions.game_digest == league.game_digest
         changes = () if same_game else game_changes(game.game, league.game) if game and game.game else None
-        found.append(
+        results.append(
             EarlierResults(
                 conditions=conditions,
                 matches=number,
@@ -73,19 +73,19 @@ def earlier_results(registry: Registry, league: LeagueRow) -> list[EarlierResult
                 replaced_at=game.replaced_at if game else None,
             )
         )
-    return found
+    return results
 
 
 def refresh_earlier_results(registry: Registry, league: str) -> None:
     """Recompute the stale tables of results under earlier conditions. Raises UnknownLeague."""
-    row, known = registry.leagues.get(league), registry.snapshots.marks(league)
+    row, marks = registry.leagues.get(league), registry.snapshots.marks(league)
     for results in earlier_results(registry, row):
         name, mark = results.conditions.name, f"{FORMAT}; {results.matches} matches; {row.interface_digest}"
-        if known.get(earlier_part(name, "leaderboard")) == mark:
+        if marks.get(earlier_part(name, "leaderboard")) == mark:
             continue
         played = CountedGames(registry, row, conditions=results.conditions)
-        found = tables(played, list(row.interface.sides))
-        registry.snapshots.put(league, {earlier_part(name, part): table for part, table in found.items()}, mark)
+        documents = tables(played, list(row.interface.sides))
+        registry.snapshots.put(league, {earlier_part(name, part): table for part, table in documents.items()}, mark)
 
 
 def tables(played: CountedGames, sides: Sequence[str], not_champion: str | None = None) -> dict[str, Any]:
@@ -99,7 +99,9 @@ def tables(played: CountedGames, sides: Sequence[str], not_champion: str | None 
         "leaderboard": {
             "sides": list(sides),
             "leaderboard": [standing.to_json() for standing in played.leaderboard],
-            "by_side": {side: [each.to_json() for each in own] for side, own in played.by_side().items()},
+            "by_side": {
+                side: [standing.to_json() for standing in standings] for side, standings in played.by_side().items()
+            },
             "not_champion": not_champion,
         },
         "payoff": payoff.to_json() if payoff else None,

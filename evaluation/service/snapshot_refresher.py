@@ -56,8 +56,12 @@ class SnapshotRefresher:
 
     def _stale(self) -> str | None:
         """The league whose snapshots have been stale for longest."""
-        now = time.monotonic()
-        waiting = (league for league in self._registry.snapshots.stale() if now >= self._not_before.get(league, now))
+        current_time = time.monotonic()
+        waiting = (
+            league
+            for league in self._registry.snapshots.stale()
+            if current_time >= self._not_before.get(league, current_time)
+        )
         return next(waiting, None)
 
     def _refresh(self, league: str) -> None:

@@ -70,7 +70,7 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
             "sides": sides,
             "environment": row.config.environment.entry_point,
             "environment_digest": row.environment_digest,
-            "earlier": [each.to_json() for each in earlier_results(registry, row)],
+            "earlier": [results.to_json() for results in earlier_results(registry, row)],
         },
         **tables(played, sides, why_not_champion(registry, league, leaderboard)),
         "ratings": {"versions": versions},
@@ -79,11 +79,11 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
 
 def _refresh_verdicts(registry: Registry, league: str) -> None:
     """Recompute stale verdicts, newest first."""
-    known, events = registry.snapshots.marks(league), registry.aliases.history(league)
+    marks, events = registry.snapshots.marks(league), registry.aliases.history(league)
     played = Ledger(registry).counts(league)
     for verdict in reversed(registry.verdicts.all(league)):
         part, mark = f"verdict/{verdict.id}", _mark(verdict, events, played)
-        if known.get(part) == mark:
+        if marks.get(part) == mark:
             continue
         try:
             document = verdict_evidence(registry, verdict, events).to_json()

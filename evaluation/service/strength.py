@@ -35,21 +35,21 @@ def strength_opponents(registry: Registry, version: VersionRow) -> list[str]:
     if version.exploits is not None:
         return [version.exploits]
     league = registry.leagues.get(version.league)
-    wanted = [f"@{CHAMPION}", *(anchor.ref for anchor in league.config.gate.anchors)]
-    champion, *anchors = (_opponent(registry, version, ref) for ref in wanted)
-    anchor = next((each for each in anchors if each not in (None, champion)), ANCHOR)
-    return [each for each in (champion, anchor) if each is not None]
+    refs = [f"@{CHAMPION}", *(anchor.ref for anchor in league.config.gate.anchors)]
+    champion, *anchors = (_opponent(registry, version, ref) for ref in refs)
+    anchor = next((opponent for opponent in anchors if opponent not in (None, champion)), ANCHOR)
+    return [opponent for opponent in (champion, anchor) if opponent is not None]
 
 
 def _opponent(registry: Registry, version: VersionRow, ref: str) -> str | None:
     """A reference that is pinned; None if it does not exist, cannot play, or is the version itself."""
     config = registry.leagues.get(version.league).config
     try:
-        found = pinned(of_league(ref, version.league), version.league, registry)
-        check_eligible(found, registry, config)
+        opponent = pinned(of_league(ref, version.league), version.league, registry)
+        check_eligible(opponent, registry, config)
     except (UnknownAlias, EnvironmentMismatch):
         return None
-    return None if found == version.ref else found
+    return None if opponent == version.ref else opponent
 
 
 def measure_strength(registry: Registry, worker: MatchWorker, number: int, games: int) -> list[StrengthRow]:

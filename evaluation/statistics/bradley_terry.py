@@ -256,18 +256,18 @@ class _Model:
         factor = self._factor or _factor(self._design, information.mean(axis=0))
         x, residual = np.zeros_like(gradient), gradient
         towards = solved = cho_solve(factor, residual.T, check_finite=False).T
-        left = (residual * solved).sum(axis=1)
-        enough = PRECISE**2 * left
+        squared_norm = (residual * solved).sum(axis=1)
+        enough = PRECISE**2 * squared_norm
         for _ in range(MOST_DIRECTIONS):
-            if not (left > enough).any():
+            if not (squared_norm > enough).any():
                 break
             curved = (information * (towards @ self._design.T)) @ self._design
             # A converged row has a residual of zero.
-            length = (left / np.maximum((towards * curved).sum(axis=1), TINY))[:, None]
+            length = (squared_norm / np.maximum((towards * curved).sum(axis=1), TINY))[:, None]
             x, residual = x + length * towards, residual - length * curved
             solved = cho_solve(factor, residual.T, check_finite=False).T
-            before, left = left, (residual * solved).sum(axis=1)
-            towards = solved + (left / np.maximum(before, TINY))[:, None] * towards
+            before, squared_norm = squared_norm, (residual * solved).sum(axis=1)
+            towards = solved + (squared_norm / np.maximum(before, TINY))[:, None] * towards
         return x
 
 

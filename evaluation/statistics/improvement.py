@@ -76,20 +76,20 @@ def stratified_bootstrap(
         confidence: Coverage of the interval.
         seed: Seed of the resamples.
     """
-    given = [_scores(each) for each in scores]
+    matrices = [_scores(matrix) for matrix in scores]
     rng = np.random.default_rng(seed)
-    values = [statistic(*(_redrawn(each, rng) for each in given)) for _ in range(resamples)]
-    tail = _expanded((1 - confidence) / 2, given)
+    values = [statistic(*(_redrawn(matrix, rng) for matrix in matrices)) for _ in range(resamples)]
+    tail = _expanded((1 - confidence) / 2, matrices)
     low, high = np.quantile(values, [tail, 1 - tail])
-    return BootstrapEstimate(statistic(*given), float(low), float(high))
+    return BootstrapEstimate(statistic(*matrices), float(low), float(high))
 
 
 def _expanded(tail: float, scores: Sequence[Floats]) -> float:
     """Quantile of bootstrap values at which the interval leaves `tail` on either side."""
-    fewest = min(len(each) for each in scores)
+    fewest = min(len(matrix) for matrix in scores)
     if fewest == 1:
         return 0.0
-    freedom = sum(each.shape[1] * (len(each) - 1) for each in scores)
+    freedom = sum(matrix.shape[1] * (len(matrix) - 1) for matrix in scores)
     return float(ndtr(-math.sqrt(fewest / (fewest - 1)) * stdtrit(freedom, 1 - tail)))
 
 

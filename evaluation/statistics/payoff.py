@@ -40,10 +40,10 @@ def paired_difference(matches: Iterable[Match], contestant: str, confidence: flo
     """
     gaps = []
     for match in matches:
-        own = match.contestants.index(contestant)
-        mine, other = match.mean_return(own), match.mean_return(1 - own)
-        if mine is not None and other is not None:
-            gaps.append(mine - other)
+        index = match.contestants.index(contestant)
+        own_return, other_return = match.mean_return(index), match.mean_return(1 - index)
+        if own_return is not None and other_return is not None:
+            gaps.append(own_return - other_return)
     return student_interval(gaps, confidence) if gaps else None
 
 
@@ -139,8 +139,8 @@ def tabulate(contestants: Sequence[str], sides: Sequence[str], matches: Iterable
 
 def only_side(game: Game, contestant: int) -> int | None:
     """The side that a contestant played in a game, or None if it played several or none."""
-    own = [side for side, player in enumerate(game.sides) if player == contestant]
-    return own[0] if len(own) == 1 else None
+    sides = [side for side, player in enumerate(game.sides) if player == contestant]
+    return sides[0] if len(sides) == 1 else None
 
 
 class _PairTotals:

@@ -80,11 +80,11 @@ def shares(payoff: Payoff, matches: Sequence[Match]) -> tuple[PopulationShare, .
 
 def without_holes(payoff: Payoff) -> list[str]:
     """Contestants in the order of the matrix, each of which has met all contestants selected before it."""
-    taken: list[int] = []
+    selection: list[int] = []
     for i in range(len(payoff.contestants)):
-        if all(payoff.games[i][j] for j in taken):
-            taken.append(i)
-    return [payoff.contestants[i] for i in taken]
+        if all(payoff.games[i][j] for j in selection):
+            selection.append(i)
+    return [payoff.contestants[i] for i in selection]
 
 
 def resampled_scores(

@@ -181,11 +181,11 @@ BOLDNESS = 0.75
 
 def _log_wealth(x: Floats, mean: float) -> Floats:
     """Log wealth of a bettor against H0: mean of x in [0, 1] ≤ `mean`, `sum ln(1 + bet (x - mean))`."""
-    seen = np.arange(1, x.shape[-1] + 1)
+    sample_sizes = np.arange(1, x.shape[-1] + 1)
     before = np.cumsum(x, axis=-1) - x
-    guess = (0.5 + before) / seen
-    deviations = (x - (0.5 + np.cumsum(x, axis=-1)) / (seen + 1)) ** 2
-    variance = (0.25 + np.cumsum(deviations, axis=-1) - deviations) / seen
+    guess = (0.5 + before) / sample_sizes
+    deviations = (x - (0.5 + np.cumsum(x, axis=-1)) / (sample_sizes + 1)) ** 2
+    variance = (0.25 + np.cumsum(deviations, axis=-1) - deviations) / sample_sizes
     edge = guess - mean
     bet = np.clip(edge / (variance + edge**2), 0.0, BOLDNESS / mean)
     return np.asarray(np.cumsum(np.log1p(bet * (x - mean)), axis=-1))

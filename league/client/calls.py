@@ -115,10 +115,10 @@ def promote(ref: str, alias: str, expected: int | None, reason: str | None, key:
     Raises InvalidReference or InvalidInput.
     """
     shares = parse_mixture(ref) if is_mixture(ref) else {CheckpointRef.parse(ref): 1.0}
-    for each in shares:
-        if not isinstance(each.version, int):
-            raise InvalidInput(f"{each} is an alias, expected a version number")
-    members = [{"version": each.version, "probability": share} for each, share in shares.items()]
+    for member in shares:
+        if not isinstance(member.version, int):
+            raise InvalidInput(f"{member} is an alias, expected a version number")
+    members = [{"version": member.version, "probability": share} for member, share in shares.items()]
     body: JsonObject = {"members": members} if is_mixture(ref) else {"version": members[0]["version"]}
     if expected is not ANY:
         body["expected"] = expected
@@ -172,14 +172,14 @@ def outdated_replicas(league: JsonObject, promotion: Promotion) -> list[str]:
     if not league["replicas"]:
         return ["no replica has reported the versions that it serves"]
     outdated = [
-        each
-        for each in league["replicas"]
-        if each["aliases"].get(alias) != version or (each["event"] or 0) < promotion.event
+        replica
+        for replica in league["replicas"]
+        if replica["aliases"].get(alias) != version or (replica["event"] or 0) < promotion.event
     ]
     return [
-        f"{each['replica']} served {each['aliases'].get(alias)} {each['silent_seconds']:.0f} s ago"
-        f" ({each['fault'] or 'no error'})"
-        for each in outdated
+        f"{replica['replica']} served {replica['aliases'].get(alias)} {replica['silent_seconds']:.0f} s ago"
+        f" ({replica['fault'] or 'no error'})"
+        for replica in outdated
     ]
 
 
@@ -204,5 +204,5 @@ def _move_alias(path: str, body: JsonObject, reason: str | None, key: str | None
 
 def _parse_promotion(body: JsonObject, _: str) -> Promotion:
     """Ignores unknown fields, which newer servers may send."""
-    known = {each.name for each in fields(Promotion)}
-    return Promotion(**{name: value for name, value in body.items() if name in known})
+    field_names = {promotion_field.name for promotion_field in fields(Promotion)}
+    return Promotion(**{name: value for name, value in body.items() if name in field_names})

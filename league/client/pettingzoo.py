@@ -119,18 +119,18 @@ class _Actors:
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, tuple[Any, ActionResponse | None]]:
         """Return the action of each agent, with the server's response."""
-        chosen: dict[str, tuple[Any, ActionResponse | None]] = {}
+        actions: dict[str, tuple[Any, ActionResponse | None]] = {}
         requested: dict[str, dict[str, Any]] = {}
         for agent, observation in observations.items():
             player = self._players[agent]
             if isinstance(player, str):
                 requested.setdefault(player, {})[agent] = observation
             else:
-                chosen[agent] = player(observation), None
+                actions[agent] = player(observation), None
         for name, of_model in requested.items():
-            chosen |= self._request(self._models[name], of_model)
+            actions |= self._request(self._models[name], of_model)
         self._time += 1
-        return chosen
+        return actions
 
     def _request(
         self, controlled: _ModelState, observations: dict[str, Any]
@@ -179,11 +179,11 @@ def _play_parallel(environment: Any, actors: _Actors, seed: int | None) -> Itera
     observations, _ = environment.reset(seed=seed)
     while environment.agents:
         before = deepcopy({agent: observations[agent] for agent in environment.agents})
-        chosen = actors.act(before)
+        actions = actors.act(before)
         observations, rewards, terminations, truncations, _ = environment.step(
-            {agent: action for agent, (action, _) in chosen.items()}
+            {agent: action for agent, (action, _) in actions.items()}
         )
-        for agent, (action, response) in chosen.items():
+        for agent, (action, response) in actions.items():
             yield Step(
                 agent,
                 before[agent],

@@ -149,8 +149,8 @@ class BatchActionRequest:
         state: Sequence[str | None] | None = None,
     ) -> "BatchActionRequest":
         """For the arguments see `Client.act_batch`. Raises InvalidInput."""
-        given: int | list[int] | None = list(seed) if isinstance(seed, Sequence) else seed
-        used_seed = _used_seed(explore, given)
+        requested_seed: int | list[int] | None = list(seed) if isinstance(seed, Sequence) else seed
+        used_seed = _used_seed(explore, requested_seed)
         states = None if state is None else list(state)
         body = {"observations": [encode(row, encoding) for row in split_batch(observations)]}
         return cls(_body(body, explore, used_seed, probabilities, states), used_seed)

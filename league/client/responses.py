@@ -137,7 +137,7 @@ def parse_batch_action_response(
         body["sha256"],
         replica,
         seed,
-        None if probabilities is None else [_decode_probabilities(each) for each in probabilities],
+        None if probabilities is None else [_decode_probabilities(distribution) for distribution in probabilities],
         body.get("state"),
     )
 
@@ -159,5 +159,5 @@ def _decode_probabilities(value: Any) -> Probabilities:
     if isinstance(value, dict):
         return {name: np.asarray(part) for name, part in value.items()}
     if value and isinstance(value[0], list):
-        return [np.asarray(each) for each in value]
+        return [np.asarray(component) for component in value]
     return np.asarray(value)

@@ -22,13 +22,13 @@ class UniqueKeyLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Return the mapping. Raises ConstructorError for a repeated key."""
-        seen = set[tuple[str, str]]()
+        earlier_keys = set[tuple[str, str]]()
         for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in earlier_keys:
                 raise yaml.constructor.ConstructorError(
                     problem=f"the key {key.value!r} occurs twice", problem_mark=key.start_mark
                 )
-            seen.add((key.tag, str(key.value)))
+            earlier_keys.add((key.tag, str(key.value)))
         return super().construct_mapping(node, deep)
 
 

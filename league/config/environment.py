@@ -79,7 +79,7 @@ class EnvironmentConfig(Part):
 
     def code(self) -> JSON:
         """Return what identifies the environment's code: revision or source digest, and the versions of libraries."""
-        found = environment_code(self.resolved_entry_point, self.folder)
-        identity: JSON = {"source": found.source} if self.revision is None else {"revision": self.revision}
-        libraries = found.libraries | ({"supersuit": version("supersuit")} if self.wrappers else {})
+        code = environment_code(self.resolved_entry_point, self.folder)
+        identity: JSON = {"source": code.source} if self.revision is None else {"revision": self.revision}
+        libraries = code.libraries | ({"supersuit": version("supersuit")} if self.wrappers else {})
         return {f"environment.{name}": value for name, value in identity.items()} | libraries

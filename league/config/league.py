@@ -99,8 +99,8 @@ class LeagueConfig(Part):
     @property
     def training_openings(self) -> int:
         """Maximum number of random moves at the start of an episode of training."""
-        own = self.training.opening_plies
-        return self.play.opening_plies if own is None else own
+        training_plies = self.training.opening_plies
+        return self.play.opening_plies if training_plies is None else training_plies
 
     def game(self) -> JSON:
         """Return what decides results: the environment's settings and code, and the rules of play, as flat JSON.
@@ -175,10 +175,10 @@ def _large_integers(value: Any, key: str = "") -> Iterator[str]:
 
 def _with_folder(document: Any, path: Path) -> Any:
     """Make `folder` absolute. Invalid documents are returned as they are."""
-    given = document.get("folder") if isinstance(document, Mapping) else 0
-    if not isinstance(given, str | None):
+    configured_folder = document.get("folder") if isinstance(document, Mapping) else 0
+    if not isinstance(configured_folder, str | None):
         return document
-    folder = (path.parent / (given or "")).resolve()
+    folder = (path.parent / (configured_folder or "")).resolve()
     if not folder.is_dir():
         raise ConfigError(f"{path}: folder: {folder} is not a directory")
     return {**document, "folder": str(folder)}

@@ -16,8 +16,8 @@ def channels_of(shape: Sequence[int]) -> Channels:
 
     Boards have few rows and many planes, so a first axis that is only a little shorter are rows.
     """
-    first, *others = shape
-    return "first" if 2 * first <= min(others) else "last"
+    first, *other_lengths = shape
+    return "first" if 2 * first <= min(other_lengths) else "last"
 
 
 class ConvolutionConfig(Part):

@@ -82,10 +82,10 @@ class Fault:
             return cls(tuple(path), kind, f"got {detail['input']!r}", expected=(TYPES[kind],))
         if detail["type"] != "extra_forbidden" or path[-1] in RENAMED_KEYS:
             return cls(tuple(path), detail["type"], _message(detail, path))
-        known = _known_keys(known_by, path[start:-1])
-        if guesses := difflib.get_close_matches(str(path[-1]), known, n=1):
+        known_keys = _known_keys(known_by, path[start:-1])
+        if guesses := difflib.get_close_matches(str(path[-1]), known_keys, n=1):
             return cls(tuple(path), "extra_forbidden", f"unknown key, did you mean {guesses[0]!r}?", guesses[0])
-        listed = f", expected one of {', '.join(sorted(known))}" if known else ""
+        listed = f", expected one of {', '.join(sorted(known_keys))}" if known_keys else ""
         return cls(tuple(path), "extra_forbidden", "unknown key", known=listed)
 
     @property
@@ -134,12 +134,12 @@ def _without_consequences(faults: list[Fault]) -> list[Fault]:
 
 def _by_value(faults: list[Fault]) -> list[Fault]:
     """Combine the faults of a value that has none of several types."""
-    found: dict[tuple[Any, ...], Fault] = {}
+    combined_faults: dict[tuple[Any, ...], Fault] = {}
     for fault in faults:
         key = (fault.path, fault.message)
-        expected = (*(found[key].expected if key in found else ()), *fault.expected)
-        found[key] = replace(fault, expected=tuple(dict.fromkeys(expected)))
-    return list(found.values())
+        expected = (*(combined_faults[key].expected if key in combined_faults else ()), *fault.expected)
+        combined_faults[key] = replace(fault, expected=tuple(dict.fromkeys(expected)))
+    return list(combined_faults.values())
 
 
 def _known_keys(model: type[BaseModel], path: list[str | int]) -> list[str]:
@@ -148,7 +148,7 @@ def _known_keys(model: type[BaseModel], path: list[str | int]) -> list[str]:
     for part in path:
         annotations = [below for annotation in annotations for below in _below(annotation, part)]
     models = [member for annotation in annotations for member in _members(annotation) if _is_model(member)]
-    return [field.alias or name for found in models for name, field in found.model_fields.items()]
+    return [field.alias or name for submodel in models for name, field in submodel.model_fields.items()]
 
 
 def _below(annotation: Any, part: str | int) -> Iterator[Any]:

@@ -272,8 +272,8 @@ class MultiAgentAdapter(_Simultaneous):
                 is_over = terminated.get("__all__", False) or truncated.get("__all__", False)
                 if is_over:
                     # Agents without their own flag get that of the episode.
-                    left = {*self._present, *observations}
-                    terminated, truncated = _for_all(left, terminated, truncated)
+                    present_agents = {*self._present, *observations}
+                    terminated, truncated = _for_all(present_agents, terminated, truncated)
                 reports = ended + self._reports(self._kept(observations), rewards, terminated, truncated)
             except UNFIT:
                 self._check("step", STEP, returned)
@@ -335,11 +335,11 @@ def _for_all(
     agents: Iterable[str], terminated: Mapping[str, bool], truncated: Mapping[str, bool]
 ) -> tuple[dict[str, bool], dict[str, bool]]:
     """Add the flags of `__all__` for all `agents` without a flag."""
-    rest = [agent for agent in agents if not _flag(agent, terminated, truncated)]
+    unflagged_agents = [agent for agent in agents if not _flag(agent, terminated, truncated)]
     all_terminated = bool(terminated.get("__all__", False))
     return (
-        dict(terminated) | dict.fromkeys(rest, all_terminated),
-        dict(truncated) | dict.fromkeys(rest, not all_terminated),
+        dict(terminated) | dict.fromkeys(unflagged_agents, all_terminated),
+        dict(truncated) | dict.fromkeys(unflagged_agents, not all_terminated),
     )
 
 

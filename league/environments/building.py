@@ -100,16 +100,16 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
         if _refuses_arguments(constructor, kwargs, error):
             raise ConfigError(f"environment.kwargs: {config.entry_point} does not accept them: {error}") from error
         raise ConfigError(f"environment.entry_point: {config.entry_point} cannot be created{cause(error)}") from error
-    found = api_of(env, config.api)
-    if found is None or config.api not in (None, found):
+    api = api_of(env, config.api)
+    if api is None or config.api not in (None, api):
         expected = NAMES[config.api] if config.api else "an environment of PettingZoo (AEC or Parallel) or RLlib"
         raise ConfigError(
             f"environment.entry_point: {config.entry_point} returned a {type(env).__name__}, expected {expected}"
         )
-    env = with_api(_without_checks(env), found)
+    env = with_api(_without_checks(env), api)
     for amend in AMENDMENTS:
         env = amend(env)
-    if config.wrappers and found == "rllib":
+    if config.wrappers and api == "rllib":
         raise ConfigError(
             f"environment.wrappers: {config.wrappers[0].name} (number 1): SuperSuit supports only PettingZoo"
             " environments; for an RLlib environment, transform observations in its own code"
@@ -269,8 +269,12 @@ def describe_policies(interface: Interface) -> str:
     """Return a human-readable sentence: the policies with their agents."""
     parts = []
     for policy in interface.policy_ids:
-        own = [agent for agent in interface.agents if interface.policies[agent] == policy]
-        agents = ", ".join(own) if len(own) <= 3 else f"{own[0]} and {len(own) - 1} more"
+        policy_agents = [agent for agent in interface.agents if interface.policies[agent] == policy]
+        agents = (
+            ", ".join(policy_agents)
+            if len(policy_agents) <= 3
+            else f"{policy_agents[0]} and {len(policy_agents) - 1} more"
+        )
         parts.append(f"{policy} ({agents})")
     return f"{'Policy' if len(parts) == 1 else 'Policies'}: {', '.join(parts)}."
 
@@ -317,9 +321,9 @@ def _check_action_names(play: PlayConfig, agents: dict[str, AgentInterface], pol
     actions = {policy: agents[agent].action for agent, policy in policies.items()}
     for policy in play.action_names if isinstance(play.action_names, dict) else ():
         if not isinstance(actions.get(policy), Discrete):
-            known = ", ".join(name for name, space in actions.items() if isinstance(space, Discrete))
+            policy_ids = ", ".join(name for name, space in actions.items() if isinstance(space, Discrete))
             raise ConfigError(
-                f"play.action_names.{policy}: expected a policy with Discrete actions ({known or 'there is none'})"
+                f"play.action_names.{policy}: expected a policy with Discrete actions ({policy_ids or 'there is none'})"
             )
     if play.action_names and not any(isinstance(space, Discrete) for space in actions.values()):
         raise ConfigError("play.action_names: no policy has Discrete actions: remove the names")

@@ -64,10 +64,10 @@ class EpisodeActions:
         try:
             adapter.reset(int(self._seeds[env]))
             for step in (*self._since(int(self._began[env])), *(() if further is None else (further,))):
-                own = slice(*np.searchsorted(step.envs, [env, env + 1]))
+                rows = slice(*np.searchsorted(step.envs, [env, env + 1]))
                 # The agents of a vectorised environment have actions of one space, but for their bounds.
-                actions = environment_actions(step.actions[own], interfaces[0].action)
-                adapter.step(list(zip(step.agents[own].tolist(), actions, strict=True)))
+                actions = environment_actions(step.actions[rows], interfaces[0].action)
+                adapter.step(list(zip(step.agents[rows].tolist(), actions, strict=True)))
         except BaseException:
             with contextlib.suppress(Exception):
                 adapter.close()

@@ -61,8 +61,8 @@ class Implementation:
 def implementation(config: EnvironmentConfig) -> Implementation:
     """Return how copies of an environment are stepped. Raises ConfigError if `environment.vector` or a wrapper of a
     vectorised environment is invalid."""
-    chosen = _without_wrappers(config)
-    return _with_wrappers(chosen.vector, config) if config.wrappers and chosen.vector else chosen
+    base = _without_wrappers(config)
+    return _with_wrappers(base.vector, config) if config.wrappers and base.vector else base
 
 
 def _without_wrappers(config: EnvironmentConfig) -> Implementation:
@@ -93,21 +93,21 @@ def _in_lockstep(reason: str) -> Implementation:
 
 def _if_verified(packages: Sequence[str]) -> Implementation | None:
     """Return None if the verified versions of these packages are installed."""
-    found = installed()
+    versions = installed()
     for package in packages:
-        if found.get(package) != VERIFIED[package]:
+        if versions.get(package) != VERIFIED[package]:
             return _in_lockstep(
                 f"the vectorised implementation equals {package} {VERIFIED[package]}, but"
-                f" {found.get(package, 'none')} is installed"
+                f" {versions.get(package, 'none')} is installed"
             )
     return None
 
 
 def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False) -> BatchedEnvironment:
     """Create environments that are stepped together, vectorised if possible. See `stock_stepping`."""
-    chosen = implementation(config)
-    logger.info("%s: %s", config.entry_point, chosen.reason)
-    vector = chosen.vector
+    choice = implementation(config)
+    logger.info("%s: %s", config.entry_point, choice.reason)
+    vector = choice.vector
     if vector is None:
         return stock_stepping(config, num_envs, crashes=crashes, states=states)
     make: Callable[[int], VectorEnv] = partial(vector, **config.kwargs)
@@ -126,7 +126,7 @@ def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation
 
 
 def _imported(entry_point: str, folder: str | None) -> Callable[..., VectorEnv]:
-    found = import_entry_point("environment.vector", entry_point, folder)
-    if not (isinstance(found, type) and issubclass(found, VectorEnv)):
+    vector_class = import_entry_point("environment.vector", entry_point, folder)
+    if not (isinstance(vector_class, type) and issubclass(vector_class, VectorEnv)):
         raise ConfigError(f"environment.vector: {entry_point} is not a subclass of VectorEnv")
-    return found
+    return vector_class

@@ -73,8 +73,8 @@ class _InfoMasks:
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the space of the observation with the mask. The same object for each call, as PettingZoo requires."""
-        own = self._observation_spaces.get(agent)
-        return self.env.observation_space(agent) if own is None else own
+        space = self._observation_spaces.get(agent)
+        return self.env.observation_space(agent) if space is None else space
 
     def action_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the action space."""
@@ -87,10 +87,10 @@ class _InfoMasks:
 
     def _mask(self, agent: str, info: Any) -> NDArray[np.int8]:
         width = self._widths[agent]
-        given = info.get(ACTION_MASK) if isinstance(info, Mapping) else None
-        if given is None:
+        info_mask = info.get(ACTION_MASK) if isinstance(info, Mapping) else None
+        if info_mask is None:
             return np.ones(width, np.int8)
-        mask = np.asarray(given)
+        mask = np.asarray(info_mask)
         if mask.shape != (width,):
             raise InvalidReturn(
                 f"the info of agent {agent!r} has an action_mask of shape {list(mask.shape)}, expected [{width}]"
@@ -116,8 +116,8 @@ class _SimultaneousInfoMasks(_InfoMasks):
 
     def step(self, actions: dict[str, Any]) -> Any:
         """Step the environment; the observations contain the masks."""
-        observations, *rest, infos = self.env.step(actions)
-        return self._all_with_masks(observations, infos), *rest, infos
+        observations, *outcomes, infos = self.env.step(actions)
+        return self._all_with_masks(observations, infos), *outcomes, infos
 
     def _all_with_masks(self, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> dict[str, Any]:
         return {agent: self._with_mask(agent, value, infos.get(agent)) for agent, value in observations.items()}

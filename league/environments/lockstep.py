@@ -66,11 +66,11 @@ class Lockstep:
         self._make, self._gives_states = make, states
         envs = [make() for _ in range(num_envs)]
         self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
-        spaces = [agent_interface(envs[0], agent) for agent in self.agents]
-        self._splits = [splitter(own.observation) for own in spaces]
-        self._inputs = [inputs(own.observation) for own in spaces]
-        self._first_alike = [self._inputs.index(own) for own in self._inputs]
-        self._actions = [own.action for own in spaces]
+        interfaces = [agent_interface(envs[0], agent) for agent in self.agents]
+        self._splits = [splitter(spaces.observation) for spaces in interfaces]
+        self._inputs = [inputs(spaces.observation) for spaces in interfaces]
+        self._first_alike = [self._inputs.index(leaves) for leaves in self._inputs]
+        self._actions = [spaces.action for spaces in interfaces]
         self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
         self._seeds = np.zeros(num_envs, np.int64)
         self._crashes = CrashLimit(num_envs, crashes)
@@ -96,8 +96,8 @@ class Lockstep:
         moves: dict[int, list[tuple[int, Any]]] = defaultdict(list)
         for group, batch in self._pending.items():
             check_actions(batch, actions[group], self._actions[batch.agents[0]], self.agents)
-            own = environment_actions(actions[group], self._actions[batch.agents[0]])
-            rows = zip(batch.envs.tolist(), batch.agents.tolist(), own, strict=True)
+            group_actions = environment_actions(actions[group], self._actions[batch.agents[0]])
+            rows = zip(batch.envs.tolist(), batch.agents.tolist(), group_actions, strict=True)
             for env, agent, action in rows:
                 moves[env].append((agent, action))
         reports: Reports = {}
@@ -116,7 +116,7 @@ class Lockstep:
                 crashed.append(env)
             else:
                 self._check_rewards(env, reports[env])
-        finished = [env for env, own in reports.items() if not any(map(_must_act, own))]
+        finished = [env for env, env_reports in reports.items() if not any(map(_must_act, env_reports))]
         self._crashes.finish(_envs(finished))
         turn = Turn(finished=_envs(finished), crashed=_envs(crashed), last_states=self._states(finished))
         free = np.union1d(_envs([*finished, *crashed]), self._abandoned)
@@ -162,8 +162,10 @@ class Lockstep:
 
     def _continue(self, turn: Turn, reports: Reports, free: Indices) -> Turn:
         """Start the next episodes of free environments, and report what has ended and who must act."""
-        endings = [(env, report) for env, own in reports.items() for report in own if not _must_act(report)]
-        acting = {env: [report for report in own if _must_act(report)] for env, own in reports.items()}
+        endings = [
+            (env, report) for env, env_reports in reports.items() for report in env_reports if not _must_act(report)
+        ]
+        acting = {env: [report for report in env_reports if _must_act(report)] for env, env_reports in reports.items()}
         if len(free):
             starts = self._next_episodes(free)
             self._groups[starts.envs] = starts.groups
@@ -172,7 +174,7 @@ class Lockstep:
             self._seeds[starts.envs] = starts.seeds % 2**31
             acting |= {env: self._reset(env) for env in starts.envs.tolist()}
         rows = [(env, report) for env in sorted(acting) for report in acting[env]]
-        turn.states = self._states(sorted(env for env, own in acting.items() if own))
+        turn.states = self._states(sorted(env for env, env_reports in acting.items() if env_reports))
         turn.endings = self._endings(endings)
         turn.batches = self._pending = self._batches(rows)
         return turn
@@ -221,9 +223,9 @@ class Lockstep:
         batches = {}
         for group in np.unique(groups).tolist():
             of_group = np.flatnonzero(groups == group)
-            own = [rows[i][1] for i in of_group.tolist()]
-            stacked = self._stacked([report[0] for report in own], [report[1] for report in own])
-            rewards = np.array([report[2] for report in own], dtype=np.float64)
+            reports = [rows[i][1] for i in of_group.tolist()]
+            stacked = self._stacked([report[0] for report in reports], [report[1] for report in reports])
+            rewards = np.array([report[2] for report in reports], dtype=np.float64)
             batches[group] = Batch(envs[of_group], agents[of_group], stacked, rewards)
         return batches
 

@@ -62,10 +62,10 @@ class OpenSpielEnv(AECEnv):
             "hidden_information": kind.information != pyspiel.GameType.Information.PERFECT_INFORMATION,
         }
         self.possible_agents = [f"player_{player}" for player in range(self._game.num_players())]
-        seen = np.zeros(self._shape, np.float32)
+        observation = np.zeros(self._shape, np.float32)
         actions = self._game.num_distinct_actions()
         observed = spaces.Dict(
-            observation=spaces.Box(-np.inf, np.inf, _channels_last(seen).shape, np.float32),
+            observation=spaces.Box(-np.inf, np.inf, _channels_last(observation).shape, np.float32),
             action_mask=spaces.Box(0, 1, (actions,), np.int8),
         )
         self.observation_spaces = dict.fromkeys(self.possible_agents, observed)
@@ -117,8 +117,8 @@ class OpenSpielEnv(AECEnv):
         )
         acts = not state.is_terminal() and state.current_player() == player
         mask = state.legal_actions_mask(player) if acts else np.zeros(self._game.num_distinct_actions())
-        seen = np.array(values, np.float32).reshape(self._shape)
-        return {"observation": _channels_last(seen), "action_mask": np.array(mask, np.int8)}
+        observation = np.array(values, np.float32).reshape(self._shape)
+        return {"observation": _channels_last(observation), "action_mask": np.array(mask, np.int8)}
 
     def render(self) -> str:
         """Return the state as text."""

@@ -50,8 +50,8 @@ def each_agent_alone(seeds: Iterable[int], agents: int) -> NextEpisodes:
     coming = iter(seeds)
 
     def next_episodes(envs: Indices) -> Starts:
-        taken = np.fromiter(islice(coming, len(envs)), np.int64)
-        return Starts(envs[: len(taken)], taken, np.tile(np.arange(agents), (len(taken), 1)))
+        next_seeds = np.fromiter(islice(coming, len(envs)), np.int64)
+        return Starts(envs[: len(next_seeds)], next_seeds, np.tile(np.arange(agents), (len(next_seeds), 1)))
 
     return next_episodes
 
@@ -232,19 +232,19 @@ def legal_rows(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
     """Return which of the actions (k, …) are in `space` and allowed by the mask, (k,) bool."""
     match space:
         case Discrete():
-            chosen = actions - space.start
-            legal = (chosen >= 0) & (chosen < space.n)
+            indices = actions - space.start
+            legal = (indices >= 0) & (indices < space.n)
             if mask is not None:
-                legal &= mask[np.arange(len(mask)), np.where(legal, chosen, 0)] != 0
+                legal &= mask[np.arange(len(mask)), np.where(legal, indices, 0)] != 0
             return legal
         case MultiDiscrete():
             choices = np.asarray(space.nvec).ravel()
-            chosen = (actions - np.asarray(space.start)).reshape(len(actions), -1)
-            inside = (chosen >= 0) & (chosen < choices)
+            indices = (actions - np.asarray(space.start)).reshape(len(actions), -1)
+            inside = (indices >= 0) & (indices < choices)
             if mask is not None:
                 # The mask concatenates the choices of all elements.
                 first = np.cumsum(choices) - choices
-                inside &= mask[np.arange(len(mask))[:, np.newaxis], first + np.where(inside, chosen, 0)] != 0
+                inside &= mask[np.arange(len(mask))[:, np.newaxis], first + np.where(inside, indices, 0)] != 0
             return inside.all(axis=1)
         case Box():
             low, high = _bound(space.low, -np.inf), _bound(space.high, np.inf)

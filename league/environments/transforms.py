@@ -101,8 +101,8 @@ class Indicator(Transform):
             rows = rows[..., np.newaxis]
         extended = np.zeros((*rows.shape[:-1], rows.shape[-1] + self._width), rows.dtype)
         extended[..., : rows.shape[-1]] = rows
-        own = self._of_agent[slots % len(self._of_agent)] + rows.shape[-1]
-        extended[np.arange(len(rows)), ..., own] = self._on
+        channels = self._of_agent[slots % len(self._of_agent)] + rows.shape[-1]
+        extended[np.arange(len(rows)), ..., channels] = self._on
         return extended
 
 
@@ -116,8 +116,8 @@ def _axis(before: int, after: int) -> tuple[NDArray, NDArray]:
     """For each new pixel, the index of the left old pixel and the weight of the right one."""
     ratio = np.float32(before - 1) / np.float32(after)
     position = (np.arange(after, dtype=np.float32) + np.float32(0.5)) * ratio
-    left = position.astype(np.int32)
-    return left, position - left.astype(np.float32)
+    left_pixels = position.astype(np.int32)
+    return left_pixels, position - left_pixels.astype(np.float32)
 
 
 def channel(mode: str = "full") -> Callable[[NDArray], NDArray] | None:

@@ -59,7 +59,7 @@ class VectorStepping:
             )
         self._actions = [spaces.action for spaces in interfaces]
         observed = [inputs(spaces.observation) for spaces in interfaces]
-        self._first_alike = [observed.index(own) for own in observed]
+        self._first_alike = [observed.index(leaves) for leaves in observed]
         self._episodes = EpisodeActions(num_envs)
         self._plays = np.zeros(num_envs, dtype=bool)
         """Which environments have an episode."""

@@ -40,7 +40,7 @@ class WrapperStack:
 
     def __init__(self, config: EnvironmentConfig) -> None:
         """Raises ConfigError for wrappers that SuperSuit does not accept, and UnsupportedWrapper."""
-        self._wrappers = [with_arguments(each) for each in config.wrappers]
+        self._wrappers = [with_arguments(wrapper_config) for wrapper_config in config.wrappers]
         with closing(build(config.model_copy(update={"wrappers": ()}))) as env:
             self.stages = agent_spaces(env, config.wrappers)
             if not isinstance(env, ParallelEnv):
@@ -55,7 +55,7 @@ class WrapperStack:
 
         Raises UnsupportedWrapper.
         """
-        found = []
+        transforms = []
         for wrapper, before, after in zip(self._wrappers, self.stages, self.stages[1:], strict=False):
             if wrapper.name in (*OF_ACTIONS, *OF_REWARDS):
                 continue
@@ -67,8 +67,8 @@ class WrapperStack:
                 raise UnsupportedWrapper(
                     f"wrapper {wrapper.name} has no vectorised version for its arguments and observations in {space}"
                 )
-            found.append(made)
-        return found
+            transforms.append(made)
+        return transforms
 
 
 class WrappedVectorEnv(VectorEnv):
@@ -92,8 +92,8 @@ class WrappedVectorEnv(VectorEnv):
         agents = len(self.possible_agents)
         slots = (env_ids[:, np.newaxis] * agents + np.arange(agents)).ravel()
         for transforms in self._transforms.values():
-            for each in transforms:
-                each.reset(slots)
+            for observation_transform in transforms:
+                observation_transform.reset(slots)
         return self._wrapped(self._env.reset(env_ids, seeds))
 
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
@@ -121,8 +121,8 @@ class WrappedVectorEnv(VectorEnv):
         if transforms := self._transforms[self._first_before[rows.agents[0]]]:
             slots = rows.envs * len(self.possible_agents) + rows.agents
             changed = observations[OBSERVATION]
-            for each in transforms:
-                changed = each(changed, slots)
+            for observation_transform in transforms:
+                changed = observation_transform(changed, slots)
             observations = {OBSERVATION: changed.astype(self._dtypes[rows.agents[0]], copy=False)}
         return replace(rows, rewards=rewards, observations=observations)
 

@@ -41,8 +41,8 @@ class BatchedWrappers(BaseParallelWrapper):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
         observations, infos = self.env.reset(seed=seed, options=options)
-        for each in self._transforms:
-            each.reset(np.arange(len(self._index)))
+        for observation_transform in self._transforms:
+            observation_transform.reset(np.arange(len(self._index)))
         return self._transformed(observations), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], Any, Any, Any, Any]:
@@ -55,8 +55,8 @@ class BatchedWrappers(BaseParallelWrapper):
         agents = np.array([self._index[agent] for agent in observations])
         values = observations.values() if self._view is None else map(self._view, observations.values())
         rows = np.array(list(values))
-        for each in self._transforms:
-            rows = each(rows, agents)
+        for observation_transform in self._transforms:
+            rows = observation_transform(rows, agents)
         return dict(zip(observations, rows, strict=True))
 
 
@@ -93,8 +93,12 @@ def wrapped(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> AEC
     if not wrappers:
         return env
     stages = _stages(env, wrappers)
-    observed = [AgentSpaces.of(each).observations for each in stages]
-    fast = batched(env, [with_arguments(each) for each in wrappers], observed) if isinstance(env, ParallelEnv) else None
+    observed = [AgentSpaces.of(stage).observations for stage in stages]
+    fast = (
+        batched(env, [with_arguments(wrapper) for wrapper in wrappers], observed)
+        if isinstance(env, ParallelEnv)
+        else None
+    )
     return stages[-1] if fast is None else fast
 
 
@@ -114,7 +118,7 @@ class AgentSpaces:
 
 def agent_spaces(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> list[AgentSpaces]:
     """Return the spaces before each wrapper and after the last. Raises what `wrapped` raises."""
-    return [AgentSpaces.of(each) for each in _stages(env, wrappers)]
+    return [AgentSpaces.of(stage) for stage in _stages(env, wrappers)]
 
 
 def _stages(env: AECEnv | ParallelEnv, wrappers: Sequence[WrapperConfig]) -> list[AECEnv | ParallelEnv]:
@@ -138,10 +142,10 @@ def _stock(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, position: int) -> 
                 made.action_space(agent)
     except (TypeError, AssertionError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as error:
         agent = env.possible_agents[0]
-        given = (
+        context = (
             f"before it, {agent} has observations {env.observation_space(agent)} and actions {env.action_space(agent)}"
         )
-        raise ConfigError(f"{where}: {one_line(error)}; {given}") from error
+        raise ConfigError(f"{where}: {one_line(error)}; {context}") from error
     return _with_whole_reset(made) if isinstance(made, aec_reward_lambda) else made
 
 
@@ -165,8 +169,8 @@ def _maker(name: str) -> Any:
     try:
         make = getattr(supersuit, name)
     except (ImportError, AttributeError) as error:
-        known = [wrapper for wrapper in dir(supersuit) if re.search(r"_v\d+$", wrapper)]
-        near = difflib.get_close_matches(name, known, n=1)
+        wrapper_names = [wrapper for wrapper in dir(supersuit) if re.search(r"_v\d+$", wrapper)]
+        near = difflib.get_close_matches(name, wrapper_names, n=1)
         # The error of a former version of a wrapper names the present one.
         hint = f"did you mean {near[0]!r}?" if near and type(error) is ImportError else error
         raise ConfigError(f"environment.wrappers: SuperSuit has no wrapper {name!r}: {hint}") from error

@@ -97,14 +97,14 @@ def _node_class(base: Any) -> Any:
 
 def _await_registration(node: Node) -> None:
     """Wait until the raylet has registered. Raises StartFailed if a process ends before."""
-    begun = noticed = time.monotonic()
+    start_time = noticed = time.monotonic()
     while not _is_registered(node):
         for name, processes in node.all_processes.items():
             if any(info.process.poll() is not None for info in processes):
                 raise StartFailed(f"its process {name} ended; see {node.get_logs_dir_path()}")
-        if (now := time.monotonic()) - noticed >= NOTICE:
-            noticed = now
-            say(f"Waiting for Ray to start: its raylet has not registered after {now - begun:.0f} s")
+        if (current_time := time.monotonic()) - noticed >= NOTICE:
+            noticed = current_time
+            say(f"Waiting for Ray to start: its raylet has not registered after {current_time - start_time:.0f} s")
         time.sleep(POLL)
 
 
@@ -124,14 +124,14 @@ def say(line: str) -> None:
 
 def free_ports(count: int) -> list[int]:
     """Unused ports of the loopback interface. Raises NotReady."""
-    found: list[int] = []
+    ports: list[int] = []
     for port in random.sample(PORTS, len(PORTS)):
         with socket.socket() as probe:
             try:
                 probe.bind((ADDRESS, port))
             except OSError:
                 continue
-        found.append(port)
-        if len(found) == count:
-            return found
+        ports.append(port)
+        if len(ports) == count:
+            return ports
     raise NotReady(f"found fewer than {count} free ports from {PORTS.start} to {PORTS.stop - 1}")

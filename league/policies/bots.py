@@ -75,11 +75,14 @@ class Bot:
         actions = np.zeros((rows, *self._action.shape), self._action.dtype)
         faults: dict[int, Exception] = {}
         for row in range(rows):
-            own = {name: array[row] for name, array in observations.items()}
+            row_observations = {name: array[row] for name, array in observations.items()}
             try:
                 act = self._bot if after is None else self._instance(after[INSTANCE], row).act
-                chosen = act(self._observation(own), **self._optional(own, None if rng is None else rng[row]))
-                actions[row] = _action(chosen, self._action)
+                action = act(
+                    self._observation(row_observations),
+                    **self._optional(row_observations, None if rng is None else rng[row]),
+                )
+                actions[row] = _action(action, self._action)
             except MemoryError:
                 raise
             except Exception as error:
@@ -93,8 +96,8 @@ class Bot:
         return instances[row]
 
     def _optional(self, observations: Mapping[str, Any], rng: Any) -> dict[str, Any]:
-        given = {ACTION_MASK: observations.get(ACTION_MASK), "rng": rng}
-        return {name: given[name] for name in self._arguments}
+        arguments = {ACTION_MASK: observations.get(ACTION_MASK), "rng": rng}
+        return {name: arguments[name] for name in self._arguments}
 
     def _observation(self, arrays: Mapping[str, Any]) -> Any:
         """The observation without its action mask, as the environment returns it."""
@@ -114,18 +117,18 @@ def _arguments(name: str, act: Callable[..., Any], is_method: bool) -> tuple[str
         and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
     ]
     if required or not parameters:
-        found = f"requires {required[0]!r}" if required else "takes no observation"
-        raise ConfigError(f"{name} {found}: expected the arguments {OBSERVATION}, {ACTION_MASK} and rng")
+        problem = f"requires {required[0]!r}" if required else "takes no observation"
+        raise ConfigError(f"{name} {problem}: expected the arguments {OBSERVATION}, {ACTION_MASK} and rng")
     return tuple(argument for argument in OPTIONAL if accepts_all or argument in named)
 
 
 def _action(chosen: Any, space: Leaf) -> NDArray:
     """One action in the dtype of the space. Raises MalformedAction if its shape or type differs."""
-    given = np.asarray(chosen)
+    array = np.asarray(chosen)
     kinds = "iuf" if np.dtype(space.dtype).kind == "f" else "iu"
-    if given.shape == space.shape and given.dtype.kind in kinds:
-        action = given.astype(space.dtype)
-        if kinds == "iuf" or np.array_equal(action, given):
+    if array.shape == space.shape and array.dtype.kind in kinds:
+        action = array.astype(space.dtype)
+        if kinds == "iuf" or np.array_equal(action, array):
             return action
     expected = f"expected {space.dtype} {list(space.shape)}"
     raise MalformedAction(f"the bot returned {type(chosen).__name__} {str(chosen)[:80]!r}: {expected}")

@@ -44,8 +44,8 @@ def choose(allowed: NDArray, uniform: NDArray) -> NDArray:
         Indices of the chosen elements, (k,) int64.
     """
     ranks = (allowed != 0).cumsum(axis=1)
-    wanted = (uniform * ranks[:, -1]).astype(np.int64)
-    return (ranks <= wanted[:, None]).sum(axis=1)
+    drawn_ranks = (uniform * ranks[:, -1]).astype(np.int64)
+    return (ranks <= drawn_ranks[:, None]).sum(axis=1)
 
 
 def invert(logits: NDArray, uniform: NDArray) -> NDArray:
@@ -109,8 +109,8 @@ def elements(columns: NDArray, space: MultiDiscrete) -> list[NDArray]:
 
 def _each(rng: Generators | None, rows: int) -> Generators:
     if rng is None or len(rng) != rows:
-        given = "none" if rng is None else str(len(rng))
-        raise InvalidInput(f"a random choice for {rows} rows needs rng, one generator per row: got {given}")
+        count = "none" if rng is None else str(len(rng))
+        raise InvalidInput(f"a random choice for {rows} rows needs rng, one generator per row: got {count}")
     return rng
 
 
@@ -134,7 +134,9 @@ def probabilities(dist_inputs: NDArray, space: Space, mask: NDArray | None = Non
             return _shares(dist_inputs, mask).tolist()
         case MultiDiscrete():
             masks = [None] * int(np.size(space.nvec)) if mask is None else elements(mask, space)
-            parts = [_shares(part, own) for part, own in zip(elements(dist_inputs, space), masks, strict=True)]
+            parts = [
+                _shares(part, part_mask) for part, part_mask in zip(elements(dist_inputs, space), masks, strict=True)
+            ]
             return [[part[row].tolist() for part in parts] for row in range(len(dist_inputs))]
         case Box(shape=shape):
             means, deviations = _gaussian(dist_inputs.astype(np.float64), space)
@@ -162,7 +164,7 @@ def certain(actions: NDArray, space: Space) -> NDArray:
         case MultiDiscrete(nvec=nvec, start=start):
             raw = (actions - np.asarray(start)).reshape(len(actions), -1)
             parts = zip(raw.T, np.ravel(nvec).tolist(), strict=True)
-            return np.concatenate([_only(chosen, n) for chosen, n in parts], axis=1)
+            return np.concatenate([_only(choices, n) for choices, n in parts], axis=1)
         case Box():
             centre, half = _range(space)
             means = (actions.reshape(len(actions), -1) - centre) / np.where(half == 0, 1, half)

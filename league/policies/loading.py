@@ -138,15 +138,15 @@ def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface
 
 def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Policy:
     require_one_policy(version)
-    known = version.manifest.policies
-    if policy is None and len(known) == 1:
-        policy = next(iter(known))
-    if policy not in known:
+    policies = version.manifest.policies
+    if policy is None and len(policies) == 1:
+        policy = next(iter(policies))
+    if policy not in policies:
         problem = (
             f"{version.ref} has no policy {policy!r}" if policy else f"{version.ref} has several policies: specify one"
         )
-        raise UnknownPolicy(f"{problem}; known: {', '.join(known)}")
-    manifest = known[policy]
+        raise UnknownPolicy(f"{problem}; known: {', '.join(policies)}")
+    manifest = policies[policy]
     graph = registry.artifacts.read(version.manifest, manifest.file)
     return OnnxPolicy(graph, manifest, version.manifest.has_distribution)
 
@@ -188,11 +188,11 @@ def requested(ref: str, league: str, registry: Registry) -> str:
     """
     config = registry.leagues.get(league).config
     if _is_remote(ref):
-        if RemoteRef.parse(ref).default not in (known := _configured_remotes(config)):
-            raise _not_configured(ref, config, "remote models", [str(each) for each in known])
+        if RemoteRef.parse(ref).default not in (remotes := _configured_remotes(config)):
+            raise _not_configured(ref, config, "remote models", [str(remote) for remote in remotes])
         return ref
     fixed = pinned(ref, league, registry)
-    if _is_bot(fixed) and fixed not in (bots := [each for each in configured_contestants(config) if _is_bot(each)]):
+    if _is_bot(fixed) and fixed not in (bots := [bot for bot in configured_contestants(config) if _is_bot(bot)]):
         raise _not_configured(fixed, config, "bots", bots)
     check_eligible(fixed, registry, config)
     return fixed
@@ -304,7 +304,9 @@ def configured_scripts(config: LeagueConfig, interface: Interface) -> list[str]:
 
 
 def _anchors_and_opponents(config: LeagueConfig) -> list[str]:
-    named = [anchor.ref for anchor in config.gate.anchors] + [each.ref for each in config.training.opponents.fixed]
+    named = [anchor.ref for anchor in config.gate.anchors] + [
+        opponent.ref for opponent in config.training.opponents.fixed
+    ]
     return list(dict.fromkeys(named))
 
 
@@ -353,11 +355,11 @@ def eligible(registry: Registry, league: str) -> list[VersionRow]:
 
     Raises UnknownLeague.
     """
-    now = registry.leagues.get(league).config.environment.digest()
+    digest = registry.leagues.get(league).config.environment.digest()
     present = (
         version for version in registry.versions.all(league) if version.retired_at is None and version.role == MAIN
     )
-    return [version for version in present if version.manifest.environment_digest == now]
+    return [version for version in present if version.manifest.environment_digest == digest]
 
 
 def check_eligible(ref: str, registry: Registry, config: LeagueConfig) -> None:
@@ -369,14 +371,21 @@ def check_eligible(ref: str, registry: Registry, config: LeagueConfig) -> None:
     if not isinstance(parsed, CheckpointRef):
         return
     _check_league(parsed, config.league)
-    manifest, now = registry.versions.resolve(parsed).manifest, config.environment
-    if manifest.environment_digest == now.digest():
+    manifest, environment = registry.versions.resolve(parsed).manifest, config.environment
+    if manifest.environment_digest == environment.digest():
         return
-    own, other = (each.model_dump(mode="json", by_alias=True) for each in (manifest.environment, now))
-    differences = [f"{name} {own[name]!r} instead of {other[name]!r}" for name in own if own[name] != other[name]]
+    trained_fields, current_fields = (
+        environment_config.model_dump(mode="json", by_alias=True)
+        for environment_config in (manifest.environment, environment)
+    )
+    differences = [
+        f"{name} {trained_fields[name]!r} instead of {current_fields[name]!r}"
+        for name in trained_fields
+        if trained_fields[name] != current_fields[name]
+    ]
     raise EnvironmentMismatch(
         f"{ref} was trained in another environment ({manifest.environment_digest[:12]}) than {config.league} has now"
-        f" ({now.digest()[:12]}), with {', '.join(differences)}: it cannot play in matches of this league"
+        f" ({environment.digest()[:12]}), with {', '.join(differences)}: it cannot play in matches of this league"
     )
 
 

@@ -102,10 +102,10 @@ class OnnxPolicy:
         """Choose greedy actions and return `dist_inputs`, too; see `act`. Without a distribution, the actions are
         certain.
         """
-        found = self.outputs(observations, state=state)
+        outputs = self.outputs(observations, state=state)
         if self.has_distribution or self._action is None:
-            return found
-        return replace(found, dist_inputs=certain(found.actions, self._action))
+            return outputs
+        return replace(outputs, dist_inputs=certain(outputs.actions, self._action))
 
     def outputs(self, observations: Arrays | NDArray, *, state: Arrays | None = None) -> Actions:
         """Return the outputs of the graph: like `distribution`, but `dist_inputs` are values if it computes values."""
@@ -151,13 +151,13 @@ class OnnxPolicy:
 
     def _explain(self, observations: Arrays, state: Arrays | None) -> None:
         """Raise ObservationError for the first array that does not fit the graph, if any."""
-        given = dict(observations) | dict(state or {})
+        arrays = dict(observations) | dict(state or {})
         for name in (*self._observed, *(self._recurrent if state is not None else ())):
             node = self._inputs[name]
             expected = f"expected a batch of {_dtype(node)} {list(node.shape[1:])}"
-            if name not in given:
+            if name not in arrays:
                 raise ObservationError(f"{name} is missing: {expected}")
-            array = given[name]
+            array = arrays[name]
             if not isinstance(array, np.ndarray):
                 raise ObservationError(f"{name} is not a NumPy array: {expected}")
             if array.dtype != _dtype(node) or list(array.shape[1:]) != list(node.shape[1:]):
@@ -182,12 +182,12 @@ def _check_graph(inputs: dict[str, Any], outputs: dict[str, Any], manifest: Poli
         ("input", inputs, manifest.inputs),
         ("output", outputs, manifest.outputs),
     ):
-        found = {name: _dtype(node) for name, node in nodes.items()}
+        graph_dtypes = {name: _dtype(node) for name, node in nodes.items()}
         expected = {tensor.name: tensor.dtype for tensor in tensors}
-        for name in sorted(found.keys() | expected.keys()):
-            if found.get(name) != expected.get(name):
+        for name in sorted(graph_dtypes.keys() | expected.keys()):
+            if graph_dtypes.get(name) != expected.get(name):
                 raise ArtifactCorrupt(
-                    f"{kind} {name} of the graph is {found.get(name, 'missing')}, "
+                    f"{kind} {name} of the graph is {graph_dtypes.get(name, 'missing')}, "
                     f"but {expected.get(name, 'missing')} in the manifest"
                 )
     found_size, size = outputs[DIST_INPUTS].shape[-1], dist_inputs_size(manifest.action)

@@ -67,9 +67,9 @@ class OpenInferencePolicy:
             RemoteError: The server cannot be reached, failed, or answered with another version.
         """
         rows = len(next(iter(observations.values())))
-        given = dict(observations) | (dict(state) if state else self.initial_state(rows))
+        arrays = dict(observations) | (dict(state) if state else self.initial_state(rows))
         parts = [
-            self._infer({name: array[begin : begin + MAX_ROWS] for name, array in given.items()})
+            self._infer({name: array[begin : begin + MAX_ROWS] for name, array in arrays.items()})
             for begin in range(0, rows, MAX_ROWS)
         ]
         after = {name: np.concatenate([part[name] for part in parts]) for name in self._signature.state}
@@ -97,38 +97,38 @@ class OpenInferencePolicy:
             raise RemoteError(f"{self._ref} answered with version {version}, another contestant")
         rows = len(next(iter(given.values())))
         outputs = {output["name"]: output for output in response.get("outputs", ())}
-        found = {self._signature.output: _array(outputs, self._signature.output, rows)}
+        arrays = {self._signature.output: _array(outputs, self._signature.output, rows)}
         for name, leaf in self._signature.state.items():
-            found[name] = _array(outputs, self._signature.next_state(name), rows).astype(leaf.dtype)
-        return found | {name: array for name, array in given.items() if name == ACTION_MASK}
+            arrays[name] = _array(outputs, self._signature.next_state(name), rows).astype(leaf.dtype)
+        return arrays | {name: array for name, array in given.items() if name == ACTION_MASK}
 
     def _call(self, given: Arrays) -> JsonObject:
         body: JsonObject = {
             "inputs": [
                 {
                     "name": name,
-                    "datatype": DATATYPES[given[own].dtype.name],
-                    "shape": given[own].shape,
-                    "data": np.ascontiguousarray(given[own]).reshape(-1),
+                    "datatype": DATATYPES[given[key].dtype.name],
+                    "shape": given[key].shape,
+                    "data": np.ascontiguousarray(given[key]).reshape(-1),
                 }
-                for name, own in self._signature.inputs.items()
+                for name, key in self._signature.inputs.items()
             ],
             "outputs": [{"name": name} for name in self._signature.requested],
         }
         return self._client.send(ApiCall(f"{self._path}/infer", lambda document, _: document, to_json(body)))
 
     def _actions(self, outputs: Arrays) -> NDArray:
-        found, space = outputs[self._signature.output], self._spaces.action
+        output, space = outputs[self._signature.output], self._spaces.action
         if self._signature.is_logits:
             assert isinstance(space, Discrete)
             mask = outputs.get(ACTION_MASK)
-            allowed = found if mask is None else np.where(mask != 0, found, -np.inf)
+            allowed = output if mask is None else np.where(mask != 0, output, -np.inf)
             return allowed.argmax(axis=1) + space.start
         kinds = "iuf" if isinstance(space, Box) else "iu"
         assert isinstance(space, Box | Discrete | MultiDiscrete)
-        if found.dtype.kind not in kinds or found.shape[1:] != space.shape:
-            raise MalformedAction(f"{self._ref} returned {found.dtype} {list(found.shape)}: expected {space!r}")
-        return found.astype(space.dtype)
+        if output.dtype.kind not in kinds or output.shape[1:] != space.shape:
+            raise MalformedAction(f"{self._ref} returned {output.dtype} {list(output.shape)}: expected {space!r}")
+        return output.astype(space.dtype)
 
 
 def _key_for(server: str) -> str:
@@ -181,8 +181,10 @@ def remote_policies(ref: RemoteRef, interface: Interface) -> dict[str, OpenInfer
     policies = {
         policy: OpenInferencePolicy(ref, policy, interface.of_policy(policy)) for policy in interface.policy_ids
     }
-    if ref.digest is not None and (found := _digest(policies)) != ref.digest:
-        raise EnvironmentMismatch(f"the metadata of {ref.default} have changed to #{found}: another contestant")
+    if ref.digest is not None and (metadata_digest := _digest(policies)) != ref.digest:
+        raise EnvironmentMismatch(
+            f"the metadata of {ref.default} have changed to #{metadata_digest}: another contestant"
+        )
     return policies
 
 

@@ -69,13 +69,15 @@ def read_signature(name: str, metadata: dict[str, Any], spaces: AgentInterface) 
         EnvironmentMismatch: They do not match.
         RemoteError: These are not the metadata of a model.
     """
-    given, returned = _tensors(name, metadata, "inputs"), _tensors(name, metadata, "outputs")
-    state = {key: _state(name, key, *tensor) for key, tensor in given.items() if key.startswith(STATE_IN)}
+    input_tensors, output_tensors = _tensors(name, metadata, "inputs"), _tensors(name, metadata, "outputs")
+    state = {key: _state(name, key, *tensor) for key, tensor in input_tensors.items() if key.startswith(STATE_IN)}
     for key in state:
-        if RemoteSignature.next_state(key) not in returned:
+        if RemoteSignature.next_state(key) not in output_tensors:
             raise EnvironmentMismatch(f"{name} has the input {key}, but no output {RemoteSignature.next_state(key)}")
-    observed = _match_inputs(name, {key: given[key] for key in given if key not in state}, inputs(spaces.observation))
-    output, is_logits = _match_output(name, returned, spaces)
+    observed = _match_inputs(
+        name, {key: input_tensors[key] for key in input_tensors if key not in state}, inputs(spaces.observation)
+    )
+    output, is_logits = _match_output(name, output_tensors, spaces)
     return RemoteSignature(observed | {key: key for key in state}, output, is_logits, state)
 
 
@@ -85,12 +87,12 @@ Tensors = dict[str, tuple[str, list[int]]]
 
 def _tensors(name: str, metadata: dict[str, Any], kind: str) -> Tensors:
     try:
-        found = {str(each["name"]): (str(each["datatype"]), list(each["shape"])) for each in metadata[kind]}
+        tensors = {str(tensor["name"]): (str(tensor["datatype"]), list(tensor["shape"])) for tensor in metadata[kind]}
     except (KeyError, TypeError) as error:
         raise RemoteError(f"{name} does not describe its {kind} as the Open Inference Protocol requires") from error
-    if not found:
+    if not tensors:
         raise EnvironmentMismatch(f"{name} lists no {kind} in its metadata: they cannot be checked")
-    return found
+    return tensors
 
 
 def _state(name: str, key: str, datatype: str, shape: list[int]) -> Leaf:
@@ -101,22 +103,26 @@ def _state(name: str, key: str, datatype: str, shape: list[int]) -> Leaf:
 
 def _match_inputs(name: str, given: Tensors, leaves: dict[str, Leaf]) -> dict[str, str]:
     """Input of the model → leaf of the observation."""
-    found: dict[str, str] = {}
+    matches: dict[str, str] = {}
     for key, (datatype, shape) in given.items():
         fitting = [
-            own for own, leaf in leaves.items() if datatype == DATATYPES[leaf.dtype] and _fits(shape, leaf.shape)
+            leaf_name
+            for leaf_name, leaf in leaves.items()
+            if datatype == DATATYPES[leaf.dtype] and _fits(shape, leaf.shape)
         ]
         if key in leaves:
-            fitting = [own for own in fitting if own == key]
+            fitting = [leaf_name for leaf_name in fitting if leaf_name == key]
         if len(fitting) != 1:
-            expected = ", ".join(f"{own} {DATATYPES[leaf.dtype]} {[-1, *leaf.shape]}" for own, leaf in leaves.items())
+            expected = ", ".join(
+                f"{leaf_name} {DATATYPES[leaf.dtype]} {[-1, *leaf.shape]}" for leaf_name, leaf in leaves.items()
+            )
             raise EnvironmentMismatch(f"{name} has the input {key} {datatype} {shape}: expected {expected}")
-        found[key] = fitting[0]
-    missing = set(leaves) - set(found.values()) - {ACTION_MASK}
-    if missing or len(set(found.values())) < len(found):
+        matches[key] = fitting[0]
+    missing = set(leaves) - set(matches.values()) - {ACTION_MASK}
+    if missing or len(set(matches.values())) < len(matches):
         problem = f"has no input for {sorted(missing)[0]}" if missing else "has two inputs for the same array"
         raise EnvironmentMismatch(f"{name} {problem}")
-    return found
+    return matches
 
 
 def _match_output(name: str, returned: Tensors, spaces: AgentInterface) -> tuple[str, bool]:
@@ -125,13 +131,15 @@ def _match_output(name: str, returned: Tensors, spaces: AgentInterface) -> tuple
     if isinstance(action, DictSpace):
         raise EnvironmentMismatch(f"{name} cannot play: remote models do not support dict actions")
     kinds = _INTEGERS + (_FLOATS if isinstance(action, Box) else ())
-    found = [key for key, (kind, shape) in returned.items() if kind.startswith(kinds) and _fits(shape, action.shape)]
+    action_outputs = [
+        key for key, (kind, shape) in returned.items() if kind.startswith(kinds) and _fits(shape, action.shape)
+    ]
     if isinstance(action, Discrete):
         logits = (action.n,)
         ranked = [key for key, (kind, shape) in returned.items() if kind.startswith(_FLOATS) and _fits(shape, logits)]
     else:
         ranked = []
-    for candidates, preferred, is_logits in ((found, ACTION, False), (ranked, DIST_INPUTS, True)):
+    for candidates, preferred, is_logits in ((action_outputs, ACTION, False), (ranked, DIST_INPUTS, True)):
         if preferred in candidates or len(candidates) == 1:
             return preferred if preferred in candidates else candidates[0], is_logits
     outputs = ", ".join(f"{key} {kind} {shape}" for key, (kind, shape) in returned.items())
@@ -143,4 +151,6 @@ def _match_output(name: str, returned: Tensors, spaces: AgentInterface) -> tuple
 
 def _fits(shape: list[int], row: tuple[int, ...]) -> bool:
     """Whether a tensor's shape, with -1 for any size, is a batch of rows of this shape."""
-    return len(shape) == 1 + len(row) and all(size in (-1, own) for size, own in zip(shape[1:], row, strict=True))
+    return len(shape) == 1 + len(row) and all(
+        size in (-1, row_size) for size, row_size in zip(shape[1:], row, strict=True)
+    )

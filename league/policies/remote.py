@@ -67,9 +67,9 @@ class RemotePolicy:
             seed=_seeds(rng, rows) if explore else None,
         )
         # As arrays, which preserve every bit; state tokens do not allow changing the rows of a batch.
-        given = {name: np.ascontiguousarray(array) for name, array in (state or {}).items()}
+        state_arrays = {name: np.ascontiguousarray(array) for name, array in (state or {}).items()}
         path = f"{self._model.path}/action{self._model.query}"
-        return self._client.send(ApiCall(path, _read, to_json(request.body | {"state": given})))
+        return self._client.send(ApiCall(path, _read, to_json(request.body | {"state": state_arrays})))
 
     def _observation(self, arrays: Arrays) -> Any:
         return _by_names(arrays) if self._space is None else nested(self._space, arrays)

@@ -84,8 +84,8 @@ class Random:
         if self._masked:
             masks = _masks(observations[ACTION_MASK], self._action)
             uniform = draw(rng, len(masks[0]), (len(masks),) if self._action.shape else ()).reshape(-1, len(masks))
-            chosen = [choose(mask, uniform[:, i]) for i, mask in enumerate(masks)]
-            return Actions(_raw_to_environment(chosen, self._action))
+            choices = [choose(mask, uniform[:, i]) for i, mask in enumerate(masks)]
+            return Actions(_raw_to_environment(choices, self._action))
         rows = len(next(iter(observations.values())))
         return Actions(_spread(draw(rng, rows, self._action.shape), self._action))
 
@@ -133,8 +133,8 @@ class Mirror:
         rng: Generators | None = None,  # noqa: ARG002
     ) -> Actions:
         """Choose actions for a batch; see `Policy.act`."""
-        seen = observations[OBSERVATION] - self._observation.start
-        return Actions(to_environment(np.where(seen < self._action.n, seen, 0), self._action))
+        opponent_moves = observations[OBSERVATION] - self._observation.start
+        return Actions(to_environment(np.where(opponent_moves < self._action.n, opponent_moves, 0), self._action))
 
 
 SCRIPTS: dict[str, Callable[[Space, Space], Policy]] = {

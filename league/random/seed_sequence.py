@@ -26,9 +26,9 @@ def generate_state(seeds: NDArray[np.int64], spawn_key: Sequence[int | NDArray[n
     constants = _powers(0x43B0D7E5, 0x931E8875, 17 + 4 * len(spawn_key))
     pool = _hashed(pool, constants[:5])
     for source in range(4):
-        others = [row for row in range(4) if row != source]
+        other_rows = [row for row in range(4) if row != source]
         first = 4 + 3 * source
-        pool[others] = _mixed(pool[others], _hashed(pool[source], constants[first : first + 4]))
+        pool[other_rows] = _mixed(pool[other_rows], _hashed(pool[source], constants[first : first + 4]))
     for number, word in enumerate(spawn_key):
         first = 16 + 4 * number
         pool = _mixed(pool, _hashed(np.asarray(word).astype(np.uint32), constants[first : first + 5]))

@@ -23,8 +23,8 @@ def derive(seed: int, *path: int | str) -> int:
 
 def derive_each(seed: int, numbers: Sequence[int]) -> NDArray[np.int64]:
     """Return `derive(seed, number)` for each number, (m,). seed: from 0 to 2⁶³ - 1."""
-    each = np.asarray(numbers, dtype=np.int64)
-    first = generate_state(np.full(len(each), seed), [each])[0]
+    words = np.asarray(numbers, dtype=np.int64)
+    first = generate_state(np.full(len(words), seed), [words])[0]
     return (first >> np.uint64(1)).astype(np.int64)
 
 

@@ -46,8 +46,8 @@ class AliasRepository(Repository):
 
     def all(self) -> dict[tuple[str, str], AliasTarget]:
         """Return (league, alias) → its target, of all leagues, by one cheap query."""
-        found = self._database.rows(_ALL)
-        return {(league, name): AliasTarget(version, event) for league, name, version, event in found}
+        rows = self._database.rows(_ALL)
+        return {(league, name): AliasTarget(version, event) for league, name, version, event in rows}
 
     @repeat_after_deadlock
     def set(
@@ -133,8 +133,8 @@ class AliasRepository(Repository):
 def current(session: Session, league: str) -> dict[str, int]:
     """Return alias → version. Raises UnknownLeague."""
     leagues.require(session, league)
-    found = session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name))
-    return {alias.name: alias.version for alias in found}
+    aliases = session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name))
+    return {alias.name: alias.version for alias in aliases}
 
 
 def _set(
@@ -205,11 +205,13 @@ def _in_force(session: Session, league: str, alias: str) -> AliasEventTable | No
 
 def _require(last: AliasEventTable | None, league: str, alias: str, expected: int | AnyVersion | None) -> None:
     """Raise AliasMoved unless the alias points to `expected`."""
-    found = last.version if last else None
-    if expected is not ANY and found != expected:
-        now = f"is at {league}@{found} now" if found else "is not set"
-        wanted = f"{league}@{expected}" if expected else "not set"
-        raise AliasMoved(f"alias {alias} of league {league} {now}, expected {wanted}: nothing was changed")
+    version = last.version if last else None
+    if expected is not ANY and version != expected:
+        actual_state = f"is at {league}@{version} now" if version else "is not set"
+        expected_state = f"{league}@{expected}" if expected else "not set"
+        raise AliasMoved(
+            f"alias {alias} of league {league} {actual_state}, expected {expected_state}: nothing was changed"
+        )
 
 
 def _record(

@@ -83,7 +83,7 @@ class ChangeRepository(Repository):
         replicas that do not follow, and why.
         """
         league, alias = event.league, event.alias
-        now = select(AliasTable.version, AliasTable.event).filter_by(league=league, name=alias).subquery()
+        current_target = select(AliasTable.version, AliasTable.event).filter_by(league=league, name=alias).subquery()
         acknowledged = AcknowledgementTable
 
         def check(version: int | None) -> None:
@@ -93,14 +93,14 @@ class ChangeRepository(Repository):
         return self._wait(
             league,
             f"{league}@{alias} is version {event.version}",
-            now=select(now.c.version).scalar_subquery(),
+            now=select(current_target.c.version).scalar_subquery(),
             check=check,
             # The alias may have moved away and back since.
-            agrees=ReplicaTable.event >= select(now.c.event).scalar_subquery(),
+            agrees=ReplicaTable.event >= select(current_target.c.event).scalar_subquery(),
             acknowledges=and_(
                 acknowledged.event >= event.id, acknowledged.aliases[alias].as_integer() == event.version
             ),
-            describe=lambda found: _serves(found, alias),
+            describe=lambda acknowledgement: _serves(acknowledgement, alias),
             timeout=timeout,
             sleep=sleep,
         )
@@ -125,7 +125,7 @@ class ChangeRepository(Repository):
             check=check,
             agrees=true(),
             acknowledges=AcknowledgementTable.traffic == setting.id,
-            describe=lambda found: found.fault or "has not applied the setting",
+            describe=lambda acknowledgement: acknowledgement.fault or "has not applied the setting",
             timeout=timeout,
             sleep=sleep,
         )

@@ -92,11 +92,11 @@ class EvaluationRepository(Repository):
         """Return league → state → number of queued and running evaluations, of the leagues that have any."""
         table = EvaluationTable
         query = select(table.league, table.state, func.count()).where(table.state.in_((QUEUED, RUNNING)))
-        found: dict[str, dict[str, int]] = {}
+        counts: dict[str, dict[str, int]] = {}
         with self._database.read() as session:
             for league, state, count in session.execute(query.group_by(table.league, table.state)):
-                found.setdefault(league, {})[state] = count
-        return found
+                counts.setdefault(league, {})[state] = count
+        return counts
 
     def stop(self, league: str, number: int, *, actor: str) -> EvaluationRow:
         """Request the end of an evaluation; an ended one is unchanged. Raises UnknownLeague or UnknownEvaluation."""
@@ -197,15 +197,15 @@ def _submit(
 
 
 def _claim(session: Session, runner: str, workers: int) -> EvaluationRow | None:
-    now = datetime.now(UTC)
+    claimed_at = datetime.now(UTC)
     # One row at a time: locking all free rows would leave none for concurrent claims.
     query = select(EvaluationTable).where(_is_free()).order_by(EvaluationTable.id).limit(1)
     while (evaluation := session.scalar(query.with_for_update(skip_locked=True))) is not None:
         if not _ends_here(evaluation):
             evaluation.state, evaluation.runner, evaluation.workers = RUNNING, runner, workers
             evaluation.attempts += 1
-            evaluation.started_at = evaluation.started_at or now
-            evaluation.heartbeat_at = now
+            evaluation.started_at = evaluation.started_at or claimed_at
+            evaluation.heartbeat_at = claimed_at
             return _row(evaluation)
     return None
 

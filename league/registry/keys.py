@@ -79,11 +79,11 @@ class KeyRepository(Repository):
         query = select(ApiKeyTable).where((ApiKeyTable.name == name) | (ApiKeyTable.id == name)).with_for_update()
         with self._database.write() as session:
             # A name takes precedence over an equal id of another key.
-            found = sorted(session.scalars(query), key=lambda key: key.name != name)
-            if not found:
-                known = ", ".join(session.scalars(select(ApiKeyTable.name).order_by(ApiKeyTable.name))) or "none yet"
-                raise UnknownKey(f"there is no key {name!r}; known: {known}")
-            key = found[0]
+            keys = sorted(session.scalars(query), key=lambda key: key.name != name)
+            if not keys:
+                names = ", ".join(session.scalars(select(ApiKeyTable.name).order_by(ApiKeyTable.name))) or "none yet"
+                raise UnknownKey(f"there is no key {name!r}; known: {names}")
+            key = keys[0]
             if key.revoked_at is None:
                 change_counter.count(session, "keys")
                 key.revoked_at = datetime.now(UTC)
@@ -98,8 +98,8 @@ def digest(token: bytes) -> str:
 def _check(scopes: Collection[str], rate: float | None) -> None:
     unknown = sorted(set(scopes) - set(SCOPES))
     if unknown or not scopes:
-        given = f"scope {unknown[0]!r} is unknown" if unknown else "a key needs a scope"
-        raise InvalidInput(f"{given}: expected some of {', '.join(SCOPES)}")
+        problem = f"scope {unknown[0]!r} is unknown" if unknown else "a key needs a scope"
+        raise InvalidInput(f"{problem}: expected some of {', '.join(SCOPES)}")
     if rate is not None and not 0 < rate < float("inf"):
         raise InvalidInput(f"rate {rate} must be a positive number of requests per second")
 

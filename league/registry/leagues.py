@@ -63,31 +63,33 @@ class LeagueRepository(Repository):
                 change_counter.count(session, "leagues")
                 _end_keys(session, config.league)
                 return
-            known = lock_active(session, config.league)
-            if known.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
+            row = lock_active(session, config.league)
+            if row.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
                 raise InterfaceChanged(
                     f"league {config.league} has versions with other spaces or policies than this configuration: "
                     "keep them, or register the configuration under a new league name"
                 )
-            before, now = _action_selections(session, known.slug)[known.slug], action_selection(config, interface)
-            changes = [f"how versions select actions has changed: {before} → {now}"] if before != now else []
+            before, selection = _action_selections(session, row.slug)[row.slug], action_selection(config, interface)
+            changes = (
+                [f"how versions select actions has changed: {before} → {selection}"] if before != selection else []
+            )
             if changes:
                 change_counter.count(session, "leagues")
-            if known.game_digest != values["game_digest"] and _has_results(session, known.slug):
-                changes.insert(0, _describe_changes(known.game, game))
-                earlier = {"game": known.game, "replaced_at": datetime.now(UTC)}
-                upsert(session, EarlierGameTable, {"league": known.slug, "digest": known.game_digest}, earlier)
-            if changes and _has_results(session, known.slug):
-                is_back = _has_results(session, known.slug, Conditions(digest(game), now))
+            if row.game_digest != values["game_digest"] and _has_results(session, row.slug):
+                changes.insert(0, _describe_changes(row.game, game))
+                earlier = {"game": row.game, "replaced_at": datetime.now(UTC)}
+                upsert(session, EarlierGameTable, {"league": row.slug, "digest": row.game_digest}, earlier)
+            if changes and _has_results(session, row.slug):
+                is_back = _has_results(session, row.slug, Conditions(digest(game), selection))
                 logger.warning(
                     "league %s: %s. %s results can be viewed, but no longer count in ratings, payoffs and verdicts.%s",
-                    known.slug,
+                    row.slug,
                     "; ".join(changes),
                     "Later" if is_back else "Earlier",
                     " The results from when the league last had this game count again." if is_back else "",
                 )
             for name, value in values.items():
-                setattr(known, name, value)
+                setattr(row, name, value)
 
     def get(self, league: str) -> LeagueRow:
         """Return one league. Raises UnknownLeague."""
@@ -100,7 +102,7 @@ class LeagueRepository(Repository):
         query = select(table).filter_by(league=league).order_by(table.replaced_at.desc(), table.digest)
         with self._database.read() as session:
             row = session.get(LeagueTable, league) or _unknown(session, league)
-            return [detached(EarlierGameRow, each) for each in session.scalars(query) if each.digest != row.game_digest]
+            return [detached(EarlierGameRow, game) for game in session.scalars(query) if game.digest != row.game_digest]
 
     def unregistered_change(self, league: str) -> str | None:
         """Describe how the game of a league has changed since it was registered, whose results still count.
@@ -147,12 +149,12 @@ class LeagueRepository(Repository):
         another release. Leaves out leagues whose interface is.
         """
         query = select(LeagueTable.slug, LeagueTable.interface).order_by(LeagueTable.slug)
-        found = {}
+        policy_ids = {}
         with self._database.read() as session:
             for league, interface in session.execute(query):
                 with suppress(ValidationError):
-                    found[league] = Interface.model_validate(interface).policy_ids
-        return found
+                    policy_ids[league] = Interface.model_validate(interface).policy_ids
+        return policy_ids
 
 
 def require(session: Session, league: str) -> None:
@@ -183,17 +185,17 @@ def _end_keys(session: Session, league: str) -> None:
         if key.leagues is None or league not in key.leagues:
             continue
         change_counter.count(session, "keys")
-        if rest := [name for name in key.leagues if name != league]:
-            key.leagues = rest
+        if other_leagues := [name for name in key.leagues if name != league]:
+            key.leagues = other_leagues
         else:
             key.revoked_at = datetime.now(UTC)
 
 
 def _action_selections(session: Session, league: str | None = None) -> dict[str, ActionSelection]:
     """league → action selection, of all leagues or of one."""
-    chosen, interface = LeagueTable.config["play"]["actions"].as_string(), LeagueTable.interface
+    configured_actions, interface = LeagueTable.config["play"]["actions"].as_string(), LeagueTable.interface
     hidden, simultaneous = (interface[key].as_boolean() for key in ("hidden_information", "simultaneous"))
-    query = select(LeagueTable.slug, chosen, hidden, simultaneous, interface["sides"])
+    query = select(LeagueTable.slug, configured_actions, hidden, simultaneous, interface["sides"])
     rows = session.execute(query if league is None else query.where(LeagueTable.slug == league))
     return {
         slug: actions or default_selection(bool(is_hidden or at_once), len(sides or ()))
@@ -213,7 +215,7 @@ def _has_results(session: Session, league: str, conditions: Conditions | None = 
     if conditions is None:
         return session.scalar(query.limit(1)) is not None
     schedules = map(json.loads, session.scalars(query.where(ScheduleTable.document.contains(conditions.game_digest))))
-    return any((each.get("game_digest"), each.get("actions", "greedy")) == conditions for each in schedules)
+    return any((schedule.get("game_digest"), schedule.get("actions", "greedy")) == conditions for schedule in schedules)
 
 
 def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:
@@ -226,9 +228,9 @@ def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:
 
 
 def _unknown(session: Session, league: str) -> LeagueTable:
-    known = list(session.scalars(select(LeagueTable.slug).order_by(LeagueTable.slug)))
-    guess = "".join(f", did you mean {name!r}?" for name in difflib.get_close_matches(league, known, n=1))
-    raise UnknownLeague(f"there is no league {league!r}{guess or '; known: ' + (', '.join(known) or 'none yet')}")
+    slugs = list(session.scalars(select(LeagueTable.slug).order_by(LeagueTable.slug)))
+    guess = "".join(f", did you mean {name!r}?" for name in difflib.get_close_matches(league, slugs, n=1))
+    raise UnknownLeague(f"there is no league {league!r}{guess or '; known: ' + (', '.join(slugs) or 'none yet')}")
 
 
 def _row(league: LeagueTable) -> LeagueRow:

@@ -191,8 +191,8 @@ def reserve(session: Session, league: str, source: str, parent: int | None, abov
 
 def check(manifest: Manifest, league: str, number: int, parent: int | None) -> None:
     """Raise EnvironmentMismatch if a manifest does not describe the reserved version."""
-    found = (manifest.league, manifest.version, manifest.parent)
-    if found != (league, number, parent):
+    identity = (manifest.league, manifest.version, manifest.parent)
+    if identity != (league, number, parent):
         raise EnvironmentMismatch(
             f"the manifest is of {manifest.league}@{manifest.version} with parent {manifest.parent}, "
             f"expected {league}@{number} with parent {parent}"

@@ -93,11 +93,11 @@ class ReplicaRepository(Repository):
 
         silence: the time without a report after which a replica counts as silent.
         """
-        now = datetime.now(UTC) if self._database.is_sqlite else func.clock_timestamp()
-        silent = func.count().filter(ReplicaTable.seen_at <= now - silence)
+        current_time = datetime.now(UTC) if self._database.is_sqlite else func.clock_timestamp()
+        silent = func.count().filter(ReplicaTable.seen_at <= current_time - silence)
         draining = func.count().filter(ReplicaTable.process[DRAINING].as_string() == "true")
-        (found,) = self._database.rows(select(func.count(), silent, draining).select_from(ReplicaTable))
-        return ReplicaCounts(*found)
+        (row,) = self._database.rows(select(func.count(), silent, draining).select_from(ReplicaTable))
+        return ReplicaCounts(*row)
 
     def silent(self, silence: timedelta = LIVENESS_TIMEOUT) -> list[RegisteredReplica]:
         """Return the registered replicas without a report for this time."""
@@ -130,8 +130,8 @@ class ReplicaRepository(Repository):
         if not differing and settled is not None and not settled:
             return self._update(replica, position._asdict())
         with self._database.write() as session:
-            seen = {"seen_at": sql_clock(session)} | position._asdict()
-            if not row_count(session, update(ReplicaTable).filter_by(replica=replica).values(seen)):
+            report = {"seen_at": sql_clock(session)} | position._asdict()
+            if not row_count(session, update(ReplicaTable).filter_by(replica=replica).values(report)):
                 return False
             earlier = delete(AcknowledgementTable).filter_by(replica=replica)
             if settled is None:
@@ -139,9 +139,9 @@ class ReplicaRepository(Repository):
             elif settled:
                 session.execute(earlier.where(AcknowledgementTable.league.in_(settled)))
             if differing:
-                now = clock(session)
+                reported_at = clock(session)
                 rows = [
-                    {"replica": replica, "league": league, "seen_at": now} | asdict(state)
+                    {"replica": replica, "league": league, "seen_at": reported_at} | asdict(state)
                     for league, state in differing.items()
                 ]
                 upsert_all(session, AcknowledgementTable, ("replica", "league"), rows)
@@ -182,7 +182,7 @@ class ReplicaRepository(Repository):
 def acknowledgements(session: Session, league: str) -> list[Acknowledgement]:
     """Return what each registered replica serves of a league, by replica. Raises UnknownLeague."""
     leagues.require(session, league)
-    now = clock(session)
+    current_time = clock(session)
     state_at = cache(lambda event, setting: _required(session, league, event, setting))
     query = select(ReplicaTable, AcknowledgementTable).select_from(with_acknowledgement(league))
     return [
@@ -192,7 +192,7 @@ def acknowledgements(session: Session, league: str) -> list[Acknowledgement]:
             replica=replica.replica,
             league=league,
             seen_at=replica.seen_at,
-            silence=now - replica.seen_at,
+            silence=current_time - replica.seen_at,
         )
         for replica, row in session.execute(query.order_by(ReplicaTable.replica))
     ]
@@ -220,13 +220,13 @@ def serving(session: Session, league: str, since: timedelta) -> dict[int, int]:
         .where(ReplicaTable.seen_at > sql_clock(session) - since)
         .group_by(AcknowledgementTable.version, read)
     )
-    found: dict[int, int] = {}
+    replica_counts: dict[int, int] = {}
     for acknowledged, event, number in session.execute(groups):
         champion = None if event is None else _aliases_at(session, league, event).get(CHAMPION)
         version = champion.version if champion else acknowledged
         if version is not None:
-            found[version] = found.get(version, 0) + number
-    return dict(sorted(found.items()))
+            replica_counts[version] = replica_counts.get(version, 0) + number
+    return dict(sorted(replica_counts.items()))
 
 
 def _required(session: Session, league: str, event: int | None, setting: int | None) -> ServedState:
@@ -251,23 +251,23 @@ def _required(session: Session, league: str, event: int | None, setting: int | N
 
 def _aliases_at(session: Session, league: str, event: int) -> dict[str, AliasTarget]:
     """Return alias → its target when `event` was the newest."""
-    now = select(AliasTable.name, AliasTable.version, AliasTable.event).filter_by(league=league)
-    found = {alias: AliasTarget(version, moved) for alias, version, moved in session.execute(now)}
-    for alias in [alias for alias, target in found.items() if target.event > event]:
-        del found[alias]
+    query = select(AliasTable.name, AliasTable.version, AliasTable.event).filter_by(league=league)
+    targets = {alias: AliasTarget(version, moved) for alias, version, moved in session.execute(query)}
+    for alias in [alias for alias, target in targets.items() if target.event > event]:
+        del targets[alias]
         table = AliasEventTable
         earlier = select(table.version, table.id).filter_by(league=league, alias=alias).where(table.id <= event)
         if target := session.execute(earlier.order_by(table.id.desc()).limit(1)).one_or_none():
-            found[alias] = AliasTarget(*target)
-    return found
+            targets[alias] = AliasTarget(*target)
+    return targets
 
 
 def _registered(session: Session, condition: ColumnElement[bool]) -> list[RegisteredReplica]:
-    found = session.scalars(select(ReplicaTable).where(condition).order_by(ReplicaTable.replica)).all()
-    if not found:
+    rows = session.scalars(select(ReplicaTable).where(condition).order_by(ReplicaTable.replica)).all()
+    if not rows:
         return []
-    now = clock(session)
-    return [detached(RegisteredReplica, row, silence=now - row.seen_at) for row in found]
+    current_time = clock(session)
+    return [detached(RegisteredReplica, row, silence=current_time - row.seen_at) for row in rows]
 
 
 def _remove(session: Session, replica: str) -> None:

@@ -96,19 +96,19 @@ class SnapshotRepository(Repository):
     def marks(self, league: str) -> dict[str, str]:
         """Return part → the mark that it was computed from, of all parts of a league."""
         with self._database.read() as session:
-            found = session.execute(select(SnapshotTable.part, SnapshotTable.mark).filter_by(league=league))
-            return dict(found.tuples().all())
+            rows = session.execute(select(SnapshotTable.part, SnapshotTable.mark).filter_by(league=league))
+            return dict(rows.tuples().all())
 
     def put(self, league: str, documents: Mapping[str, Any], mark: str) -> None:
         """Replace these parts of a league's snapshots, all or none. Raises UnknownLeague.
 
         mark: of the data that they were computed from.
         """
-        now = datetime.now(UTC)
+        stored_at = datetime.now(UTC)
         with self._database.write() as session:
             leagues.require(session, league)
             for part, document in documents.items():
-                values = {"mark": mark, "document": document, "at": now}
+                values = {"mark": mark, "document": document, "at": stored_at}
                 upsert(session, SnapshotTable, {"league": league, "part": part}, values)
 
     def current_marks(self) -> dict[str, str]:
@@ -120,11 +120,11 @@ class SnapshotRepository(Repository):
         """Return the leagues whose snapshots are outdated: leagues without snapshots first, then the oldest."""
         query = select(SnapshotTable.league, SnapshotTable.mark, SnapshotTable.at).filter_by(part=SUMMARY)
         with self._database.read() as session:
-            known = {league: (mark, at) for league, mark, at in session.execute(query)}
+            snapshots = {league: (mark, at) for league, mark, at in session.execute(query)}
             current = _current_marks(session)
-        behind = [league for league, mark in current.items() if league not in known or known[league][0] != mark]
+        behind = [league for league, mark in current.items() if league not in snapshots or snapshots[league][0] != mark]
         never = datetime.min.replace(tzinfo=UTC)
-        return sorted(behind, key=lambda league: known[league][1] if league in known else never)
+        return sorted(behind, key=lambda league: snapshots[league][1] if league in snapshots else never)
 
 
 def _current_marks(session: Session) -> dict[str, str]:

@@ -76,8 +76,8 @@ class TrafficRepository(Repository):
         """Return league → its setting in force, of the leagues that have one, by one cheap query."""
         newest = select(func.max(TrafficEventTable.id)).group_by(TrafficEventTable.league)
         with self._database.read() as session:
-            found = session.scalars(select(TrafficEventTable).where(TrafficEventTable.id.in_(newest)))
-            return {event.league: _row(event) for event in found}
+            events = session.scalars(select(TrafficEventTable).where(TrafficEventTable.id.in_(newest)))
+            return {event.league: _row(event) for event in events}
 
     def history(self, league: str) -> list[Traffic]:
         """Return all settings of a league, newest first. Raises UnknownLeague."""
@@ -90,23 +90,23 @@ class TrafficRepository(Repository):
         """Return the shadow counters of a league, summed over replicas, by candidate and champion."""
         table = ShadowCountTable
         query = select(table).filter_by(league=league).order_by(table.candidate, table.champion)
-        found: dict[tuple[int, int], list[ShadowCountTable]] = {}
+        counts_by_pair: dict[tuple[int, int], list[ShadowCountTable]] = {}
         with self._database.read() as session:
             for count in session.scalars(query):
-                found.setdefault((count.candidate, count.champion), []).append(count)
-        return [_sum(league, *pair, counts) for pair, counts in found.items()]
+                counts_by_pair.setdefault((count.candidate, count.champion), []).append(count)
+        return [_sum(league, *pair, counts) for pair, counts in counts_by_pair.items()]
 
 
 def write_shadow_counts(session: Session, replica: str, counts: Collection[ShadowCounts]) -> None:
     """Replace the shadow counters of `replica`, and delete old ones of all replicas."""
     if not counts:
         return
-    now = datetime.now(UTC)
+    written_at = datetime.now(UTC)
     for count in counts:
         values = asdict(count)
         key = {"replica": replica} | {name: values.pop(name) for name in ("league", "candidate", "champion")}
-        upsert(session, ShadowCountTable, key, values | {"latency": list(count.latency), "at": now})
-    session.execute(delete(ShadowCountTable).where(ShadowCountTable.at < now - SHADOW_COUNTS_KEPT))
+        upsert(session, ShadowCountTable, key, values | {"latency": list(count.latency), "at": written_at})
+    session.execute(delete(ShadowCountTable).where(ShadowCountTable.at < written_at - SHADOW_COUNTS_KEPT))
 
 
 def _set(
@@ -118,24 +118,24 @@ def _set(
     actor: str,
     reason: str,
 ) -> Traffic:
-    now = current_setting(session, league)
-    wanted = (
-        now.canary if isinstance(canary, Unchanged) else canary,
-        now.shadow if isinstance(shadow, Unchanged) else shadow,
+    setting = current_setting(session, league)
+    new_portions = (
+        setting.canary if isinstance(canary, Unchanged) else canary,
+        setting.shadow if isinstance(shadow, Unchanged) else shadow,
     )
     for portion in (canary, shadow):
         if isinstance(portion, Portion):
             _check(session, league, portion)
-    if now.id is not None and wanted == (now.canary, now.shadow):
-        return now
+    if setting.id is not None and new_portions == (setting.canary, setting.shadow):
+        return setting
     change_counter.count(session, "traffic")
-    return _record(session, league, *wanted, actor=actor, reason=reason)
+    return _record(session, league, *new_portions, actor=actor, reason=reason)
 
 
 def end(session: Session, league: str, portions: Collection[str], *, actor: str, reason: str) -> None:
     """End the canary, the shadow, or both, in a transaction that has counted it."""
-    now = current_setting(session, league)
-    kept = (None if name in portions else getattr(now, name) for name in ("canary", "shadow"))
+    setting = current_setting(session, league)
+    kept = (None if name in portions else getattr(setting, name) for name in ("canary", "shadow"))
     _record(session, league, *kept, actor=actor, reason=reason)
 
 

@@ -39,8 +39,8 @@ class VerdictRepository(Repository):
             insert(session, VerdictTable, [values | {"id": schedule, "opened_at": datetime.now(UTC)}])
             verdict = session.get_one(VerdictTable, schedule)
             for name, value in values.items():
-                if (found := getattr(verdict, name)) != value:
-                    raise Conflict(f"verdict {schedule} was opened with {name} {found!r}, not {value!r}")
+                if (stored_value := getattr(verdict, name)) != value:
+                    raise Conflict(f"verdict {schedule} was opened with {name} {stored_value!r}, not {value!r}")
             return _row(verdict)
 
     @repeat_after_deadlock
@@ -103,16 +103,16 @@ class VerdictRepository(Repository):
             if (exact := session.get(table, text)) is not None and league in (None, exact.league):
                 return _row(exact)
             rows = [_row(row) for row in session.scalars(select(table).where(begins).order_by(table.id))]
-        found = [
+        verdicts = [
             row
             for row in rows
             if league in (None, row.league) and (row.id.startswith(text) or verdict_digest(row.id).startswith(text))
         ]
-        if not text or not found:
+        if not text or not verdicts:
             _unknown(text)
-        if len(found) > 1:
-            raise InvalidReference(f"verdict {text!r} is ambiguous: {_candidates(found)}")
-        return found[0]
+        if len(verdicts) > 1:
+            raise InvalidReference(f"verdict {text!r} is ambiguous: {_candidates(verdicts)}")
+        return verdicts[0]
 
     def all(self, league: str) -> list[VerdictRow]:
         """Return all verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
@@ -177,8 +177,8 @@ class NightlyRunRepository(Repository):
         table = NightlyRunTable
         query = select(table.league, func.max(table.ended_at)).where(table.ended_at.is_not(None))
         with self._database.read() as session:
-            found = session.execute(query.group_by(table.league)).tuples()
-            return {league: ended_at for league, ended_at in found if ended_at is not None}
+            rows = session.execute(query.group_by(table.league)).tuples()
+            return {league: ended_at for league, ended_at in rows if ended_at is not None}
 
     def all(self, league: str) -> list[NightlyRunRow]:
         """Return all nightly runs of a league, oldest first. Raises UnknownLeague."""
@@ -199,7 +199,7 @@ def _candidates(rows: Sequence[VerdictRow]) -> str:
     """List the first verdicts with as many characters of their digests as distinguish all of them."""
     digests = [verdict_digest(row.id) for row in rows]
     lengths = range(SHORT_VERDICT, max(map(len, digests)) + 1)
-    length = next((each for each in lengths if len({digest[:each] for digest in digests}) == len(rows)), None)
+    length = next((digits for digits in lengths if len({digest[:digits] for digest in digests}) == len(rows)), None)
     listed = [
         f"{row.id if length is None else digest[:length]} ({row.league}@{row.candidate} against {row.champion})"
         for row, digest in zip(rows[:MAX_LISTED], digests, strict=False)

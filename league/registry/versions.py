@@ -91,11 +91,11 @@ class VersionRepository(Repository):
             .filter_by(state=READY, retired_at=None)
             .order_by(table.league, table.number)
         )
-        found: dict[str, list[int]] = {}
+        numbers: dict[str, list[int]] = {}
         with self._database.read() as session:
             for name, number in session.execute(query if league is None else query.filter_by(league=league)):
-                found.setdefault(name, []).append(number)
-        return found
+                numbers.setdefault(name, []).append(number)
+        return numbers
 
     def states(self, keys: Collection[tuple[str, int]]) -> dict[tuple[str, int], VersionState | None]:
         """Return (league, number) → the state of a version, None if it was removed."""
@@ -103,8 +103,8 @@ class VersionRepository(Repository):
         query = select(table.league, table.number, table.sha256, table.retired_at.is_not(None))
         query = query.where(table.state == READY, table.league.in_({league for league, _ in keys}))
         query = query.where(table.number.in_({number for _, number in keys}))
-        found = {(league, number): VersionState(*state) for league, number, *state in self._database.rows(query)}
-        return {key: found.get(key) for key in keys}
+        states = {(league, number): VersionState(*state) for league, number, *state in self._database.rows(query)}
+        return {key: states.get(key) for key in keys}
 
     def mixtures(self, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
         """Return the mixtures among some versions, by one cheap query."""
@@ -149,8 +149,8 @@ def resolve(session: Session, ref: CheckpointRef) -> VersionRow:
     if number is None:
         leagues.require(session, ref.league)
         names = session.scalars(select(AliasTable.name).filter_by(league=ref.league).order_by(AliasTable.name))
-        known = ", ".join(names) or "none yet"
-        raise UnknownAlias(f"league {ref.league} has no alias {ref.version!r}; known: {known}")
+        known_names = ", ".join(names) or "none yet"
+        raise UnknownAlias(f"league {ref.league} has no alias {ref.version!r}; known: {known_names}")
     return _get(session, ref.league, number)
 
 
@@ -170,10 +170,10 @@ def require_files(session: Session, league: str, number: int) -> None:
     """Raise UnknownLeague, UnknownVersion or VersionRetired unless the version is ready and has its files, as have its
     members if it is a mixture.
     """
-    for each in (number, *sorted(members(session, league, [number]))):
-        require(session, league, each)
-        if session.get_one(VersionTable, (league, each)).retired_at is not None:
-            _retired(league, each)
+    for version in (number, *sorted(members(session, league, [number]))):
+        require(session, league, version)
+        if session.get_one(VersionTable, (league, version)).retired_at is not None:
+            _retired(league, version)
 
 
 def require_promotable(session: Session, league: str, number: int) -> None:
@@ -189,13 +189,13 @@ def require_promotable(session: Session, league: str, number: int) -> None:
 def mixtures(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
     """Return the mixtures among some versions."""
     query = select(VersionTable.number, VersionTable.manifest).filter_by(league=league, state=READY, role=MIXTURE)
-    found: dict[int, Mixture] = {}
+    mixture_by_number: dict[int, Mixture] = {}
     for number, text in session.execute(query.where(VersionTable.number.in_(numbers))):
         assert text is not None, "a ready version has a manifest"
         mixture = Manifest.from_json(text, source=f"the manifest of {league}@{number}").mixture
         assert mixture is not None, "the manifest checks it"
-        found[number] = mixture
-    return found
+        mixture_by_number[number] = mixture
+    return mixture_by_number
 
 
 def members(session: Session, league: str, numbers: Collection[int]) -> set[int]:

@@ -43,7 +43,7 @@ def alpha_rank(scores: ArrayLike, selection: float = 100.0, population: int = 50
     fixation = np.maximum(np.nan_to_num(fixation), SMALLEST)
     rates = fixation / max(1, table.shape[-1] - 1)
     flat = rates.reshape(-1, *rates.shape[-2:])
-    return np.stack([_stationary(each) for each in flat]).reshape(table.shape[:-1])
+    return np.stack([_stationary(matrix) for matrix in flat]).reshape(table.shape[:-1])
 
 
 def _stationary(rates: Floats) -> Floats:
@@ -80,8 +80,8 @@ def nash_averaging(payoff: ArrayLike) -> tuple[Floats, Floats]:
         raise ValueError(f"the payoff must be a square antisymmetric matrix, not of shape {table.shape}")
     support = _support(table)
     share = np.zeros(len(table))
-    others = np.setdiff1d(np.arange(len(table)), support)
-    share[support] = _most_even(table[np.ix_(support, support)], table[np.ix_(others, support)])
+    other_strategies = np.setdiff1d(np.arange(len(table)), support)
+    share[support] = _most_even(table[np.ix_(support, support)], table[np.ix_(other_strategies, support)])
     return share, table @ share
 
 

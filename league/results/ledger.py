@@ -96,13 +96,15 @@ class Ledger:
         with self._database.write() as session:
             schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
             for schedule in schedules.values():
-                own = [match for match in matches if match.schedule == schedule.id]
-                for match, seed in zip(own, schedule.seeds_at([match.position for match in own]), strict=True):
+                group = [match for match in matches if match.schedule == schedule.id]
+                for match, seed in zip(group, schedule.seeds_at([match.position for match in group]), strict=True):
                     admit(match, schedule, seed)
-            now = datetime.now(UTC)
-            rows = [row(match, now) for match in matches]
+            stored_at = datetime.now(UTC)
+            rows = [row(match, stored_at) for match in matches]
             for name in schedules:
-                self._add_size(session, name, sum(len(each["moves"]) for each in rows if each["schedule"] == name))
+                self._add_size(
+                    session, name, sum(len(record["moves"]) for record in rows if record["schedule"] == name)
+                )
             return insert(session, tables.MatchTable, rows)
 
     def _require_space(self) -> None:
@@ -133,7 +135,9 @@ class Ledger:
         after: return only matches at later positions.
         """
         with self._database.read() as session:
-            schedules = {known.id: known for known in _schedules(session, league, schedule)}
+            schedules = {
+                league_schedule.id: league_schedule for league_schedule in _schedules(session, league, schedule)
+            }
             query = _in_order(
                 select(tables.MatchTable.schedule, tables.MatchTable.position, tables.MatchTable.moves), league
             )
@@ -141,8 +145,8 @@ class Ledger:
                 query = query.where(tables.MatchTable.schedule == schedule)
             if after is not None:
                 query = query.where(tables.MatchTable.position > after)
-            found = groupby(session.execute(query), key=attrgetter("schedule"))
-            return [match for name, rows in found for match in _matches(schedules[name], list(rows))]
+            groups = groupby(session.execute(query), key=attrgetter("schedule"))
+            return [match for name, rows in groups for match in _matches(schedules[name], list(rows))]
 
     def walk(self, schedule: Schedule) -> Iterator[Match]:
         """Iterate over the matches of a schedule in order, with at most STRIDE of them in memory."""
@@ -150,11 +154,11 @@ class Ledger:
         query = select(table.position, table.moves).filter_by(schedule=schedule.id).order_by(table.position)
         while True:
             with self._database.read() as session:
-                found = session.execute(query.where(table.position > last).limit(STRIDE)).all()
-            yield from _matches(schedule, found)
-            if len(found) < STRIDE:
+                rows = session.execute(query.where(table.position > last).limit(STRIDE)).all()
+            yield from _matches(schedule, rows)
+            if len(rows) < STRIDE:
                 return
-            last = found[-1].position
+            last = rows[-1].position
 
     def match(self, match: str) -> Match:
         """Return one match. Raises UnknownMatch."""
@@ -195,10 +199,10 @@ class Ledger:
         schedule, position = _place(match)
         with self._database.read() as session:
             one = select(*_LISTED).filter_by(schedule=schedule, position=position)
-            found = _entries(session, one.subquery(), limit=1)
-        if not found:
+            entries = _entries(session, one.subquery(), limit=1)
+        if not entries:
             raise _no_match(match)
-        return found[0]
+        return entries[0]
 
     def positions(self, schedule: str) -> set[int]:
         """Return the positions of a schedule that were played."""
@@ -219,9 +223,9 @@ class Ledger:
         query = select(match.schedule).filter_by(league=league).distinct()
         with self._database.read() as session:
             counted = {
-                known.id
-                for known in _schedules(session, league)
-                if known.conditions == conditions and ref in known.contestants
+                league_schedule.id
+                for league_schedule in _schedules(session, league)
+                if league_schedule.conditions == conditions and ref in league_schedule.contestants
             }
             return any(
                 schedule in counted
@@ -241,18 +245,18 @@ class Ledger:
         columns = match.schedule, match.position, match.games, match.scores, match.returns
         with self._database.read() as session:
             schedules = {
-                known.id: known
-                for known in _schedules(session, league)
-                if conditions in (None, known.conditions) and known.scoring != "team"
+                schedule.id: schedule
+                for schedule in _schedules(session, league)
+                if conditions in (None, schedule.conditions) and schedule.scoring != "team"
             }
             query = _in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None))
             if between is not None:
                 query = query.where(tuple_(match.first, match.second).in_([between, between[::-1]]))
-            found = session.execute(query)
+            match_rows = session.execute(query)
             return [
-                _result(each, schedules[each.schedule].contestants_at(each.position))
-                for each in found
-                if each.schedule in schedules
+                _result(match_row, schedules[match_row.schedule].contestants_at(match_row.position))
+                for match_row in match_rows
+                if match_row.schedule in schedules
             ]
 
 
@@ -298,10 +302,10 @@ def _no_match(match: str) -> UnknownMatch:
 
 def _when_played(session: Session, league: str, match: str) -> tuple[Any, ...]:
     schedule, position = _place(match)
-    found = session.execute(select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)).first()
-    if found is None:
+    sort_key = session.execute(select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)).first()
+    if sort_key is None:
         raise InvalidInput(f"before: league {league} has no match {match!r}")
-    return tuple(found)
+    return tuple(sort_key)
 
 
 def _entries(session: Session, found: Subquery, limit: int) -> list[LedgerEntry]:
@@ -309,16 +313,16 @@ def _entries(session: Session, found: Subquery, limit: int) -> list[LedgerEntry]
     schedule, newest_first = tables.ScheduleTable, (found.c[column.key].desc() for column in _PLAYED)
     query = select(*found.c, schedule.kind, schedule.purged_at).join(schedule, schedule.id == found.c.schedule)
     rows = session.execute(query.order_by(*newest_first).limit(limit)).all()
-    schedules = {name: _schedule(session, name) for name in {each.schedule for each in rows}}
+    schedules = {name: _schedule(session, name) for name in {match_row.schedule for match_row in rows}}
     return [
         LedgerEntry(
-            _result(each, (each.first, each.second)),
-            kind=each.kind,
-            played_at=each.played_at,
-            is_purged=each.purged_at is not None,
-            conditions=schedules[each.schedule].conditions,
+            _result(match_row, (match_row.first, match_row.second)),
+            kind=match_row.kind,
+            played_at=match_row.played_at,
+            is_purged=match_row.purged_at is not None,
+            conditions=schedules[match_row.schedule].conditions,
         )
-        for each in rows
+        for match_row in rows
     ]
 
 

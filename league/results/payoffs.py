@@ -69,21 +69,23 @@ def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: s
         raise NotFound(
             f"the league has {len(refs)} versions, expected at least two: `league train CONFIG` publishes them"
         )
-    known = set(refs)
-    pairs = [each for each in results if len(set(each.contestants)) == 2 and known >= set(each.contestants)]
-    playing = tuple(ref for ref in refs if any(ref in each.contestants for each in pairs))
+    contestants = set(refs)
+    pairs = [
+        result for result in results if len(set(result.contestants)) == 2 and contestants >= set(result.contestants)
+    ]
+    playing = tuple(ref for ref in refs if any(ref in result.contestants for result in pairs))
     if not playing:
         raise NotFound(
             f"no two of the {len(refs)} versions have played each other: `league evaluate LEAGUE` lets them play"
         )
     table = payoff_matrix(playing, pairs, {})
     shares = nash_averaging(2 * table - 1)[0] if method == "nash" else alpha_rank(table)
-    met = {frozenset(each.contestants) for each in pairs}
+    met = {frozenset(result.contestants) for result in pairs}
     return MetaStrategy(
         refs=playing,
         probabilities=tuple(shares.tolist()),
         payoff=tuple(map(tuple, table.tolist())),
-        games=sum(each.games for each in pairs),
+        games=sum(result.games for result in pairs),
         unmet=len(playing) * (len(playing) - 1) // 2 - len(met),
     )
 

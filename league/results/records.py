@@ -289,10 +289,10 @@ def load_games(text: str) -> tuple[Game, ...]:
             tuple(actions),
             tuple(returns),
             tuple(scores),
-            tuple(Forfeit(*part) for part in rest if isinstance(part, list)),
-            next((tuple(part["members"]) for part in rest if isinstance(part, dict)), ()),
+            tuple(Forfeit(*part) for part in parts if isinstance(part, list)),
+            next((tuple(part["members"]) for part in parts if isinstance(part, dict)), ()),
         )
-        for sides, actions, returns, scores, *rest in games
+        for sides, actions, returns, scores, *parts in games
     )
 
 

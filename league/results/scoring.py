@@ -74,13 +74,13 @@ def _scores(returns: tuple[Values, ...], scoring: Scoring, broken: tuple[frozens
 def _score(
     returns: Sequence[Values], game: int, contestant: int, scoring: Scoring, broken: Collection[int]
 ) -> float | None:
-    mine = returns[game][contestant]
-    other = returns[game if scoring == "game" else 1 - game][1 - contestant]
-    if scoring == "team" or mine is None or other is None:
+    own_outcome = returns[game][contestant]
+    other_outcome = returns[game if scoring == "game" else 1 - game][1 - contestant]
+    if scoring == "team" or own_outcome is None or other_outcome is None:
         return None
     if broken:
-        mine, other = float(contestant not in broken), float(1 - contestant not in broken)
-    return 1.0 if mine > other else 0.5 if mine == other else 0.0
+        own_outcome, other_outcome = float(contestant not in broken), float(1 - contestant not in broken)
+    return 1.0 if own_outcome > other_outcome else 0.5 if own_outcome == other_outcome else 0.0
 
 
 def admit(match: Match, schedule: Schedule, seed: int | None = None) -> None:
@@ -93,9 +93,9 @@ def admit(match: Match, schedule: Schedule, seed: int | None = None) -> None:
     expected = schedule.match(match.position, match.games, seed)
     if match != expected:
         for name in Match.__slots__:
-            given, value = getattr(match, name), getattr(expected, name)
-            if given != value:
-                raise _refusal(match, f"its {name} is {given!r}, but {value!r} in its schedule")
+            recorded_value, value = getattr(match, name), getattr(expected, name)
+            if recorded_value != value:
+                raise _refusal(match, f"its {name} is {recorded_value!r}, but {value!r} in its schedule")
     if len(match.games) != GAMES_PER_BLOCK:
         raise _refusal(match, f"it has {len(match.games)} games, expected {GAMES_PER_BLOCK}")
     for index, game in enumerate(match.games):
@@ -104,8 +104,10 @@ def admit(match: Match, schedule: Schedule, seed: int | None = None) -> None:
     forfeits = [{forfeit.contestant for forfeit in game.forfeits} for game in match.games]
     for index, expected_scores in enumerate(scores(returns, schedule.scoring, forfeits)):
         if match.games[index].scores != expected_scores:
-            given, ground = match.games[index].scores, "forfeits" if any(forfeits) else "returns"
-            raise _refusal(match, f"game {index} has the scores {given}, but its {ground} say {expected_scores}")
+            recorded_scores, ground = match.games[index].scores, "forfeits" if any(forfeits) else "returns"
+            raise _refusal(
+                match, f"game {index} has the scores {recorded_scores}, but its {ground} say {expected_scores}"
+            )
 
 
 def _admit_game(match: Match, schedule: Schedule, index: int, game: Game) -> None:

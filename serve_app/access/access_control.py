@@ -214,15 +214,15 @@ class AccessControlMiddleware:
         if (kind := scope["type"]) == "lifespan":
             await self._application(scope, receive, send)
             return
-        if self._is_first and (here := scope.get("server")):
+        if self._is_first and (server := scope.get("server")):
             self._is_first = False
-            self._access.backlog.watch_port(here[1])
+            self._access.backlog.watch_port(server[1])
         if self._log is not None:
             send = self._log.begin(scope, _path(scope), send)
         response = ResponseTracker(send)
         try:
-            shown = _read_headers(scope["headers"])
-            key = self._access.admit_request(scope, shown)
+            headers = _read_headers(scope["headers"])
+            key = self._access.admit_request(scope, headers)
             if key is not None:
                 scope[KEY] = key
                 response.add_header(KEY_ACCEPTED.encode(), b"1")
@@ -232,7 +232,7 @@ class AccessControlMiddleware:
             if kind != "http" or is_event_stream(path):
                 await self._application(scope, receive, response.send)
                 return
-            timeout = self._timeout if shown.timeout is None else min(_seconds(shown.timeout), self._timeout)
+            timeout = self._timeout if headers.timeout is None else min(_seconds(headers.timeout), self._timeout)
             scope[DEADLINE] = monotonic() + timeout
             with nullcontext() if path.startswith(UNLIMITED) else self._in_flight.opened(None):
                 await run_within(timeout, self._application(scope, receive, response.send))

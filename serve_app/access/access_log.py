@@ -45,7 +45,7 @@ class AccessLog:
 
     def begin(self, scope: Scope, path: str, send: Send) -> Send:
         """Start the entry of a request; returns a `send` that completes it."""
-        begun = perf_counter_ns()
+        start = perf_counter_ns()
         line: dict[str, Any] = {"time": None, "method": scope.get("method", scope["type"]), "route": path}
         line |= {"policy": None, "version": None, "status": None, "us": None, "key": None}
         scope[LOG_ENTRY] = line
@@ -56,7 +56,7 @@ class AccessLog:
             await send(message)
             is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
             if is_end or message["type"] == "websocket.close":
-                line["time"], line["us"] = datetime.now(UTC), (perf_counter_ns() - begun) // 1000
+                line["time"], line["us"] = datetime.now(UTC), (perf_counter_ns() - start) // 1000
                 self._append(line)
 
         return noting

@@ -45,9 +45,9 @@ class TokenBucket:
         return 0.0
 
     def _refill(self) -> None:
-        now = self._clock()
-        self._tokens = min(self._size, self._tokens + (now - self._at) * self.rate)
-        self._at = now
+        current_time = self._clock()
+        self._tokens = min(self._size, self._tokens + (current_time - self._at) * self.rate)
+        self._at = current_time
 
 
 class ApiKey:
@@ -97,7 +97,7 @@ class ApiKeyCache:
         return self._keys.get(key.digest) is key and time() < key.expires
 
     def _key(self, row: KeyRow) -> ApiKey:
-        known = self._keys.get(bytes.fromhex(row.sha256))
-        if known is not None and known.row == row:
-            return known
+        cached_key = self._keys.get(bytes.fromhex(row.sha256))
+        if cached_key is not None and cached_key.row == row:
+            return cached_key
         return ApiKey(row, None if row.rate is None else TokenBucket(row.rate))

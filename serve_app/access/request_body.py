@@ -91,8 +91,8 @@ def _known_encoding(value: bytes) -> bytes:
     if encoding in (b"", b"identity"):
         return b""
     if encoding not in WINDOW_BITS:
-        given = encoding.decode("latin-1")[:64]
-        raise UnsupportedMediaType(f"the Content-Encoding is {given!r}, expected gzip, deflate or identity")
+        encoding_name = encoding.decode("latin-1")[:64]
+        raise UnsupportedMediaType(f"the Content-Encoding is {encoding_name!r}, expected gzip, deflate or identity")
     return encoding
 
 
@@ -112,8 +112,8 @@ def _inflate(body: bytes, window_bits: int, limit: int) -> bytes:
 def _check_type(value: bytes) -> None:
     media_type = value.partition(b";")[0].strip().lower()
     if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
-        given = media_type.decode("latin-1")[:64]
-        raise UnsupportedMediaType(f"the Content-Type is {given!r}, expected application/json")
+        type_name = media_type.decode("latin-1")[:64]
+        raise UnsupportedMediaType(f"the Content-Type is {type_name!r}, expected application/json")
 
 
 def _incomplete() -> MalformedBody:

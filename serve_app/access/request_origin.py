@@ -37,17 +37,17 @@ def reject_cross_site(kind: str, method: str, headers: Iterable[tuple[bytes, byt
     # "same-site" is not enough: it includes pages on other ports of this machine.
     is_ours = site in SAME_ORIGIN if site is not None else origin is None or _authority(origin) == values.get(b"host")
     if not is_ours:
-        shown = (origin or b"another origin").decode("latin-1")[:100]
-        raise CrossSiteRequest(f"cross-site request from {shown} refused: only pages of this server may send it")
+        sender = (origin or b"another origin").decode("latin-1")[:100]
+        raise CrossSiteRequest(f"cross-site request from {sender} refused: only pages of this server may send it")
 
 
 def reject_foreign_host(headers: Iterable[tuple[bytes, bytes]]) -> None:
     """Raise UntrustedHost if a `Host` header does not name the loopback interface. Browsers always send one."""
     for name, value in headers:
         if name == b"host" and not (len(value) <= MAX_AUTHORITY and _is_loopback(value)):
-            shown = value.decode("latin-1")[:100]
+            host = value.decode("latin-1")[:100]
             raise UntrustedHost(
-                f"a server without API keys accepts only requests to localhost, not to {shown}: "
+                f"a server without API keys accepts only requests to localhost, not to {host}: "
                 "create a key (league keys create), or set require_keys to never"
             )
 

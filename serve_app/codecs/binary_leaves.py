@@ -65,13 +65,13 @@ def _decode_array(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
         )
     dtype = value.get("dtype", leaf.dtype)
     if dtype != leaf.dtype:
-        given = f"dtype {dtype[:64]!r}" if type(dtype) is str else "a dtype that is not a string"
-        raise ObservationError(f"{name} has {given}, expected {leaf.dtype}: nothing is converted")
+        dtype_text = f"dtype {dtype[:64]!r}" if type(dtype) is str else "a dtype that is not a string"
+        raise ObservationError(f"{name} has {dtype_text}, expected {leaf.dtype}: nothing is converted")
     shape = value.get("shape", list(leaf.shape))
     if shape != list(leaf.shape):
         is_list = type(shape) is list and all(type(size) is int for size in shape)
-        given = f"shape {shape[:16]}" if is_list else "a shape that is not a list of integers"
-        raise ObservationError(f"{name} has {given}, expected {list(leaf.shape)}")
+        shape_text = f"shape {shape[:16]}" if is_list else "a shape that is not a list of integers"
+        raise ObservationError(f"{name} has {shape_text}, expected {list(leaf.shape)}")
     data = _decode_base64(f"{name}.b64", value[B64])
     size = prod(leaf.shape) * np.dtype(leaf.dtype).itemsize
     if len(data) != size:
@@ -94,10 +94,10 @@ def _decode_images(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
         raise ObservationError(f"{name}.png holds {len(texts)} images, expected 1 to {MAX_IMAGES}")
     pictures = [_decode_base64(f"{name}.png", text) for text in texts]
     height, width, *channels = leaf.shape
-    found = sum(_check_header(name, picture, height, width) for picture in pictures)
-    if found != (channels[0] if channels else 1):
+    channel_count = sum(_check_header(name, picture, height, width) for picture in pictures)
+    if channel_count != (channels[0] if channels else 1):
         raise ObservationError(
-            f"{name}.png has {found} channels, expected {channels[0] if channels else 1}"
+            f"{name}.png has {channel_count} channels, expected {channels[0] if channels else 1}"
             " (grey has 1, grey and alpha 2, RGB 3, RGBA 4; several images add up)"
         )
     decoded = [_decode_pixels(name, picture, height, width) for picture in pictures]

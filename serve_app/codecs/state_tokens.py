@@ -56,9 +56,9 @@ def read_token(text: Any) -> StateToken:
         raise InvalidState("state must be null or the state of an earlier response: one string per observation")
     try:
         data = binascii.a2b_base64(text.translate(FROM_URL_ALPHABET) + "=" * (-len(text) % 4), strict_mode=True)
-        found, version, manifest, length = HEAD.unpack_from(data)
+        token_format, version, manifest, length = HEAD.unpack_from(data)
         begin, end = HEAD.size + length, len(data) - DIGEST
-        whole = found == FORMAT and begin <= end and _digest(data[:end]) == data[end:]
+        whole = token_format == FORMAT and begin <= end and _digest(data[:end]) == data[end:]
         model = data[HEAD.size : begin].decode("ascii") if whole else ""
     except (binascii.Error, ValueError, struct.error):
         whole = False

@@ -113,7 +113,7 @@ def _tokens(state: Any, batch: int | None) -> list[StateToken | None]:
         raise InvalidState(f"state is {json_type(state)}, expected a list with the state of each observation, or null")
     if len(state) != batch:
         raise InvalidState(f"state has {len(state)} items, expected {batch}: one per observation")
-    return [None if each is None else read_token(each) for each in state]
+    return [None if token is None else read_token(token) for token in state]
 
 
 def _check_seed(seed: Any, batch: int | None) -> None:
@@ -122,7 +122,7 @@ def _check_seed(seed: Any, batch: int | None) -> None:
     if batch is not None and type(seed) is list and len(seed) != batch:
         raise InvalidInput(f"seed has {len(seed)} integers, expected {batch}: one per observation")
     seeds = seed if batch is not None and type(seed) is list else [seed]
-    if any(type(each) is not int or not 0 <= each < 2**63 for each in seeds):
+    if any(type(row_seed) is not int or not 0 <= row_seed < 2**63 for row_seed in seeds):
         raise InvalidInput("seed must be null or an integer from 0 to 2^63 - 1, or in a batch a list of such integers")
 
 
@@ -228,7 +228,7 @@ def generators(seed: int | list[int] | None, rows: int) -> Sequence[np.random.Ge
     if seed is None:
         return [np.random.default_rng() for _ in range(rows)]
     if isinstance(seed, list):
-        return [generator(own, 0) for own in seed]
+        return [generator(row_seed, 0) for row_seed in seed]
     return [generator(seed, row) for row in range(rows)]
 
 

@@ -58,21 +58,21 @@ class BinaryCodec:
 
     def __init__(self, policy: LoadedPolicy) -> None:
         self._inputs = [_input(name, leaf) for name, _, leaf in policy.reader.leaves]
-        self._row = sum(each.size for each in self._inputs)
+        self._row = sum(tensor.size for tensor in self._inputs)
         self._is_masked = policy.reader.is_masked
         self._action = _little(next(tensor.dtype for tensor in policy.manifest.outputs if tensor.name == ACTION))
 
     def read(self, request: BinaryRequest) -> dict[str, NDArray]:
         """Decode the graph's inputs, without state. Raises ObservationError or IllegalMask."""
         if len(request.tensors) != (size := request.rows * self._row):
-            parts = " + ".join(f"{each.size} {each.name}" for each in self._inputs)
+            parts = " + ".join(f"{tensor.size} {tensor.name}" for tensor in self._inputs)
             raise ObservationError(
                 f"the tensors have {len(request.tensors)} bytes, expected {size}: {request.rows} rows of {parts}"
             )
         arrays, at = {}, 0
-        for each in self._inputs:
-            end = at + request.rows * each.size
-            arrays[each.name] = _array(request.tensors[at:end], each, request.rows)
+        for tensor in self._inputs:
+            end = at + request.rows * tensor.size
+            arrays[tensor.name] = _array(request.tensors[at:end], tensor, request.rows)
             at = end
         if self._is_masked:
             check_mask(arrays[ACTION_MASK])

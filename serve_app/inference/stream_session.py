@@ -145,24 +145,24 @@ class StreamSession:
         return _text({"closing": True, "state": self._tokens()} | self._served.signature)
 
     async def _answer_text(self, data: bytes) -> StreamMessage:
-        begun = perf_counter_ns()
+        start = perf_counter_ns()
         if is_large := len(data) > LARGE_BODY:
             self._served.policy.limits.check_body(data, self._dependencies.settings.max_batch)
         document = await asyncio.to_thread(_parsed, data) if is_large else _parsed(data)
         reject_unknown_keys(document, KEYS | STREAM_ONLY_KEYS)
-        own = document.keys() & STREAM_ONLY_KEYS
+        stream_keys = document.keys() & STREAM_ONLY_KEYS
         if document.keys() == {"reset"} and parse_flag(document, "reset"):
             self._served, self._state = self._current(is_anew=True), None
             return _text({"reset": True} | self._served.signature)
         return_state, reset = parse_flag(document, "return_state"), document.get("reset", False)
-        for key in own:
+        for key in stream_keys:
             del document[key]
         request = parse_action_request(document, self._dependencies.settings.max_batch)
         if request.state is not None:
             raise InvalidState("state is an object, expected a token: streams do not accept arrays")
         is_anew = reset is True or ("state" in document and document["state"] is None)
         served, state = await self._select(request, is_anew, _resets(reset, request))
-        plain = is_plain(request, served.policy, data.count(b'"') - 2 * len(own))
+        plain = is_plain(request, served.policy, data.count(b'"') - 2 * len(stream_keys))
         observations = await read_observations(request, served.policy, plain, len(data))
         answer, is_greedy = await execute_request(request, served.policy, observations, state)
         self._mirror(served, observations, state, answer.actions if is_greedy else None)
@@ -171,11 +171,11 @@ class StreamSession:
         if return_state and self._state is not None:
             response["state"] = self._tokens()
         message = _text(response)
-        self._count(served, len(request.observations), begun)
+        self._count(served, len(request.observations), start)
         return message
 
     async def _answer_binary(self, data: bytes) -> StreamMessage:
-        begun = perf_counter_ns()
+        start = perf_counter_ns()
         request = parse_request(data, self._dependencies.settings.max_batch)
         served, state = self._continue(request.rows, request.reset, request.resets)
         observations = served.codec.read(request)
@@ -184,7 +184,7 @@ class StreamSession:
         self._mirror(served, observations, state, answer.actions if rng is None else None)
         self._store_state(served, answer, is_batch=request.rows > 1)
         message = StreamMessage(served.codec.write(answer.actions, served.version.number), False)
-        self._count(served, request.rows, begun)
+        self._count(served, request.rows, start)
         return message
 
     async def _select(
@@ -285,7 +285,7 @@ def _resets(reset: Any, request: DecodedActionRequest) -> NDArray | None:
         return None
     if not request.is_batch or type(reset) is not list:
         raise InvalidInput(f"reset is {json_type(reset)}, expected true or false, or in a batch a list of booleans")
-    if len(reset) != len(request.observations) or any(type(each) is not bool for each in reset):
+    if len(reset) != len(request.observations) or any(type(flag) is not bool for flag in reset):
         raise InvalidInput(f"reset must have {len(request.observations)} booleans: one per observation")
     return np.array(reset)
 

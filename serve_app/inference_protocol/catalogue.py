@@ -84,17 +84,17 @@ class ModelCatalogue:
 
         Raises the errors of `ModelResolver.find`.
         """
-        found = sum_documents(await self._of_all_replicas())
+        documents = sum_documents(await self._of_all_replicas())
         if not model:
-            return {"model_stats": found}
+            return {"model_stats": documents}
         served = await self._inference.find(model, version)
         number = served.version.number
-        own = [each for each in found if each["name"] == served.name]
+        model_documents = [document for document in documents if document["name"] == served.name]
         if version:
-            own = [each for each in own if each["version"] == str(number)]
-        if all(each["version"] != str(number) for each in own):
-            own.append(ModelStatistics().document(served.name, number))
-        return {"model_stats": own}
+            model_documents = [document for document in model_documents if document["version"] == str(number)]
+        if all(document["version"] != str(number) for document in model_documents):
+            model_documents.append(ModelStatistics().document(served.name, number))
+        return {"model_stats": model_documents}
 
     async def _of_all_replicas(self) -> list[Document]:
         """What the replicas wrote last. This one writes first, so that no later answer, by any replica, has less."""
@@ -103,7 +103,7 @@ class ModelCatalogue:
             reports = await self._models.query(lambda registry: registry.replicas.reports())
         except StorageError:
             return self._inference.statistics.documents()
-        return [each for report in reports.values() for each in report.get(REPORT, ())]
+        return [document for report in reports.values() for document in report.get(REPORT, ())]
 
     async def index(self, only_ready: bool = False) -> list[Document]:
         """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises

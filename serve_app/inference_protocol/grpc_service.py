@@ -112,11 +112,11 @@ def is_local_peer(peer: str, machine: str) -> bool:
     """Whether a peer address is on this machine: `ipv4:127.0.0.1:4711`, `ipv6:%5B::1%5D:4711`, `unix:` or the node's
     address.
     """
-    kind, _, rest = unquote(peer).partition(":")
+    kind, _, endpoint = unquote(peer).partition(":")
     if kind == "unix":
         return True
     try:
-        address = ip_address(rest.rpartition(":")[0].strip("[]"))
+        address = ip_address(endpoint.rpartition(":")[0].strip("[]"))
     except ValueError:
         return False
     if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:

@@ -103,28 +103,28 @@ class Inference:
 
         headers: those of the request; the caller's key may route a request for the champion to the canary.
         """
-        begun = perf_counter_ns()
+        start = perf_counter_ns()
         served = await self.find(request.model, request.version, headers)
         mirror = self._shadow.mirror_for(request.model, served.version)
-        found = perf_counter_ns()
+        lookup_end = perf_counter_ns()
         entry = self.statistics.entry(served.name, served.version.number)
         try:
-            wanted = _wanted(request.outputs, served.signature)
+            output_names = _wanted(request.outputs, served.signature)
             if request.is_sequence and served.signature.is_recurrent:
                 raise InvalidInput("sequences are not supported: send state_out_<i> back as state_in_<i>")
             arrays = await self._read(request, served.signature)
             read = perf_counter_ns()
-            outputs = await _run(arrays, wanted, served, mirror)
+            outputs = await _run(arrays, output_names, served, mirror)
             ran = perf_counter_ns()
             response = InferResponse(request.model, str(served.version.number), request.id, outputs)
             encoded = encode(response)
         except BaseException:
-            entry.fail(perf_counter_ns() - begun)
+            entry.fail(perf_counter_ns() - start)
             raise
         rows = len(next(iter(arrays.values())))
         done = perf_counter_ns()
-        entry.succeed(rows, begun, found, read, ran, done)
-        self._metrics.count_request(API, request.model, served.version, rows, done - begun)
+        entry.succeed(rows, start, lookup_end, read, ran, done)
+        self._metrics.count_request(API, request.model, served.version, rows, done - start)
         return encoded
 
     async def _read(self, request: InferRequest, signature: Signature) -> dict[str, NDArray]:

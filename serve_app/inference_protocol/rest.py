@@ -132,8 +132,8 @@ class InferRoute:
             self._access.admit_body(scope.get(KEY), len(body))
         model, version = scope["path_params"]["model"], scope["path_params"].get("version", "")
         if is_large:
-            found = await self._inference.find(model, version)
-            found.policy.limits.check_body(memoryview(body)[:header_length], self._settings.max_batch)
+            served = await self._inference.find(model, version)
+            served.policy.limits.check_body(memoryview(body)[:header_length], self._settings.max_batch)
             request = await asyncio.to_thread(read_request, model, version, body, header_length)
         else:
             request = read_request(model, version, body, header_length)
@@ -148,10 +148,10 @@ class InferRoute:
         if length is not None:
             headers.append((HEADER_LENGTH, b"%d" % length))
         if accepted:
-            response, chosen = await compressed(response, accepted)
+            response, encoding = await compressed(response, accepted)
             headers.append((b"vary", b"accept-encoding"))
-            if chosen is not None:
-                headers.append((b"content-encoding", chosen))
+            if encoding is not None:
+                headers.append((b"content-encoding", encoding))
         headers.append((b"content-length", b"%d" % len(response)))
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": response})

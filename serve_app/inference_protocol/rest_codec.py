@@ -69,21 +69,21 @@ def read_request(model: str, version: str, body: bytes, header_length: int | Non
 
     Raises MalformedBody or InvalidInput.
     """
-    document, rest = _split(body, header_length)
+    document, tensor_bytes = _split(body, header_length)
     parameters = _parameters(document, "the request")
     outputs = _list(document, "outputs", required=False)
     names, binary = [], {}
     for output in outputs:
         name = _string(output, "name", "an output")
         names.append(name)
-        own = _parameters(output, "an output")
-        if own.get("binary_data") is not None:
-            binary[name] = _flag(own, "binary_data")
+        output_parameters = _parameters(output, "an output")
+        if output_parameters.get("binary_data") is not None:
+            binary[name] = _flag(output_parameters, "binary_data")
     request = InferRequest(
         model=model,
         version=version,
         id="" if document.get("id") is None else _string(document, "id", "the request"),
-        inputs=_tensors(_list(document, "inputs", required=True), rest),
+        inputs=_tensors(_list(document, "inputs", required=True), tensor_bytes),
         outputs=names,
         size=len(body),
         is_sequence=bool(parameters.get(SEQUENCE)),

@@ -90,11 +90,11 @@ class ModelStatistics:
 
 def sum_documents(documents: Iterable[Document]) -> list[Document]:
     """Sum the statistics of replicas by model and version; the last inference is the latest one."""
-    found: dict[tuple[str, int], Document] = {}
+    sums: dict[tuple[str, int], Document] = {}
     for document in documents:
         key = (document["name"], int(document["version"]))
-        found[key] = _sum(found[key], document) if key in found else document
-    return [found[key] for key in sorted(found)]
+        sums[key] = _sum(sums[key], document) if key in sums else document
+    return [sums[key] for key in sorted(sums)]
 
 
 def _sum(one: Document, other: Document) -> Document:

@@ -116,8 +116,8 @@ def read_inputs(tensors: Sequence[RequestTensor], signature: Signature, max_batc
     for tensor in tensors:
         port = signature.inputs.get(tensor.name)
         if port is None:
-            known = ", ".join(signature.inputs)
-            raise ObservationError(f"unknown input {tensor.name[:64]!r}, expected {known}")
+            input_names = ", ".join(signature.inputs)
+            raise ObservationError(f"unknown input {tensor.name[:64]!r}, expected {input_names}")
         if tensor.name in arrays:
             raise ObservationError(f"input {tensor.name} is given twice")
         arrays[tensor.name] = _array(tensor, port, max_batch)

@@ -67,7 +67,7 @@ class AliasSlots:
 
     def knows(self, league: str) -> bool:
         """Whether a league has an alias."""
-        return any(league == known for known, _ in self._wanted)
+        return any(league == alias_league for alias_league, _ in self._wanted)
 
     def champion(self, league: str) -> LoadedVersion | None:
         """The version that answers if a request names none."""
@@ -90,10 +90,10 @@ class AliasSlots:
 
     def faults(self) -> dict[str, str]:
         """league → why aliases of it are not served as the registry requires."""
-        found: dict[str, list[str]] = {}
+        reasons: dict[str, list[str]] = {}
         for (league, alias), fault in sorted(self._faults.items()):
-            found.setdefault(league, []).append(f"{alias}: {fault}")
-        return {league: "; ".join(faults) for league, faults in found.items()}
+            reasons.setdefault(league, []).append(f"{alias}: {fault}")
+        return {league: "; ".join(faults) for league, faults in reasons.items()}
 
     def loaded(self) -> set[VersionKey]:
         """The versions in memory."""

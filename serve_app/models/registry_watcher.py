@@ -144,8 +144,8 @@ class RegistryWatcher:
         if read.versions is not None:
             self._slots.drop_changed(read.versions)
         if read.aliases is not None or read.traffic is not None or self._slots.differing():
-            wanted = {alias: target.version for alias, target in self._aliases.items()}
-            self._slots.update(wanted | pinned_slots(self._wanted_traffic))
+            alias_versions = {alias: target.version for alias, target in self._aliases.items()}
+            self._slots.update(alias_versions | pinned_slots(self._wanted_traffic))
             await self._slots.settle(self._settings.poll)
             self._traffic.update(self._wanted_traffic)
         if self._slots.is_settled:
@@ -189,15 +189,17 @@ class RegistryWatcher:
         counts, connection = registry.changes.counts(), self._connection.opened
         last = self._last_read
         is_current = last is not None and connection == last.connection and time.monotonic() < self._reread_at
-        known = last.counts if last is not None and is_current else None
+        last_counts = last.counts if last is not None and is_current else None
         return _Read(
             counts,
             connection,
-            registry.aliases.all() if known is None or known.aliases != counts.aliases else None,
-            registry.traffic.all() if known is None or known.traffic != counts.traffic else None,
-            registry.keys.all() if known is None or known.keys != counts.keys else None,
-            registry.leagues.action_selections() if known is None or known.leagues != counts.leagues else None,
-            registry.versions.states(loaded) if known is None or known.leagues != counts.leagues else None,
+            registry.aliases.all() if last_counts is None or last_counts.aliases != counts.aliases else None,
+            registry.traffic.all() if last_counts is None or last_counts.traffic != counts.traffic else None,
+            registry.keys.all() if last_counts is None or last_counts.keys != counts.keys else None,
+            registry.leagues.action_selections()
+            if last_counts is None or last_counts.leagues != counts.leagues
+            else None,
+            registry.versions.states(loaded) if last_counts is None or last_counts.leagues != counts.leagues else None,
         )
 
     def _accept(self, read: _Read) -> None:
@@ -222,10 +224,12 @@ class RegistryWatcher:
 
     async def _acknowledge(self) -> None:
         """Acknowledge what was read, and leagues that differ from it, if this has changed."""
-        known, position, differing = self._acknowledged, self._position, self._differing()
-        changed = {league: state for league, state in differing.items() if known.differing.get(league) != state}
-        settled = None if known.position is None else known.differing.keys() - differing.keys()
-        if position == known.position and not changed and not settled:
+        acknowledgement, position, differing = self._acknowledged, self._position, self._differing()
+        changed = {
+            league: state for league, state in differing.items() if acknowledgement.differing.get(league) != state
+        }
+        settled = None if acknowledgement.position is None else acknowledgement.differing.keys() - differing.keys()
+        if position == acknowledgement.position and not changed and not settled:
             return
         self._acknowledged = _Acknowledged()  # unknown, until it is certain that the change was committed
         if await self._connection.call(

@@ -178,7 +178,7 @@ class Shadow:
         for candidate in candidates:
             target = self._traffic.shadows.get(candidate.league)
             shadow = None if target is None else self._slots.get(candidate.league, target.slot)
-            if shadow is None or all(candidate is not each for each in (shadow, *shadow.members)):
+            if shadow is None or all(candidate is not version for version in (shadow, *shadow.members)):
                 for policy in candidate.policies.values():
                     policy.shadow_policy.end_runs()
         asyncio.get_running_loop().call_later(BATCH_WINDOW, self._end_if_off, computing, candidates)
@@ -197,8 +197,8 @@ class Shadow:
             counts.failed += outcome.failed
             if outcome.ns is not None:
                 counts.latency.add(outcome.ns)
-        rest = max(BATCH_WINDOW, seconds * (1 / self._settings.shadow_load - 1))
-        asyncio.get_running_loop().call_later(rest, self._start_batch)
+        pause = max(BATCH_WINDOW, seconds * (1 / self._settings.shadow_load - 1))
+        asyncio.get_running_loop().call_later(pause, self._start_batch)
 
     def _counts_of(self, pair: tuple[str, int, int]) -> Tally:
         if (counts := self._counts.get(pair)) is None:
@@ -208,19 +208,19 @@ class Shadow:
 
 def compare(requests: Sequence[MirroredRequest]) -> tuple[list[ShadowResult], float]:
     """Run candidates on requests; returns the results and the CPU time in seconds."""
-    begun = thread_time_ns()
+    start = thread_time_ns()
     alike: dict[tuple[int, int, str | None], list[MirroredRequest]] = {}
     for request in requests:
         alike.setdefault((id(request.candidate), id(request.champion), request.policy), []).append(request)
     outcomes = []
     for group in alike.values():
-        first, rest = group[:1], group[1:]
+        first, later_requests = group[:1], group[1:]
         outcomes.append(_compare_batch(first, is_timed=True))
         if outcomes[-1].is_late:
-            outcomes.append(replace(outcomes[-1], failed=len(rest)))
+            outcomes.append(replace(outcomes[-1], failed=len(later_requests)))
             continue
-        outcomes += [_compare_batch(part, is_timed=False) for part in _batches(rest)]
-    return outcomes, (thread_time_ns() - begun) / 1e9
+        outcomes += [_compare_batch(part, is_timed=False) for part in _batches(later_requests)]
+    return outcomes, (thread_time_ns() - start) / 1e9
 
 
 def _batches(requests: Sequence[MirroredRequest]) -> list[list[MirroredRequest]]:
@@ -241,9 +241,9 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
         candidate = requests[0].candidate.policy(requests[0].policy)
         observations = _concatenate([request.observations for request in requests])
         seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
-        begun = thread_time_ns()
+        start = thread_time_ns()
         actions = _act(candidate, candidate.shadow_policy, observations, seeds)
-        taken = thread_time_ns() - begun
+        cpu_ns = thread_time_ns() - start
         expected = _champion_actions(requests, requests[0].champion.policy(requests[0].policy), observations, seeds)
         outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
     except Exception as error:  # any failure is counted against the candidate
@@ -251,7 +251,7 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
         outcome.failed, outcome.fault = len(requests), one_line(error, with_type=True)
         return outcome
     outcome.requests, outcome.observations = len(requests), len(actions)
-    outcome.ns = taken if is_timed else None
+    outcome.ns = cpu_ns if is_timed else None
     return outcome
 
 
@@ -266,10 +266,10 @@ def _champion_actions(
     requests: Sequence[MirroredRequest], champion: LoadedPolicy, observations: Arrays, seeds: NDArray[np.int64]
 ) -> NDArray:
     """The champion's actions, recomputed if they were or are to be sampled."""
-    known = [request.actions for request in requests if request.actions is not None]
-    if champion.samples or len(known) < len(requests):
+    recorded_actions = [request.actions for request in requests if request.actions is not None]
+    if champion.samples or len(recorded_actions) < len(requests):
         return _act(champion, champion.policy, observations, seeds)
-    return np.concatenate(known)
+    return np.concatenate(recorded_actions)
 
 
 def _concatenate(batches: Sequence[Arrays]) -> Arrays:

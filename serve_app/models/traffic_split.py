@@ -103,7 +103,7 @@ def slots(setting: Setting) -> dict[Alias, int | None]:
 def pinned_slots(settings: Mapping[str, Setting]) -> dict[Alias, int]:
     """The slots of versions that settings name by number."""
     needed = (slots(setting) for setting in settings.values())
-    return {slot: number for each in needed for slot, number in each.items() if number is not None}
+    return {slot: number for setting_slots in needed for slot, number in setting_slots.items() if number is not None}
 
 
 def key_position(league: str, key: bytes) -> float:

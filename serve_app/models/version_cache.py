@@ -162,12 +162,12 @@ def _warm_up(
 def _measure(policy: Policy, reader: ObservationReader, rows: int) -> float:
     """Seconds of the fastest of a few runs: slower ones shared the processor."""
     observations = reader.zeros(rows)
-    taken = []
+    durations = []
     for _ in range(4):
         start = time.perf_counter()
         policy.act(observations)
-        taken.append(time.perf_counter() - start)
-    return float(np.min(taken))
+        durations.append(time.perf_counter() - start)
+    return float(np.min(durations))
 
 
 def _sizes(shape: tuple[int | None, ...]) -> tuple[int, ...]:
@@ -242,7 +242,9 @@ class VersionCache:
                 del self._loaded[key]
         mixtures = [(key, version.members) for key, version in self._loaded.items() if version.members]
         for key, members in mixtures:
-            if key not in self._pinned and any((each.league, each.number) not in self._loaded for each in members):
+            if key not in self._pinned and any(
+                (member.league, member.number) not in self._loaded for member in members
+            ):
                 del self._loaded[key]
         self._drops += 1
 
@@ -340,8 +342,8 @@ class VersionCache:
             del self._loaded[key]
 
     def _refuse_corrupt(self, key: VersionKey) -> None:
-        now = time.monotonic()
-        self._corrupt = {known: fault for known, fault in self._corrupt.items() if fault[0] > now}
+        current_time = time.monotonic()
+        self._corrupt = {corrupt_key: fault for corrupt_key, fault in self._corrupt.items() if fault[0] > current_time}
         if key in self._corrupt:
             error = self._corrupt[key][1]
             raise type(error)(*error.args)

@@ -37,8 +37,8 @@ class DiskSpace:
 
     def _measure(self, disk: str, path: Path) -> None:
         with suppress(OSError):
-            found = os.statvfs(path)
+            file_system = os.statvfs(path)
             # As `df` has it: the part that is reserved for root is neither free nor counted.
-            free = found.f_bavail * found.f_frsize
-            used = (found.f_blocks - found.f_bfree) * found.f_frsize
+            free = file_system.f_bavail * file_system.f_frsize
+            used = (file_system.f_blocks - file_system.f_bfree) * file_system.f_frsize
             self._sizes[disk] = free, used + free

@@ -64,16 +64,16 @@ class LoadSampler:
 
     def sample(self) -> LoadSample | None:
         """The load since the last call; None the first time."""
-        now = _Totals(time.monotonic(), time.process_time(), _runnable_seconds(), self._metrics.totals())
-        last, self._last = self._last, now
+        totals = _Totals(time.monotonic(), time.process_time(), _runnable_seconds(), self._metrics.totals())
+        last, self._last = self._last, totals
         if last is None:
             return None
-        seconds = max(now.at - last.at, 1e-3)
+        seconds = max(totals.at - last.at, 1e-3)
         # Counts of policies that were not used for long are dropped.
-        counts = {api: max(count - last.requests.get(api, (0, 0))[0], 0) for api, (count, _) in now.requests.items()}
-        ns = sum(max(spent - last.requests.get(api, (0, 0))[1], 0) for api, (_, spent) in now.requests.items())
+        counts = {api: max(count - last.requests.get(api, (0, 0))[0], 0) for api, (count, _) in totals.requests.items()}
+        ns = sum(max(spent - last.requests.get(api, (0, 0))[1], 0) for api, (_, spent) in totals.requests.items())
         return LoadSample(
-            (now.cpu - last.cpu) / seconds, (now.runnable - last.runnable) / seconds, ns / 1e9 / seconds, counts
+            (totals.cpu - last.cpu) / seconds, (totals.runnable - last.runnable) / seconds, ns / 1e9 / seconds, counts
         )
 
 

@@ -39,13 +39,13 @@ class RequestRates:
 
     def since_last(self, report: Report) -> Samples:
         """league → requests per second since the last call."""
-        counts, now = _counts(report), monotonic()
-        seconds = max(now - self._at, 1e-3)
+        counts, current_time = _counts(report), monotonic()
+        seconds = max(current_time - self._at, 1e-3)
         # Counts of policies that were not used for long are dropped.
         rates: Samples = [
             [[league], max(count - self._counts[league], 0) / seconds] for league, count in counts.items()
         ]
-        self._counts, self._at = counts, now
+        self._counts, self._at = counts, current_time
         return rates
 
 

@@ -130,8 +130,8 @@ def _family(name: str, definition: MetricDefinition, samples: Iterable[tuple[lis
 
 def _buckets(bounds: tuple[float, ...], counts: list[int]) -> list[tuple[str, float]]:
     """Upper bound → cumulative count."""
-    seen, buckets = 0, []
+    total, buckets = 0, []
     for bound, count in zip((*map(str, bounds), "+Inf"), counts, strict=True):
-        seen += count
-        buckets.append((bound, float(seen)))
+        total += count
+        buckets.append((bound, float(total)))
     return buckets

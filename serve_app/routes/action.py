@@ -82,7 +82,7 @@ class ActionRoute:
             self.in_flight -= 1
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        begun = perf_counter_ns()
+        start = perf_counter_ns()
         turn = self._access.backlog.turn
         body = await read_body(scope, receive, self._settings.max_body)
         model, requested = scope["path_params"]["model"], parsing.query_params(scope).get("version", CHAMPION)
@@ -99,7 +99,7 @@ class ActionRoute:
         if LOG_ENTRY in scope:
             log_version(scope, model, version.number)
         await _send(send, orjson.dumps(response), self._replica)
-        self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - begun)
+        self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - start)
 
     async def _parse_large(self, body: bytes, model: str, requested: str) -> dict[str, Any]:
         """Parse a body in a thread, unless it is too large for the policy."""

@@ -118,7 +118,7 @@ def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[
             "archived_at": (at := archived[league]) and at.isoformat(),
         } | _requests(counts.get(league, NO_REQUESTS))
 
-    return {"leagues": [document(league, found) for league, found in aliases.items()], "next": more}
+    return {"leagues": [document(league, league_aliases) for league, league_aliases in aliases.items()], "next": more}
 
 
 def _league(registry: Registry, league: str) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def _league(registry: Registry, league: str) -> dict[str, Any]:
         "sides": interface.sides,
         "baselines": baselines(row.config, interface),
         "replicas": list(map(_replica, acknowledgements)),
-        "faults": sorted({each.fault for each in acknowledgements if each.fault}),
+        "faults": sorted({acknowledgement.fault for acknowledgement in acknowledgements if acknowledgement.fault}),
         "traffic": documents.traffic_document(registry.traffic.current(league)),
         "summary": summary and summary.document,
         "computed_at": summary and summary.at.isoformat(),

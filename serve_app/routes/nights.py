@@ -35,7 +35,7 @@ class NightRoutes:
             rows = [row for row in reversed(registry.training_nights.all(league)) if before is None or row.id < before]
             page, more = parsing.paginate(rows[: limit + 1], limit, lambda row: row.id)
             snapshot = registry.snapshots.get(league, RATINGS)
-            ratings = {} if snapshot is None else {each["ref"]: each for each in snapshot.document["versions"]}
+            ratings = {} if snapshot is None else {rating["ref"]: rating for rating in snapshot.document["versions"]}
             return {"league": league, "nights": [_night(row, ratings) for row in page], "next": more}
 
         return await parsing.query_response(self._models, query)
@@ -56,12 +56,12 @@ class NightRoutes:
 def _nightly_run(row: NightlyRunRow) -> dict[str, Any]:
     """A nightly run as JSON. What it decided is null or empty while it runs."""
     report = row.report or {}
-    shown = ("verdict", "candidate", "opponent", "outcome", "promoted")
+    fields = ("verdict", "candidate", "opponent", "outcome", "promoted")
     return {
         "nightly_run": row.id,
         "candidates": [f"{row.league}@{number}" for number in row.candidates],
         "alpha": row.alpha,
-        "verdicts": [{name: verdict[name] for name in shown} for verdict in report.get("verdicts", ())],
+        "verdicts": [{name: verdict[name] for name in fields} for verdict in report.get("verdicts", ())],
         "champion_before": report.get("champion_before"),
         "champion": report.get("champion"),
         "errors": report.get("faults", []),

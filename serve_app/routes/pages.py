@@ -150,10 +150,10 @@ class PageRoutes:
 
     async def file(self, request: Request) -> Response:
         """A static file."""
-        found = self._files.get(request.path_params["file"])
-        if found is None:
+        static_file = self._files.get(request.path_params["file"])
+        if static_file is None:
             raise HTTPException(404)
-        return found.response(request)
+        return static_file.response(request)
 
 
 def _document(depth: int) -> bytes:

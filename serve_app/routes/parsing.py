@@ -69,9 +69,9 @@ def query_time(request: Request, key: str) -> datetime | None:
     if text is None:
         return None
     try:
-        found = datetime.fromisoformat(text)
-        if found.tzinfo is not None:
-            return found.astimezone(UTC)
+        moment = datetime.fromisoformat(text)
+        if moment.tzinfo is not None:
+            return moment.astimezone(UTC)
     except (ValueError, OverflowError):
         pass
     raise InvalidInput(f"{key} must be a time with a time zone, such as 2026-03-03T14:00:00Z, got {text[:40]!r}")

@@ -145,9 +145,9 @@ def _part(registry: Registry, league: str, game: str | None, part: str) -> str:
     if game is None:
         return part
     summary, _ = _snapshot(registry, league, SUMMARY)
-    known = [each["name"] for each in (summary or {}).get("earlier", ())]
-    if game not in known:
-        expected = f"game must be one of {', '.join(known)}" if known else f"{league} has no results of an earlier game"
+    games = [earlier_game["name"] for earlier_game in (summary or {}).get("earlier", ())]
+    if game not in games:
+        expected = f"game must be one of {', '.join(games)}" if games else f"{league} has no results of an earlier game"
         raise InvalidInput(f"{expected}, got {game!r}")
     return earlier_part(game, part)
 
@@ -159,8 +159,10 @@ def _leaderboard(
     document = document or {"leaderboard": [], "by_side": {}}
     sides = list(document["by_side"])
     if side is not None and side not in sides:
-        known = f"side must be one of {', '.join(sides)}" if sides else f"no side of {league} has its own leaderboard"
-        raise InvalidInput(f"{known}, got {side!r}")
+        expected = (
+            f"side must be one of {', '.join(sides)}" if sides else f"no side of {league} has its own leaderboard"
+        )
+        raise InvalidInput(f"{expected}, got {side!r}")
     every = document["leaderboard"] if side is None else document["by_side"][side]
     page = [{"rank": offset + place} | standing for place, standing in enumerate(every[offset : offset + limit], 1)]
     return {
@@ -176,5 +178,5 @@ def _leaderboard(
 
 def _snapshot(registry: Registry, league: str, part: str) -> tuple[Any, str | None]:
     """A snapshot and its time; None before it was computed. Raises UnknownLeague."""
-    found = registry.snapshots.get(league, part)
-    return (None, None) if found is None else (found.document, found.at.isoformat())
+    snapshot = registry.snapshots.get(league, part)
+    return (None, None) if snapshot is None else (snapshot.document, snapshot.at.isoformat())

@@ -41,13 +41,13 @@ class StatusRoutes:
         Needs no key. Raises Unauthenticated for an invalid one.
         """
         key = self._access.presented_key(request.scope["headers"])
-        shown = key and {
+        key_document = key and {
             "name": key.name,
             "scopes": sorted(key.scopes),
             "leagues": None if key.leagues is None else sorted(key.leagues),
         }
         headers = {"cache-control": "no-store"}
-        return JSONResponse({"key": shown, "is_needed": self._access.requires_key}, headers=headers)
+        return JSONResponse({"key": key_document, "is_needed": self._access.requires_key}, headers=headers)
 
     async def metrics(self, _: Request) -> Response:
         """The metrics of all replicas in the Prometheus text format. Raises StorageError.

@@ -54,10 +54,10 @@ class TrafficRoutes:
     async def show(self, request: Request) -> JSONResponse:
         """The setting, the replicas that apply it, and statistics of this replica and of all. Raises UnknownLeague."""
         league = check_slug("league", request.path_params["league"])
-        here = [one for one in self._shadow.shadowings() if one.league == league]
-        mine = {"replica": self._replica} | _statistics(league, [self._metrics.report()], here)
+        shadowings = [one for one in self._shadow.shadowings() if one.league == league]
+        replica_statistics = {"replica": self._replica} | _statistics(league, [self._metrics.report()], shadowings)
         document = await self._models.query(lambda registry: _document(registry, league))
-        return JSONResponse(document | {"here": mine})
+        return JSONResponse(document | {"here": replica_statistics})
 
     async def put(self, request: Request) -> JSONResponse:
         """Set canary or shadow. Raises UnknownLeague, UnknownVersion, UnknownAlias, KeyReused or InvalidInput."""
@@ -134,5 +134,5 @@ def _statistics(league: str, reports: list[Report], shadowings: list[ShadowCount
 
 
 def _quantiles(histogram: Histogram) -> dict[str, float | None]:
-    found = {name: histogram.quantile(share) for name, share in (("p50", 0.5), ("p95", 0.95), ("p99", 0.99))}
-    return {name: None if value == float("inf") else value for name, value in found.items()}
+    quantiles = {name: histogram.quantile(share) for name, share in (("p50", 0.5), ("p95", 0.95), ("p99", 0.99))}
+    return {name: None if value == float("inf") else value for name, value in quantiles.items()}

@@ -57,14 +57,14 @@ def _listed(row: VerdictRow) -> dict[str, Any]:
 
 def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
     row = registry.verdicts.find(verdict, league)
-    found = registry.snapshots.get(league, f"verdict/{row.id}")
+    snapshot = registry.snapshots.get(league, f"verdict/{row.id}")
     conditions = Ledger(registry).schedule(row.schedule).conditions
     is_current = conditions == registry.leagues.get(league).conditions
     document = {"league": league, "reason": None, "computed_at": None} | _listed(row)
     document["earlier_game"] = None if is_current else conditions.name
-    if found is not None:
-        judgement = found.document
-        document |= {"computed_at": found.at.isoformat()} | judgement | documents.verdict_summary(row)
+    if snapshot is not None:
+        judgement = snapshot.document
+        document |= {"computed_at": snapshot.at.isoformat()} | judgement | documents.verdict_summary(row)
         document["reason"] = _reason(row, judgement["outcome"], judgement["reason"])
     return document
 

@@ -36,11 +36,11 @@ def required_replicas(loads: Collection[float | None], target: float, current: i
     A replica whose load is unknown needs no others, but none is removed meanwhile.
     """
     total = sum(load for load in loads if load is not None)
-    wanted = ceil(total / target)
-    if wanted <= current:
+    replica_count = ceil(total / target)
+    if replica_count <= current:
         is_complete = None not in loads
-        wanted = min(current, ceil(total / (target * (1 - MARGIN)))) if is_complete else current
-    return min(max(wanted, minimum, 1), maximum)
+        replica_count = min(current, ceil(total / (target * (1 - MARGIN)))) if is_complete else current
+    return min(max(replica_count, minimum, 1), maximum)
 
 
 class LoadPolicy:
@@ -58,7 +58,11 @@ class LoadPolicy:
         """Return the number of replicas, and when the statistics of each replica changed."""
         reported = (context.raw_metrics or {}).get(LOAD, {})
         changes: Mapping[str, tuple[float, float]] = context.policy_state.get("changes", {})
-        now, loads, seen = context.current_time or 0.0, list[float | None](), dict[str, tuple[float, float]]()
+        current_time, loads, new_changes = (
+            context.current_time or 0.0,
+            list[float | None](),
+            dict[str, tuple[float, float]](),
+        )
         for replica in context.running_replicas:
             samples, name = reported.get(replica), replica.unique_id
             if not samples:
@@ -66,15 +70,15 @@ class LoadPolicy:
                 continue
             # The clock of the replica's node may differ from this one: only changes of its time stamps are compared.
             newest = samples[-1].timestamp
-            last, changed_at = changes.get(name, (None, now))
-            seen[name] = (newest, changed_at if last == newest else now)
-            is_stale = now - seen[name][1] > STALE
+            last, changed_at = changes.get(name, (None, current_time))
+            new_changes[name] = (newest, changed_at if last == newest else current_time)
+            is_stale = current_time - new_changes[name][1] > STALE
             loads.append(None if is_stale else fmean(sample.value for sample in samples))
-        wanted = required_replicas(
+        replica_count = required_replicas(
             loads,
             self._target,
             context.target_num_replicas,
             context.capacity_adjusted_min_replicas,
             context.capacity_adjusted_max_replicas,
         )
-        return wanted, {"changes": seen}
+        return replica_count, {"changes": new_changes}

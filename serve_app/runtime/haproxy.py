@@ -51,8 +51,8 @@ IDLE_CLIENT_TIMEOUT = 60
 def environment(directory: Path) -> dict[str, str]:
     """Ray's variables for a server whose HAProxy has its files in `directory`. deploy.yaml explains the first ones."""
     grpc = _claim_grpc_ports(directory)
-    own = range(grpc.start + DISTANCE, grpc.stop + DISTANCE)
-    stats, metrics, fallback_http, fallback_grpc = free_ports(4, ports=own)
+    proxy_ports = range(grpc.start + DISTANCE, grpc.stop + DISTANCE)
+    stats, metrics, fallback_http, fallback_grpc = free_ports(4, ports=proxy_ports)
     return _install_script(directory, stats, metrics) | {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
@@ -119,20 +119,20 @@ def private_directory() -> Iterator[Path]:
 
 def _install_script(directory: Path, stats: int, metrics: int) -> dict[str, str]:
     """Write the wrapper script; returns the variable that names it, or nothing if there is no HAProxy."""
-    found = haproxy_script.find_haproxy()
-    if found is None:
+    binary = haproxy_script.find_haproxy()
+    if binary is None:
         return {}
-    return {haproxy_script.BINARY_PATH: str(haproxy_script.install(directory, found, stats, metrics))}
+    return {haproxy_script.BINARY_PATH: str(haproxy_script.install(directory, binary, stats, metrics))}
 
 
 def free_ports(count: int, host: str = "", ports: range = PORTS) -> list[int]:
     """Unused ports of `host` (default: all interfaces)."""
-    found = []
+    unused_ports = []
     for port in random.sample(ports, len(ports)):
         if is_free(host, port):
-            found.append(port)
-        if len(found) == count:
-            return found
+            unused_ports.append(port)
+        if len(unused_ports) == count:
+            return unused_ports
     raise NotReady(f"found fewer than {count} free ports from {ports.start} to {ports.stop - 1}")
 
 
@@ -143,19 +143,19 @@ def _own_directories() -> list[Path]:
 
 def _is_own_directory(path: Path) -> bool:
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:  # removed in the meantime
         return False
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()
 
 
 def _claim_grpc_ports(directory: Path) -> range:
     """Claim a block of unused ports for the gRPC servers of replicas."""
-    claims = (each / GRPC_PORT_FILE for each in _own_directories())
-    taken = {int(claim.read_text()) for claim in claims if claim.exists()}
+    claims = (own_directory / GRPC_PORT_FILE for own_directory in _own_directories())
+    claimed_starts = {int(claim.read_text()) for claim in claims if claim.exists()}
     for start in random.sample(GRPC_PORTS, len(GRPC_PORTS)):
         block = range(start, start + GRPC_PORTS.step)
-        if start not in taken and all(is_free("", port) for port in block):
+        if start not in claimed_starts and all(is_free("", port) for port in block):
             (directory / GRPC_PORT_FILE).write_text(str(start))
             return block
     raise NotReady(f"found no block of {GRPC_PORTS.step} free ports from {GRPC_PORTS.start}")
@@ -187,15 +187,15 @@ def stop(directory: Path) -> None:
 
 def processes(directory: Path) -> list[int]:
     """The HAProxy processes whose configuration is in a directory."""
-    found = []
+    process_ids = []
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
         with suppress(OSError):
             arguments = (entry / "cmdline").read_bytes().split(b"\0")
             if b"haproxy" in arguments[0] and any(a.startswith(os.fsencode(directory)) for a in arguments):
-                found.append(int(entry.name))
-    return found
+                process_ids.append(int(entry.name))
+    return process_ids
 
 
 def _remove(directory: Path) -> None:

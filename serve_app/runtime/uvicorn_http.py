@@ -165,9 +165,9 @@ class HttpProtocol(HttpToolsProtocol):
         if queue is None:
             queue = _queues[self.server_state] = AcceptQueue(self.server[1])
         while (connection := queue.take()) is not None:
-            begun = self.loop.create_task(self.loop.connect_accepted_socket(self._another, connection))
-            self.server_state.tasks.add(begun)  # type: ignore[arg-type]
-            begun.add_done_callback(self.server_state.tasks.discard)
+            task = self.loop.create_task(self.loop.connect_accepted_socket(self._another, connection))
+            self.server_state.tasks.add(task)  # type: ignore[arg-type]
+            task.add_done_callback(self.server_state.tasks.discard)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Count the connection no longer, and forget it.

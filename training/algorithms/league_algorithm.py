@@ -30,9 +30,12 @@ class LeagueAlgorithm(NoResultsDirectory, Algorithm):
 
     def setup(self, config: AlgorithmConfig) -> None:
         super().setup(config)
-        given = self.config.env_config
-        league, interface = LeagueConfig.model_validate(given[LEAGUE]), Interface.model_validate(given[INTERFACE])
-        self.opponents = LeagueOpponents(league, interface, given[STORAGE])
+        env_config = self.config.env_config
+        league, interface = (
+            LeagueConfig.model_validate(env_config[LEAGUE]),
+            Interface.model_validate(env_config[INTERFACE]),
+        )
+        self.opponents = LeagueOpponents(league, interface, env_config[STORAGE])
 
     def reset_episodes(self, steps: int) -> None:
         """Drop all open episodes, and derive all further randomness from the seed and `steps`.

@@ -136,9 +136,9 @@ class LeagueOpponents:
         self._payoff = payoff_matrix(self.candidates, results, self._rows)
         if parent is not None:
             of_parent = f"{self._league.league}@{parent}"
-            known = tuple(dict.fromkeys((of_parent, *self.candidates)))
-            found = payoff_matrix(known, results, {of_parent: self._inherited} | self._rows)
-            self._priors = dict(zip(known, found[0].tolist(), strict=True))
+            refs = tuple(dict.fromkeys((of_parent, *self.candidates)))
+            payoffs = payoff_matrix(refs, results, {of_parent: self._inherited} | self._rows)
+            self._priors = dict(zip(refs, payoffs[0].tolist(), strict=True))
 
     def drop_removed(self) -> None:
         """Drop candidates whose files were removed since the checkpoint. Others stay, whatever was published since."""
@@ -184,17 +184,17 @@ class LeagueOpponents:
         numbers = registry.versions.numbers(league).get(league, [])
         mixtures, exploiters = registry.versions.mixtures(league, numbers), registry.versions.exploiter_refs(league)
         numbers = [number for number in numbers if number not in mixtures]
-        chosen = {number for number in numbers if f"{league}@{number}" not in exploiters}
-        chosen = set(sorted(chosen)[-self._settings.window :])
+        candidates = {number for number in numbers if f"{league}@{number}" not in exploiters}
+        candidates = set(sorted(candidates)[-self._settings.window :])
         champions = {event.version for event in registry.aliases.history(league)}
         if self._settings.champions:
             for champion in champions:
-                chosen |= {champion} if champion not in mixtures else set(mixtures[champion].versions)
+                candidates |= {champion} if champion not in mixtures else set(mixtures[champion].versions)
         if self._settings.exploiters:
             of_champions = registry.versions.exploiters(league, [f"{league}@{champion}" for champion in champions])
             newest = {exploiter.exploits: exploiter.number for exploiter in of_champions}
-            chosen |= set(newest.values())
-        rows = [registry.versions.get(league, number) for number in numbers if number in chosen]
+            candidates |= set(newest.values())
+        rows = [registry.versions.get(league, number) for number in numbers if number in candidates]
         rows.sort(key=lambda row: (row.exploits is None, row.number))
         fixed = {opponent.ref for opponent in self._league.training.opponents.fixed}
         digest = self._interface.digest()

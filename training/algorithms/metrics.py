@@ -81,28 +81,28 @@ def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[st
     """Return the metrics of one update, without those that did not occur in it, such as the return of ended
     episodes."""
     play = result[ENV_RUNNER_RESULTS]
-    found: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         RETURN: play.get(EPISODE_RETURN_MEAN),
         "length": play.get(EPISODE_LEN_MEAN),
         EXPLORATION: result.get(EXPLORATION),
     }
     for policy in interface.policy_ids:
-        found[f"{policy}/return"] = play.get(EPISODE_MODULE_RETURN_MEAN, {}).get(policy)
-        found[f"{policy}/length"] = play.get(EPISODE_MODULE_LEN_MEAN, {}).get(policy)
-        found[f"{policy}/entropy"] = play.get(policy, {}).get(ENTROPY)
+        metrics[f"{policy}/return"] = play.get(EPISODE_MODULE_RETURN_MEAN, {}).get(policy)
+        metrics[f"{policy}/length"] = play.get(EPISODE_MODULE_LEN_MEAN, {}).get(policy)
+        metrics[f"{policy}/entropy"] = play.get(policy, {}).get(ENTROPY)
     for agent in interface.agents:
-        found[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
-        found[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
+        metrics[f"agents/{agent}/return"] = play.get(EPISODE_AGENT_RETURN_MEAN, {}).get(agent)
+        metrics[f"agents/{agent}/length"] = play.get(EPISODE_AGENT_LEN_MEAN, {}).get(agent)
     for ref, values in result.get(OPPONENTS, {}).items():
-        found |= {f"{OPPONENTS}/{ref}/{name}": values.get(name) for name in (SCORE, SHARE)}
+        metrics |= {f"{OPPONENTS}/{ref}/{name}": values.get(name) for name in (SCORE, SHARE)}
     # RLlib reports NaN for what was logged earlier but not in this update.
-    found = {name: value for name, value in found.items() if value is not None and not math.isnan(value)}
+    metrics = {name: value for name, value in metrics.items() if value is not None and not math.isnan(value)}
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
-        found |= {f"{key}/{name}": learned.get(metric) for name, metric in PPO_METRICS.items()}
-        found |= {f"{key}/{name}": learned.get(name) for name in (*SCHEDULES.values(), *REFERENCE_METRICS)}
-        found |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
-    return {name: float(value) for name, value in found.items() if value is not None}
+        metrics |= {f"{key}/{name}": learned.get(metric) for name, metric in PPO_METRICS.items()}
+        metrics |= {f"{key}/{name}": learned.get(name) for name in (*SCHEDULES.values(), *REFERENCE_METRICS)}
+        metrics |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
+    return {name: float(value) for name, value in metrics.items() if value is not None}
 
 
 def totals(result: Mapping[str, Any]) -> dict[str, float]:

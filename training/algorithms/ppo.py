@@ -64,7 +64,7 @@ class PPO(LeagueAlgorithm, ppo.PPO):
                 self.env_runner_group.sync_weights(
                     from_worker_or_learner_group=self.learner_group, policies=changed, inference_only=True
                 )
-        self.exchange_opponents(results, sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results))
+        self.exchange_opponents(results, sum(int(result[NUM_ENV_STEPS_SAMPLED]) for result in results))
 
     def sample_train_batch(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
         """Sample a train batch from all runners; return the chunks and the runners' metrics.
@@ -76,9 +76,9 @@ class PPO(LeagueAlgorithm, ppo.PPO):
         # With remote runners, the local one only holds weights.
         is_local = self.env_runner_group.num_remote_env_runners() == 0
         sample = partial(_sample_chunks, opponents=self.opponents.active)
-        while sum(int(each[NUM_ENV_STEPS_SAMPLED]) for each in results) < self.config.total_train_batch_size:
-            for own, metrics in self.env_runner_group.foreach_env_runner(sample, local_env_runner=is_local):
-                chunks += own
+        while sum(int(result[NUM_ENV_STEPS_SAMPLED]) for result in results) < self.config.total_train_batch_size:
+            for runner_chunks, metrics in self.env_runner_group.foreach_env_runner(sample, local_env_runner=is_local):
+                chunks += runner_chunks
                 results.append(metrics)
         return chunks, results
 
@@ -153,8 +153,8 @@ def _check_shared(interface: Interface) -> None:
         }
         for policy in interface.policy_ids
     }
-    first, *others = observed
-    for other in others:
+    first, *other_policies = observed
+    for other in other_policies:
         if observed[other] != observed[first]:
             raise ConfigError(
                 f"training.shared_encoder: policies {first} and {other} have different observation spaces: remove it,"

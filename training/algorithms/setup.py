@@ -50,8 +50,10 @@ def check_policies_to_train(settings: TrainingSettings, policies: tuple[str, ...
         named: Sequence[str] = part.policies if isinstance(part, PhaseConfig) else (part,)
         for policy in named:
             if policy not in policies:
-                known = ", ".join(policies)
-                raise ConfigError(f"training.policies_to_train: unknown policy {policy!r}; the league has {known}")
+                policy_names = ", ".join(policies)
+                raise ConfigError(
+                    f"training.policies_to_train: unknown policy {policy!r}; the league has {policy_names}"
+                )
         if shared_encoder and isinstance(part, PhaseConfig) and set(named) != set(policies):
             raise _shared_encoder_error()
     if shared_encoder and not isinstance(planned[0], PhaseConfig) and set(planned) != set(policies):
@@ -146,17 +148,17 @@ def rl_module_specs(
     interface: Interface, module: type[PolicyModule], model_config: dict[str, Any]
 ) -> dict[str, RLModuleSpec]:
     """Return policy id → module specification. Raises ConfigError for unsupported action spaces."""
-    found = {}
+    specs = {}
     for policy in interface.policy_ids:
         try:
             dist_inputs_size(interface.of_policy(policy).action)
         except ConfigError as error:
             raise ConfigError(f"policies.{policy}: {error}") from error
         observation, action = module_spaces(interface, policy)
-        found[policy] = RLModuleSpec(
+        specs[policy] = RLModuleSpec(
             module_class=module, observation_space=observation, action_space=action, model_config=model_config
         )
-    return found
+    return specs
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:

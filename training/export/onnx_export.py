@@ -91,18 +91,20 @@ class ContinuousActions(nn.Module):
 
 def export_policy(module: PolicyModule, spaces: AgentInterface, path: Path) -> None:
     """Write the graph of `module` to `path`, with the tensors of `graph_tensors` and a dynamic batch size."""
-    taken, answered, _ = graph_tensors(module, spaces)
+    input_tensors, output_tensors, _ = graph_tensors(module, spaces)
     # Two rows: torch.export treats a batch of one as constant.
-    examples = tuple(torch.zeros([size or 2 for size in tensor.shape], dtype=_dtype(tensor.dtype)) for tensor in taken)
+    examples = tuple(
+        torch.zeros([size or 2 for size in tensor.shape], dtype=_dtype(tensor.dtype)) for tensor in input_tensors
+    )
     graph = PolicyGraph(module, tuple(inputs(spaces.observation)), spaces.action).eval()
     with quiet():
         program = torch.onnx.export(
             graph,
             examples,
             dynamo=True,
-            input_names=[tensor.name for tensor in taken],
-            output_names=[tensor.name for tensor in answered],
-            dynamic_shapes=(tuple({0: torch.export.Dim(BATCH)} for _ in taken),),
+            input_names=[tensor.name for tensor in input_tensors],
+            output_names=[tensor.name for tensor in output_tensors],
+            dynamic_shapes=(tuple({0: torch.export.Dim(BATCH)} for _ in input_tensors),),
             verbose=False,
         )
     assert program is not None, "the exporter returns a program unless it is told to write one"

@@ -132,8 +132,16 @@ def check_parity(path: Path, policy: str, module: PolicyModule, batches: list[Ob
         largest = max(largest, float(np.abs(exported.dist_inputs - expected).max()))
         pairs = [(exported.dist_inputs, expected)]
         after = exported.state or {}
-        pairs += [(after[name], known) for name, known in _state_in(state).items() if name != LAST_ACTION]
-        worst = max(worst, *(float((np.abs(found - known) / (1 + np.abs(known))).max()) for found, known in pairs))
+        pairs += [
+            (after[name], module_output) for name, module_output in _state_in(state).items() if name != LAST_ACTION
+        ]
+        worst = max(
+            worst,
+            *(
+                float((np.abs(graph_output - module_output) / (1 + np.abs(module_output))).max())
+                for graph_output, module_output in pairs
+            ),
+        )
     count = sum(map(len, batches))
     if mismatches or not worst <= TOLERANCE:
         raise ParityError(
@@ -147,13 +155,13 @@ def probes(path: Path, batches: list[ObservedBatch]) -> Probes:
     """Return evenly spaced observations with the actions of the graph at `path`."""
     starts = np.cumsum([0, *map(len, batches)])
     size = sum(array[0].nbytes for array in batches[0].observations.values())
-    wanted = min(PROBES, max(1, MAX_PROBE_BYTES // size), int(starts[-1]))
-    rows = np.linspace(0, starts[-1] - 1, wanted).astype(int)
-    found = [(batches[i], row - starts[i]) for row in rows for i in [int(np.searchsorted(starts, row, "right")) - 1]]
+    count = min(PROBES, max(1, MAX_PROBE_BYTES // size), int(starts[-1]))
+    rows = np.linspace(0, starts[-1] - 1, count).astype(int)
+    samples = [(batches[i], row - starts[i]) for row in rows for i in [int(np.searchsorted(starts, row, "right")) - 1]]
     observations = {
-        name: np.stack([met.observations[name][row] for met, row in found]) for name in batches[0].observations
+        name: np.stack([met.observations[name][row] for met, row in samples]) for name in batches[0].observations
     }
-    state = _state_in({key: np.stack([met.state[key][row] for met, row in found]) for key in batches[0].state})
+    state = _state_in({key: np.stack([met.state[key][row] for met, row in samples]) for key in batches[0].state})
     return Probes(observations, state, OnnxPolicy(path).act(observations, state=state or None).actions)
 
 

@@ -35,11 +35,11 @@ def adapt(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
     action = spaces.action
     assert not isinstance(action, DictSpace), "check refuses it"
     builder = _Builder(_upgraded(model, source))
-    given = graph_inputs(model)
+    model_inputs = graph_inputs(model)
     leaves = inputs(spaces.observation)
-    for name, own in mapping.inputs.items():
-        dtype, shape = given[name]
-        builder.feed(own, leaves[own.name], PREFIX + name, dtype, shape)
+    for name, input_mapping in mapping.inputs.items():
+        dtype, shape = model_inputs[name]
+        builder.feed(input_mapping, leaves[input_mapping.name], PREFIX + name, dtype, shape)
     for number, (name, after) in enumerate(mapping.state.items()):
         builder.node("Identity", [f"{STATE_IN}{number}"], PREFIX + name)
         builder.node("Identity", [PREFIX + after], f"{STATE_OUT}{number}")
@@ -50,24 +50,24 @@ def adapt(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
         builder.chosen(PREFIX + mapping.output, action)
     else:
         builder.logits(PREFIX + mapping.output, action, masked)
-    taken, answered, _ = graph_tensors(model, mapping, spaces)
-    return builder.serialized(taken, answered)
+    input_tensors, output_tensors, _ = graph_tensors(model, mapping, spaces)
+    return builder.serialized(input_tensors, output_tensors)
 
 
 def graph_tensors(
     model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface
 ) -> tuple[Tensors, Tensors, Tensors]:
     """Return inputs, outputs and recurrent inputs of the adapted graph for its manifest."""
-    given, action = graph_inputs(model), spaces.action
+    model_inputs, action = graph_inputs(model), spaces.action
     assert not isinstance(action, DictSpace), "check refuses it"
     observed = tuple(
         Tensor(name=name, dtype=leaf.dtype, shape=(None, *leaf.shape))
         for name, leaf in inputs(spaces.observation).items()
-        if name == ACTION_MASK or name in {own.name for own in mapping.inputs.values()}
+        if name == ACTION_MASK or name in {input_mapping.name for input_mapping in mapping.inputs.values()}
     )
     before, after = (
         tuple(
-            Tensor(name=f"{prefix}{number}", dtype=given[name][0], shape=(None, *given[name][1][1:]))
+            Tensor(name=f"{prefix}{number}", dtype=model_inputs[name][0], shape=(None, *model_inputs[name][1][1:]))
             for number, name in enumerate(mapping.state)
         )
         for prefix in (STATE_IN, STATE_OUT)
@@ -81,30 +81,30 @@ def graph_tensors(
 
 def check(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface, source: str) -> None:
     """Raise EnvironmentMismatch unless `mapping` names tensors of the graph, with fitting kinds and sizes."""
-    given, results, leaves = graph_inputs(model), tensors(list(model.graph.output)), inputs(spaces.observation)
+    model_inputs, results, leaves = graph_inputs(model), tensors(list(model.graph.output)), inputs(spaces.observation)
 
     def refuse(problem: str) -> None:
         raise EnvironmentMismatch(f"{source}: {problem}")
 
-    if missing := sorted(given.keys() - mapping.inputs.keys() - mapping.state.keys()):
+    if missing := sorted(model_inputs.keys() - mapping.inputs.keys() - mapping.state.keys()):
         refuse(f"input {missing[0]} of the graph is not in the mapping")
-    for name, (_, shape) in given.items():
+    for name, (_, shape) in model_inputs.items():
         if shape[:1] not in ((), (None,)):
             refuse(
                 f"input {name} has a fixed batch size of {shape[0]}: export it with a dynamic one, in PyTorch with"
                 f" dynamic_shapes={{'{name}': {{0: torch.export.Dim('batch')}}}}"
             )
-    for name, own in mapping.inputs.items():
-        if name not in given:
-            refuse(f"inputs.{name}: the graph has the inputs {', '.join(given)}")
-        if own.name not in leaves:
-            refuse(f"inputs.{name}: the league has no {own.name}, expected one of {', '.join(leaves)}")
-        _check_shape(given[name][1][1:], name, own, leaves[own.name].shape, refuse)
+    for name, input_mapping in mapping.inputs.items():
+        if name not in model_inputs:
+            refuse(f"inputs.{name}: the graph has the inputs {', '.join(model_inputs)}")
+        if input_mapping.name not in leaves:
+            refuse(f"inputs.{name}: the league has no {input_mapping.name}, expected one of {', '.join(leaves)}")
+        _check_shape(model_inputs[name][1][1:], name, input_mapping, leaves[input_mapping.name].shape, refuse)
     for name in (mapping.output, *mapping.state.values()):
         if name not in results:
             refuse(f"output {name}: the graph has the outputs {', '.join(results)}")
     for name in mapping.state:
-        if name not in given or None in given[name][1][1:]:
+        if name not in model_inputs or None in model_inputs[name][1][1:]:
             refuse(f"state.{name}: expected an input of the graph with known sizes")
     _check_output(results[mapping.output][1][1:], mapping, spaces, refuse)
 
@@ -169,11 +169,11 @@ class _Builder:
             parts = [
                 self._best(self._slice(value, first, size), keep=1) for first, size in zip(starts, sizes, strict=True)
             ]
-            chosen = self._reshaped(self._new("Concat", parts, axis=1), action.shape)
+            raw_action = self._reshaped(self._new("Concat", parts, axis=1), action.shape)
         else:
-            chosen = self._best(value, keep=0)
+            raw_action = self._best(value, keep=0)
         assert isinstance(action, Discrete | MultiDiscrete)
-        moved = self._new("Add", [chosen, self._constant(np.asarray(action.start, np.int64))])
+        moved = self._new("Add", [raw_action, self._constant(np.asarray(action.start, np.int64))])
         self.node("Identity", [self._cast(moved, "int64", action.dtype)], ACTION)
 
     def chosen(self, output: str, action: Leaf) -> None:
@@ -187,8 +187,8 @@ class _Builder:
         levels = self._constant(np.array([0.0, CERTAIN], np.float32))
         parts = []
         for element, size in enumerate(sizes):
-            own = self._reshaped(self._slice(columns, element, 1), ())
-            parts.append(self._new("OneHot", [own, self._constant(np.int64(size)), levels], axis=1))
+            column = self._reshaped(self._slice(columns, element, 1), ())
+            parts.append(self._new("OneHot", [column, self._constant(np.int64(size)), levels], axis=1))
         self.node("Concat", parts, DIST_INPUTS, axis=1)
 
     def box(self, output: str, mapping: GraphMapping, action: Box) -> None:
@@ -285,7 +285,7 @@ def _infos(described: Tensors) -> list[ValueInfoProto]:
 
 def _upgraded(model: onnx.ModelProto, source: str) -> onnx.ModelProto:
     """The model with at least OPSET, in which the added nodes are defined."""
-    current = next((each.version for each in model.opset_import if each.domain in ("", "ai.onnx")), OPSET)
+    current = next((opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")), OPSET)
     if current >= OPSET:
         return model
     try:
@@ -299,9 +299,11 @@ def _upgraded(model: onnx.ModelProto, source: str) -> onnx.ModelProto:
 def decoded(value: NDArray, mask: NDArray | None, mapping: GraphMapping, action: Leaf) -> NDArray:
     """Return the greedy actions (k, …) for the output of the source, computed in NumPy."""
     if mapping.kind == "action":
-        given = value.reshape(-1, *action.shape)
+        actions = value.reshape(-1, *action.shape)
         return (
-            np.clip(given, *bounds(action)).astype(action.dtype) if isinstance(action, Box) else given.astype(np.int64)
+            np.clip(actions, *bounds(action)).astype(action.dtype)
+            if isinstance(action, Box)
+            else actions.astype(np.int64)
         )
     if isinstance(action, Box):
         means = value[:, : value.shape[1] // 2].reshape(-1, *action.shape)

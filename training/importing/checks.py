@@ -59,14 +59,14 @@ def collect(
     batched, resets, names = stock_stepping(environment, NUM_ENVS), itertools.count(), interface.policy_ids
     groups = 2 * np.array([names.index(interface.policies[agent]) for agent in batched.agents])
     spaces = {name: interface.of_policy(name) for name in names}
-    scripts = {name: Random(own.observation, own.action) for name, own in spaces.items()}
+    scripts = {name: Random(policy_spaces.observation, policy_spaces.action) for name, policy_spaces in spaces.items()}
     recurrent = {
         name: RecurrentStates(
             {key: rows[0] for key, rows in policy.initial_state(1).items()}, NUM_ENVS, len(batched.agents)
         )
         for name, policy in policies.items()
     }
-    rng, found, began = generator(seed, "import"), defaultdict[str, list[PlayedBatch]](list), time.monotonic()
+    rng, batches, began = generator(seed, "import"), defaultdict[str, list[PlayedBatch]](list), time.monotonic()
 
     def next_episodes(envs: Indices) -> Starts:
         seeds = [derive(seed, "import", next(resets)) % SEEDS for _ in envs]
@@ -74,14 +74,14 @@ def collect(
 
     try:
         turn = batched.start(next_episodes)
-        while not _is_enough(found, names, time.monotonic() - began):
+        while not _is_enough(batches, names, time.monotonic() - began):
             for states in recurrent.values():
                 states.forget(turn.finished)
             actions = {}
             for group, batch in turn.batches.items():
                 name, plays = names[group // 2], group % 2
                 played = PlayedBatch(batch.observations, recurrent[name].get(batch))
-                found[name].append(played)
+                batches[name].append(played)
                 answer = policies[name].act(played.observations, state=played.state or None)
                 recurrent[name].update(batch, answer.state or {})
                 _check_legal(name, answer.actions, spaces[name], played)
@@ -90,7 +90,7 @@ def collect(
             turn = batched.step(actions)
     finally:
         batched.close()
-    return dict(found)
+    return dict(batches)
 
 
 def check_parity(
@@ -115,8 +115,8 @@ def check_parity(
         fine = excused(answer.actions, expected, known_logits(logits, expected, spaces), action)
         mismatches += int((~fine).sum())
         near_ties += int((fine & ~alike).sum())
-        for own, known in zip((answer.state or {}).values(), after.values(), strict=True):
-            largest = max(largest, float(np.abs(own - known).max()))
+        for graph_state, source_state in zip((answer.state or {}).values(), after.values(), strict=True):
+            largest = max(largest, float(np.abs(graph_state - source_state).max()))
     count = sum(map(len, batches))
     if mismatches:
         raise ParityError(f"policy {policy}: {mismatches} of {count} greedy actions differ from those of the source")
@@ -126,8 +126,8 @@ def check_parity(
 def probes(graph: OnnxPolicy, batches: list[PlayedBatch]) -> Probes:
     """Return evenly spaced observations with the actions of the graph."""
     first = batches[0]
-    together = {name: np.concatenate([each.observations[name] for each in batches]) for name in first.observations}
-    states = {name: np.concatenate([each.state[name] for each in batches]) for name in first.state}
+    together = {name: np.concatenate([batch.observations[name] for batch in batches]) for name in first.observations}
+    states = {name: np.concatenate([batch.state[name] for batch in batches]) for name in first.state}
     total = len(next(iter(together.values())))
     size = sum(array[0].nbytes for array in together.values())
     rows = np.linspace(0, total - 1, min(PROBES, max(1, MAX_PROBE_BYTES // size), total)).astype(int)

@@ -116,10 +116,10 @@ def _shapes(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterfac
     """Input → shape without the batch."""
     leaves, shapes = inputs(spaces.observation), {}
     for name, (_, (_, *sizes)) in graph_inputs(model).items():
-        own = mapping.inputs.get(name)
-        observed = own.shape(leaves[own.name].shape) if own is not None else ()
-        known = tuple(size for size in sizes if size is not None)
-        shapes[name] = known if len(known) == len(sizes) else observed
+        input_mapping = mapping.inputs.get(name)
+        observed = input_mapping.shape(leaves[input_mapping.name].shape) if input_mapping is not None else ()
+        fixed_sizes = tuple(size for size in sizes if size is not None)
+        shapes[name] = fixed_sizes if len(fixed_sizes) == len(sizes) else observed
     return shapes
 
 
@@ -137,7 +137,7 @@ class _BoundedGraph:
     def __init__(self, model: onnx.ModelProto, shapes: Mapping[str, Shape], source: str) -> None:
         self._nodes, self._source, self._ir_version = list(model.graph.node), source, model.ir_version
         self._opsets = list(model.opset_import)
-        self._version = next((each.version for each in self._opsets if each.domain in ("", "ai.onnx")), 1)
+        self._version = next((opset.version for opset in self._opsets if opset.domain in ("", "ai.onnx")), 1)
         self._types: dict[str, TypeProto] = {}
         self._values: dict[str, NDArray] = {}
         for weight in model.graph.initializer:
@@ -145,9 +145,9 @@ class _BoundedGraph:
             if prod(weight.dims) <= KNOWN:
                 self._values[weight.name] = numpy_helper.to_array(weight)
         self._given = {
-            given.name: (given.type.tensor_type.elem_type, shapes[given.name])
-            for given in model.graph.input
-            if given.name not in self._types
+            graph_input.name: (graph_input.type.tensor_type.elem_type, shapes[graph_input.name])
+            for graph_input in model.graph.input
+            if graph_input.name not in self._types
         }
         self._last_use = {name: at for at, node in enumerate(self._nodes) for name in (*node.output, *node.input)}
         self._last_use |= {result.name: len(self._nodes) for result in model.graph.output}
@@ -273,8 +273,8 @@ def _increases(node: NodeProto, one: _CheckedBatch, before: _CheckedBatch, last:
         is_fixed = changing == [first] and last.shapes[first] == before.shapes[first]
         return node.op_type in SMOOTH or (node.op_type in ("Gather", "Slice", "Split") and is_fixed)
     if node.op_type in RESIZING:
-        given = zip(before.shapes[node.input[0]], last.shapes[node.input[0]], strict=True)
-        fixed = [a == b for a, b in given]
+        size_pairs = zip(before.shapes[node.input[0]], last.shapes[node.input[0]], strict=True)
+        fixed = [a == b for a, b in size_pairs]
         results = [last.shapes[name] for name in node.output if name]
         return not changing and all(
             same or size == result
@@ -294,26 +294,26 @@ def _is_sorted(values: list[NDArray | None]) -> bool:
 
 def _work(node: NodeProto, types: Mapping[str, TypeProto]) -> tuple[int, int]:
     """Operations of a node, each about as long as a multiplication, and the elements of its buffer."""
-    given = [_shape(types[name]) if name else () for name in node.input]
+    input_shapes = [_shape(types[name]) if name else () for name in node.input]
     kind, result = node.op_type, _shape(types[next(filter(None, node.output))])
     if kind in PRODUCTS:
-        right = given[3] if kind == "QLinearMatMul" else given[1]
+        right = input_shapes[3] if kind == "QLinearMatMul" else input_shapes[1]
         columns = bool(_attribute(node, "transB")) or len(right) == 1
         return prod(result) * right[-1 if columns else -2], 0
     if kind in CONVOLUTIONS:
-        weights = given[3] if kind == "QLinearConv" else given[1]
-        outer = given[0] if kind == "ConvTranspose" else result
+        weights = input_shapes[3] if kind == "QLinearConv" else input_shapes[1]
+        outer = input_shapes[0] if kind == "ConvTranspose" else result
         return prod(outer) * prod(weights[1:]), prod(weights[1:]) * prod(outer[2:])
     if kind in POOLS:
         return prod(result) * prod(_attribute(node, "kernel_shape") or ()), 0
     if kind in RECURRENT:
-        sequence, weights, recurrent = given[:3]
+        sequence, weights, recurrent = input_shapes[:3]
         sums = sequence[0] * sequence[1] * weights[0] * weights[1]
         return sums * (weights[2] + recurrent[2]), sums
     if kind == "Einsum":
-        return prod(_letters(node, given).values()), 0
+        return prod(_letters(node, input_shapes).values()), 0
     passes = int(_attribute(node, "size")) if kind == "LRN" else 64
-    return passes * (prod(result) + sum(map(prod, given))), 0
+    return passes * (prod(result) + sum(map(prod, input_shapes))), 0
 
 
 def _letters(node: NodeProto, given: list[Shape]) -> dict[str, int]:
@@ -330,13 +330,13 @@ def _letters(node: NodeProto, given: list[Shape]) -> dict[str, int]:
 
 def _check_count(model: onnx.ModelProto, source: str) -> None:
     """Raise InvalidInput if inlining functions gives too many nodes, or does not end."""
-    functions = {(each.domain, each.name, each.overload): each for each in model.functions}
+    functions = {(function.domain, function.name, function.overload): function for function in model.functions}
     counts: dict[tuple[str, str, str], int | None] = {}
 
     def count(nodes: Iterable[NodeProto]) -> int:
         total = 0
         for node in nodes:
-            if nested := [each for each in node.attribute if each.type in NESTED]:
+            if nested := [attribute for attribute in node.attribute if attribute.type in NESTED]:
                 raise InvalidInput(
                     f"{source}: {_described(node)} has a graph of its own, {nested[0].name}: loops and branches are "
                     "not supported"
@@ -351,10 +351,10 @@ def _check_count(model: onnx.ModelProto, source: str) -> None:
         if key not in counts:
             counts[key] = None
             counts[key] = count(functions[key].node)
-        known = counts[key]
-        if known is None:
+        total = counts[key]
+        if total is None:
             raise InvalidInput(f"{source}: function {key[1]} calls itself")
-        return known
+        return total
 
     count(model.graph.node)
 
@@ -365,7 +365,7 @@ def _check_operator(node: NodeProto, source: str) -> None:
         raise InvalidInput(f"{where} is of the domain {node.domain}: only operators of ONNX itself are supported")
     if node.op_type not in ALLOWED:
         raise InvalidInput(f"{where} is not supported: its time or memory is not bounded by the shapes of its inputs")
-    if any(each.type in SPARSE for each in node.attribute):
+    if any(attribute.type in SPARSE for attribute in node.attribute):
         raise InvalidInput(f"{where} has a sparse tensor, which is not supported")
     if node.op_type == "Einsum" and len(node.input) > 2:
         raise InvalidInput(f"{where} has {len(node.input)} inputs, expected at most 2")
@@ -379,7 +379,7 @@ def _weights(model: onnx.ModelProto) -> Iterable[TensorProto]:
 
 
 def _attribute(node: NodeProto, name: str) -> Any:
-    return next((helper.get_attribute_value(each) for each in node.attribute if each.name == name), None)
+    return next((helper.get_attribute_value(attribute) for attribute in node.attribute if attribute.name == name), None)
 
 
 def _described(node: NodeProto) -> str:

@@ -79,12 +79,12 @@ Shape = tuple[int | None, ...]
 
 def tensors(nodes: list[onnx.ValueInfoProto]) -> dict[str, tuple[str, Shape]]:
     """Return name → dtype and shape of a graph's inputs or outputs. Free dimensions are None."""
-    found = {}
+    tensor_types = {}
     for node in nodes:
         kind = node.type.tensor_type
         shape = tuple(size.dim_value or None if size.HasField("dim_value") else None for size in kind.shape.dim)
-        found[node.name] = (tensor_dtype_to_np_dtype(kind.elem_type).name, shape)
-    return found
+        tensor_types[node.name] = (tensor_dtype_to_np_dtype(kind.elem_type).name, shape)
+    return tensor_types
 
 
 def inferred(model: onnx.ModelProto, spaces: AgentInterface, source: str) -> GraphMapping:
@@ -93,39 +93,46 @@ def inferred(model: onnx.ModelProto, spaces: AgentInterface, source: str) -> Gra
     Raises:
         EnvironmentMismatch: A tensor has no match or several; the message names it and `source`.
     """
-    given, results = graph_inputs(model), tensors(list(model.graph.output))
-    wanted = inputs(spaces.observation)
+    model_inputs, results = graph_inputs(model), tensors(list(model.graph.output))
+    leaves = inputs(spaces.observation)
     matched: dict[str, str] = {}
-    state = {name: name.replace("_in", "_out") for name in given if name.replace("_in", "_out") in results}
-    for name, (dtype, shape) in given.items():
+    state = {name: name.replace("_in", "_out") for name in model_inputs if name.replace("_in", "_out") in results}
+    for name, (dtype, shape) in model_inputs.items():
         if name in state:
             continue
-        open_leaves = {own: leaf for own, leaf in wanted.items() if own not in matched.values()}
+        open_leaves = {leaf_name: leaf for leaf_name, leaf in leaves.items() if leaf_name not in matched.values()}
         if name in open_leaves:
             matched[name] = name
             continue
-        fits = [own for own, leaf in open_leaves.items() if shape[1:] == leaf.shape]
+        fits = [leaf_name for leaf_name, leaf in open_leaves.items() if shape[1:] == leaf.shape]
         if len(fits) > 1:
-            fits = [own for own in fits if open_leaves[own].dtype == dtype] or fits
+            fits = [leaf_name for leaf_name in fits if open_leaves[leaf_name].dtype == dtype] or fits
         if len(fits) > 1:
-            fits = [own for own in fits if (own == ACTION_MASK) == ("mask" in name)]
+            fits = [leaf_name for leaf_name in fits if (leaf_name == ACTION_MASK) == ("mask" in name)]
         if len(fits) != 1:
-            known = ", ".join(f"{own} {leaf.dtype} {list(leaf.shape)}" for own, leaf in open_leaves.items())
+            choices = ", ".join(
+                f"{leaf_name} {leaf.dtype} {list(leaf.shape)}" for leaf_name, leaf in open_leaves.items()
+            )
             raise EnvironmentMismatch(
                 f"{source}: input {name} is {dtype} {list(shape[1:])}: expected {'one' if fits else 'one of'} "
-                f"{known or 'no further input'}; use a mapping file"
+                f"{choices or 'no further input'}; use a mapping file"
             )
         matched[name] = fits[0]
-    output, kind = _output({name: each for name, each in results.items() if name not in state.values()}, spaces, source)
+    output, kind = _output(
+        {name: tensor_type for name, tensor_type in results.items() if name not in state.values()}, spaces, source
+    )
     return GraphMapping(
-        inputs={name: InputMapping(name=own) for name, own in matched.items()}, output=output, kind=kind, state=state
+        inputs={name: InputMapping(name=leaf_name) for name, leaf_name in matched.items()},
+        output=output,
+        kind=kind,
+        state=state,
     )
 
 
 def graph_inputs(model: onnx.ModelProto) -> dict[str, tuple[str, Shape]]:
     """Return name → dtype and shape of the inputs that are not weights."""
     weights = {weight.name for weight in model.graph.initializer}
-    return {name: each for name, each in tensors(list(model.graph.input)).items() if name not in weights}
+    return {name: tensor_type for name, tensor_type in tensors(list(model.graph.input)).items() if name not in weights}
 
 
 def _output(results: dict[str, tuple[str, Shape]], spaces: AgentInterface, source: str) -> tuple[str, Kind]:
@@ -141,9 +148,9 @@ def _output(results: dict[str, tuple[str, Shape]], spaces: AgentInterface, sourc
     for names, kind in kinds:
         if len(names) == 1:
             return names[0], kind
-    found = ", ".join(f"{name} {dtype} {list(shape[1:])}" for name, (dtype, shape) in results.items())
+    outputs = ", ".join(f"{name} {dtype} {list(shape[1:])}" for name, (dtype, shape) in results.items())
     raise EnvironmentMismatch(
-        f"{source}: outputs are {found}: expected one float output [{width}] or one {action.dtype} action "
+        f"{source}: outputs are {outputs}: expected one float output [{width}] or one {action.dtype} action "
         f"{list(action.shape)}; use a mapping file"
     )
 

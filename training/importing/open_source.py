@@ -117,11 +117,11 @@ def _format(file: Path) -> str:
 
 def _digest(path: Path, *choices: object) -> str:
     """Digest of a file or of all files of a directory, and of what else decides how they are imported."""
-    found = hashlib.sha256()
-    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
-    mapping = [each for each in (choices[0],) if isinstance(each, Path) and each.exists()]
+    digest = hashlib.sha256()
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    mapping = [choice for choice in (choices[0],) if isinstance(choice, Path) and choice.exists()]
     for file in [*files, *mapping, *([beside] if (beside := path.with_suffix(".yaml")).exists() else [])]:
-        found.update(file.name.encode())
-        found.update(hashlib.sha256(file.read_bytes()).digest())
-    found.update(repr(choices[1:]).encode())
-    return found.hexdigest()
+        digest.update(file.name.encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    digest.update(repr(choices[1:]).encode())
+    return digest.hexdigest()

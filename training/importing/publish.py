@@ -77,10 +77,10 @@ def _write(
         source, spaces = sources[policy], interface.of_policy(policy)
         file = staging / f"{policy}.onnx"
         file.write_bytes(adapt(source.model, source.mapping, spaces, policy))
-        taken, answered, state = graph_tensors(source.model, source.mapping, spaces)
+        input_tensors, output_tensors, state = graph_tensors(source.model, source.mapping, spaces)
         partial[policy] = {
             "file": file.name, "observation": spaces.observation, "action": spaces.action,
-            "inputs": taken, "outputs": answered, "state": state, "probes": f"{policy}{PROBES}",
+            "inputs": input_tensors, "outputs": output_tensors, "state": state, "probes": f"{policy}{PROBES}",
         }  # fmt: skip
         graphs[policy] = OnnxPolicy(file)
     played = checks.collect(environment, interface, graphs, seed)

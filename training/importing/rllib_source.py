@@ -53,8 +53,8 @@ def rllib_source(path: Path, module_id: str, spaces: AgentInterface, origin: dic
     if not modules.is_dir():
         raise ConfigError(f"{path}: not a checkpoint of RLlib's new API stack: {modules.relative_to(path)} is missing")
     if not (modules / module_id).is_dir():
-        known = ", ".join(sorted(each.name for each in modules.iterdir() if each.is_dir()))
-        raise ConfigError(f"{path}: there is no module {module_id!r}; known: {known}; use --policy NAME=MODULE")
+        module_names = ", ".join(sorted(directory.name for directory in modules.iterdir() if directory.is_dir()))
+        raise ConfigError(f"{path}: there is no module {module_id!r}; known: {module_names}; use --policy NAME=MODULE")
     try:
         # RLlib takes a relative path for a URI.
         module = RLModule.from_checkpoint((modules / module_id).resolve())
@@ -86,9 +86,9 @@ def _observed(space: gymnasium.Space[Any], where: str) -> tuple[str | None, gymn
     if isinstance(space, gymnasium.spaces.Box):
         return None, space
     if isinstance(space, gymnasium.spaces.Dict) and ACTION_MASK in space.spaces:
-        others = [(key, part) for key, part in space.spaces.items() if key != ACTION_MASK]
-        if len(others) == 1 and isinstance(others[0][1], gymnasium.spaces.Box):
-            return others[0]
+        parts = [(key, part) for key, part in space.spaces.items() if key != ACTION_MASK]
+        if len(parts) == 1 and isinstance(parts[0][1], gymnasium.spaces.Box):
+            return parts[0]
     raise EnvironmentMismatch(f"{where}: observations are {space}: expected Box, or Dict with a Box and an action_mask")
 
 

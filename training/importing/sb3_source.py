@@ -81,19 +81,19 @@ class PredictOriginal:
 
     def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
         """Call `predict`. With a mask, which Stable-Baselines3 does not know, the best legal logit decides."""
-        seen = observations[OBSERVATION]
+        observation = observations[OBSERVATION]
         if self._transpose:
-            seen = seen.transpose(0, *(axis + 1 for axis in self._transpose))
-        seen = np.ascontiguousarray(seen).reshape(-1, *self._model.observation_space.shape)
+            observation = observation.transpose(0, *(axis + 1 for axis in self._transpose))
+        observation = np.ascontiguousarray(observation).reshape(-1, *self._model.observation_space.shape)
         logits = None
         if self._kind != "gaussian" and self._kind != "action":
             with torch.no_grad():
-                logits = self._graph(torch.from_numpy(seen.astype(np.float32))).numpy()
+                logits = self._graph(torch.from_numpy(observation.astype(np.float32))).numpy()
         action, mask = self._spaces.action, observations.get(ACTION_MASK)
         if mask is not None and logits is not None:
             assert isinstance(action, Discrete)
             return np.where(mask != 0, logits, -np.inf).argmax(axis=1) + action.start, logits, state
-        actions, _ = self._model.predict(seen.astype(self._model.observation_space.dtype), deterministic=True)
+        actions, _ = self._model.predict(observation.astype(self._model.observation_space.dtype), deterministic=True)
         assert not isinstance(action, DictSpace)
         if isinstance(action, Discrete) and self._model.action_space.start != action.start:
             actions = actions - self._model.action_space.start + action.start
@@ -162,8 +162,8 @@ def _load(path: Path) -> Any:
     except Exception as error:
         raise ConfigError(f"{path}: not a file of Stable-Baselines3: {one_line(error)}") from error
     policy_class = str(getattr((data or {}).get("policy_class"), "__module__", ""))
-    found = [name for name in FORMATS if f".{name.lower()}." in policy_class]
-    candidates = found or (["PPO", "A2C"] if "common.policies" in policy_class else [])
+    algorithms = [name for name in FORMATS if f".{name.lower()}." in policy_class]
+    candidates = algorithms or (["PPO", "A2C"] if "common.policies" in policy_class else [])
     for name in candidates:
         try:
             return getattr(stable_baselines3, name).load(path, device="cpu")

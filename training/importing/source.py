@@ -67,11 +67,11 @@ class OnnxOriginal:
     def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
         """Run the graph. Raises InvalidInput if it fails."""
         feed = dict(state)
-        for name, own in self._mapping.inputs.items():
+        for name, input_mapping in self._mapping.inputs.items():
             dtype, shape = self._given[name]
-            value = observations[own.name].astype(dtype)
-            if own.transpose:
-                value = value.transpose(0, *(axis + 1 for axis in own.transpose))
+            value = observations[input_mapping.name].astype(dtype)
+            if input_mapping.transpose:
+                value = value.transpose(0, *(axis + 1 for axis in input_mapping.transpose))
             feed[name] = value if None in shape[1:] else value.reshape(-1, *shape[1:])
         try:
             results = [self._mapping.output, *self._mapping.state.values()]

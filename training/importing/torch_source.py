@@ -38,10 +38,10 @@ class ModuleOriginal:
         """Run the module."""
         arguments = []
         for name, (shape, dtype) in self._examples.items():
-            own = self._mapping.inputs[name]
-            value = torch.from_numpy(np.ascontiguousarray(observations[own.name])).to(dtype)
-            if own.transpose:
-                value = value.permute(0, *(axis + 1 for axis in own.transpose))
+            input_mapping = self._mapping.inputs[name]
+            value = torch.from_numpy(np.ascontiguousarray(observations[input_mapping.name])).to(dtype)
+            if input_mapping.transpose:
+                value = value.permute(0, *(axis + 1 for axis in input_mapping.transpose))
             arguments.append(value.reshape(-1, *shape))
         with torch.no_grad():
             value = self._module(*arguments).numpy()
@@ -103,10 +103,12 @@ def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origi
         )
     assert exported is not None, "the exporter returns a program unless it is told to write one"
     model = exported.model_proto
-    given = GraphMapping.load(mapping) if mapping else inferred(model, spaces, str(path))
-    check(model, given, spaces, str(path))
-    model = bounded(model, given, spaces, str(path))
-    return Source(model, given, ModuleOriginal(_Called(program.module()), examples, given, spaces), origin)
+    graph_mapping = GraphMapping.load(mapping) if mapping else inferred(model, spaces, str(path))
+    check(model, graph_mapping, spaces, str(path))
+    model = bounded(model, graph_mapping, spaces, str(path))
+    return Source(
+        model, graph_mapping, ModuleOriginal(_Called(program.module()), examples, graph_mapping, spaces), origin
+    )
 
 
 class _Called(nn.Module):

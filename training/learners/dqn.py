@@ -36,11 +36,11 @@ class DQNLearner(OffPolicyLearner):
         observations, actions = subcolumns(batch.rows, OBSERVATIONS), batch.rows[ACTIONS]
         counted = batch.weights > 0
         network.encoder.update_statistics({name: column[counted] for name, column in observations.items()})
-        now, after = self._hidden(network, batch.rows)
-        taken = _chosen(network.head_outputs(observations, noise=True, hidden=now), actions)
+        hidden, after = self._hidden(network, batch.rows)
+        outputs = _chosen(network.head_outputs(observations, noise=True, hidden=hidden), actions)
         compare = self._values if network.atoms is None else self._atoms
-        errors = compare(policy, batch, taken, after)
-        values = taken if network.atoms is None else (taken.detach().softmax(-1) * network.atoms).sum(-1)
+        errors = compare(policy, batch, outputs, after)
+        values = outputs if network.atoms is None else (outputs.detach().softmax(-1) * network.atoms).sum(-1)
         if network.atoms is None:
             losses = nn.functional.smooth_l1_loss(errors, torch.zeros_like(errors), reduction="none")
         else:
@@ -61,15 +61,19 @@ class DQNLearner(OffPolicyLearner):
         if self.settings.recurrence is None:
             return NOT_RECURRENT
         state, actions = subcolumns(rows, RECURRENT_STATE), rows[ACTIONS]
-        now = network.hidden_states(subcolumns(rows, OBSERVATIONS), state, actions, self.settings.recurrence.sequence)
+        hidden = network.hidden_states(
+            subcolumns(rows, OBSERVATIONS), state, actions, self.settings.recurrence.sequence
+        )
         with torch.no_grad():
-            return now, network.hidden_after(subcolumns(rows, NEXT + OBSERVATIONS), actions, now)
+            return hidden, network.hidden_after(subcolumns(rows, NEXT + OBSERVATIONS), actions, hidden)
 
     def _values(self, policy: str, batch: ReplayBatch, taken: Tensor, after: Tensor | None) -> Tensor:
         """Return the temporal differences, (k,). after: hidden states at the next observations."""
         with torch.no_grad():
-            rows, (chosen, answers) = batch.rows, self._next(policy, batch, after)
-            targets = bootstrapped_returns(rows[REWARDS], rows[DISCOUNTS], rows[TERMINATED], _chosen(answers, chosen))
+            rows, (best_actions, answers) = batch.rows, self._next(policy, batch, after)
+            targets = bootstrapped_returns(
+                rows[REWARDS], rows[DISCOUNTS], rows[TERMINATED], _chosen(answers, best_actions)
+            )
         return taken - targets
 
     def _atoms(self, policy: str, batch: ReplayBatch, taken: Tensor, after: Tensor | None) -> Tensor:
@@ -77,8 +81,8 @@ class DQNLearner(OffPolicyLearner):
         network, rows = self.networks[policy], batch.rows
         assert isinstance(network, QNetwork)
         with torch.no_grad():
-            chosen, answers = self._next(policy, batch, after)
-            following = _chosen(answers, chosen).softmax(-1)
+            best_actions, answers = self._next(policy, batch, after)
+            following = _chosen(answers, best_actions).softmax(-1)
             targets = project_distribution(following, network.atoms, rows[REWARDS], rows[DISCOUNTS], rows[TERMINATED])
         return -(targets * taken.log_softmax(-1)).sum(-1)
 

@@ -102,15 +102,15 @@ class MADDPGLearner(OffPolicyLearner):
         share = (present / present.mean().clamp_min(1e-8)).flatten()
         weights = share * batch.weights.repeat(len(order))
         targets = self._targets(policy, batch, order)
-        seen, done = self._critic_inputs(rows, order)
+        observations, actions = self._critic_inputs(rows, order)
         critic = self._critic_of(policy)
         if self.settings.normalize_observations:
-            self._actor_of(policy).encoder.update_statistics(seen[0])
-            critic.update_statistics(seen)
-        values = critic(seen, done)
+            self._actor_of(policy).encoder.update_statistics(observations[0])
+            critic.update_statistics(observations)
+        values = critic(observations, actions)
         loss = critic_loss(values, targets, weights)
         critic_norm = self.gradient_step(loss, [critic_name(policy)])[critic_name(policy)]
-        policy_loss = self._policy_loss(policy, seen, done, share)
+        policy_loss = self._policy_loss(policy, observations, actions, share)
         norm = self.gradient_step(policy_loss, [policy])[policy]
         errors = (values.detach() - targets).abs() * present.flatten()
         self.log_statistics(
@@ -129,14 +129,14 @@ class MADDPGLearner(OffPolicyLearner):
     @torch.no_grad()
     def _targets(self, policy: str, batch: ReplayBatch, order: CriticAgents) -> Tensor:
         rows = batch.rows
-        seen = {place: _agent_observations(rows, NEXT + OBSERVATIONS, place) for place in _distinct(order)}
+        observations = {place: _agent_observations(rows, NEXT + OBSERVATIONS, place) for place in _distinct(order)}
         actions = {}
-        for place, observed in seen.items():
+        for place, observed in observations.items():
             actor = self.targets[place.policy]
             assert isinstance(actor, Actor)
             goes_on = _agent_column(rows, PRESENT, place) & ~_agent_column(rows, TERMINATED, place)
             actions[place] = actor.act(observed, self.settings.temperature)[0] * goes_on.unsqueeze(-1)
-        values = self.targets[critic_name(policy)](*_stack_by_position(order, seen, actions))
+        values = self.targets[critic_name(policy)](*_stack_by_position(order, observations, actions))
         rewards, terminated = (rows[f"{head}/{policy}"].T.flatten() for head in (REWARDS, TERMINATED))
         return bootstrapped_returns(rewards, rows[DISCOUNTS].repeat(len(order)), terminated, values)
 
@@ -146,13 +146,13 @@ class MADDPGLearner(OffPolicyLearner):
         """Return observations and actions of each position, concatenated over the policy's agents; absent agents act
         0."""
         places = _distinct(order)
-        seen = {place: _agent_observations(rows, OBSERVATIONS, place) for place in places}
-        done = {
+        observations = {place: _agent_observations(rows, OBSERVATIONS, place) for place in places}
+        actions = {
             place: self._actor_of(place.policy).relaxed.encode(_agent_column(rows, ACTIONS, place))
             * _agent_column(rows, PRESENT, place).unsqueeze(-1)
             for place in places
         }
-        return _stack_by_position(order, seen, done)
+        return _stack_by_position(order, observations, actions)
 
     def _actor_of(self, policy: str) -> Actor:
         actor = self.networks[policy]
@@ -173,8 +173,8 @@ class MADDPGLearner(OffPolicyLearner):
         spaces = [module_spaces(self.interface, place.policy) for place in self._critic_agents(own)]
         layers = [(layer.filters, layer.kernel, layer.stride) for layer in self.settings.convolutions]
         return Critic(
-            [seen for seen, _ in spaces],
-            [acted for _, acted in spaces],
+            [observation for observation, _ in spaces],
+            [action for _, action in spaces],
             self.settings.hidden,
             layers,
             self.settings.normalize_observations,
@@ -183,7 +183,7 @@ class MADDPGLearner(OffPolicyLearner):
 
 
 def _distinct(order: CriticAgents) -> Iterable[AgentSlot]:
-    return dict.fromkeys(place for seen in order for place in seen)
+    return dict.fromkeys(place for agents in order for place in agents)
 
 
 def _agent_column(rows: Mapping[str, Tensor], head: str, place: AgentSlot) -> Tensor:

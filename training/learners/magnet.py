@@ -35,7 +35,7 @@ State = dict[str, dict[str, Any]]
 
 def states(module: MultiRLModule) -> State:
     """Return the weights of all policies."""
-    return {policy: each.get_state() for policy, each in module.items()}
+    return {policy: policy_module.get_state() for policy, policy_module in module.items()}
 
 
 class Uniform:
@@ -75,8 +75,8 @@ class Previous:
 
     def set_state(self, state: State) -> None:
         """Load what `get_state` returned."""
-        for policy, each in self._snapshot.items():
-            each.set_state(state[policy])
+        for policy, policy_module in self._snapshot.items():
+            policy_module.set_state(state[policy])
 
 
 class Version:
@@ -94,9 +94,9 @@ class Version:
         return torch.from_numpy(np.concatenate(parts)).to(batch.dist_inputs.device)
 
     def _rows(self, observations: dict[str, NDArray], policy: str) -> NDArray:
-        found = self._policies[policy].distribution(observations).dist_inputs
-        assert found is not None
-        return found
+        dist_inputs = self._policies[policy].distribution(observations).dist_inputs
+        assert dist_inputs is not None
+        return dist_inputs
 
 
 Magnet = Uniform | Previous | Version

@@ -208,8 +208,8 @@ class OffPolicyLearner(FixedPoliciesLearner):
             network, rate = self.networks[name], self.settings.target_rate
             for old, new in zip(target.parameters(), network.parameters(), strict=True):
                 old.lerp_(new, rate)
-            for kept, known in zip(target.buffers(), network.buffers(), strict=True):
-                kept.copy_(known)
+            for old_buffer, new_buffer in zip(target.buffers(), network.buffers(), strict=True):
+                old_buffer.copy_(new_buffer)
 
     def log_statistics(self, key: str, **statistics: Tensor) -> None:
         """Add scalars of a gradient step to the reported means. key: a policy id or a buffer key."""
@@ -244,11 +244,11 @@ class OffPolicyLearner(FixedPoliciesLearner):
 
     def set_state(self, state: dict[str, Any]) -> None:
         super().set_state(state)
-        if own := state.get(OFF_POLICY):
-            self.updates = own["updates"]
-            for name, weights in own["targets"].items():
+        if off_policy_state := state.get(OFF_POLICY):
+            self.updates = off_policy_state["updates"]
+            for name, weights in off_policy_state["targets"].items():
                 self.targets[name].load_state_dict(weights)
-            for name, weights in own["extra"].items():
+            for name, weights in off_policy_state["extra"].items():
                 self.networks[name].load_state_dict(weights)
         for name in self.networks:
             # The saved state of an optimiser contains the learning rate of that time.

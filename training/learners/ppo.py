@@ -67,8 +67,8 @@ def scheduled_hyperparameters(settings: PPOConfig, policy: str) -> tuple[str, ..
 
 
 def _setting(settings: PPOConfig, policy: str, name: str) -> Scheduled:
-    own = getattr(settings.per_policy.get(policy), name, None)
-    return getattr(settings, name) if own is None else own
+    override = getattr(settings.per_policy.get(policy), name, None)
+    return getattr(settings, name) if override is None else override
 
 
 class PPOLoss(NamedTuple):
@@ -198,8 +198,10 @@ class PPOLearner(FixedPoliciesLearner):
         common = list(shared.parameters()) if shared is not None else []
         self._parameters: dict[str, list[torch.nn.Parameter]] = {}
         for policy, module in self.module.items():
-            own = [parameter for parameter in module.parameters() if not any(parameter is other for other in common)]
-            self._add_optimizer(policy, own)
+            own_parameters = [
+                parameter for parameter in module.parameters() if not any(parameter is other for other in common)
+            ]
+            self._add_optimizer(policy, own_parameters)
         if common:
             self._add_optimizer(ALL_MODULES, common)
 
@@ -249,9 +251,9 @@ class PPOLearner(FixedPoliciesLearner):
 
     def _batches(self, sampled: Iterable[EpisodeChunks], policies: Collection[str]) -> dict[str, TrainBatch]:
         chunks = defaultdict(list)
-        for own in sampled:
-            if own.policy in policies:
-                chunks[own.policy].append(own)
+        for policy_chunks in sampled:
+            if policy_chunks.policy in policies:
+                chunks[policy_chunks.policy].append(policy_chunks)
         recurrence = self.settings.recurrence
         batches = {
             policy: train_batch(

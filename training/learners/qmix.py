@@ -51,32 +51,35 @@ def teams(groups: Mapping[str, tuple[str, ...]] | None, interface: Interface) ->
     or has other spaces than the rest of its group.
     """
     if groups is None:
-        found = {
-            group: tuple(agent for agent in interface.agents if agent in own) for group, own in interface.sides.items()
+        team_agents = {
+            group: tuple(agent for agent in interface.agents if agent in side)
+            for group, side in interface.sides.items()
         }
         key = "sides"
     else:
         group_of = divide("training.groups", dict(groups), list(interface.agents))
-        found = {group: tuple(agent for agent in interface.agents if group_of[agent] == group) for group in groups}
+        team_agents = {
+            group: tuple(agent for agent in interface.agents if group_of[agent] == group) for group in groups
+        }
         key = "training.groups"
-    for group, members in found.items():
+    for group, members in team_agents.items():
         for agent in members:
             _check(f"{key}.{group}", members[0], agent, interface)
-    return found
+    return team_agents
 
 
 def _check(where: str, first: str, agent: str, interface: Interface) -> None:
-    own, others = interface.agents[agent], interface.agents[first]
-    if not isinstance(own.action, Discrete):
+    agent_spaces, first_spaces = interface.agents[agent], interface.agents[first]
+    if not isinstance(agent_spaces.action, Discrete):
         raise ConfigError(
-            f"{where}: qmix needs Discrete actions, but {agent} has {own.action!r}: use algorithm: ppo, or"
+            f"{where}: qmix needs Discrete actions, but {agent} has {agent_spaces.action!r}: use algorithm: ppo, or"
             " maddpg for continuous actions"
         )
-    if own.action != others.action:
+    if agent_spaces.action != first_spaces.action:
         raise ConfigError(
             f"{where}: {first} and {agent} have different action spaces: pad them with SuperSuit's pad_action_space_v0"
         )
-    if own.observation != others.observation:
+    if agent_spaces.observation != first_spaces.observation:
         raise ConfigError(
             f"{where}: {first} and {agent} have different observation spaces: pad them with SuperSuit's"
             " pad_observations_v0"
@@ -156,16 +159,16 @@ class QMIXLearner(OffPolicyLearner):
 
     def losses(self, batches: Mapping[str, ReplayBatch], learning: Collection[str]) -> dict[str, ReplayLoss]:
         rows, weights = batches[JOINT].rows, batches[JOINT].weights
-        chosen, following = self._values(rows, learning)
+        action_values, following = self._values(rows, learning)
         networks = [policy for policy in self.interface.policy_ids if policy in learning]
         totals, errors, values = [], [], []
         for team, steps in self._steps(rows, learning).items():
             networks += [name for name in (_mixer_name(team),) if name in self.networks]
-            own = self.columns[team]
+            columns = self.columns[team]
             self._update_statistics(team, steps.states[weights > 0])
-            mixed = steps.mixed(self.mixer(self.networks, team), chosen[:, own])
+            mixed = steps.mixed(self.mixer(self.networks, team), action_values[:, columns])
             with torch.no_grad():
-                targets = steps.targets(self.mixer(self.targets, team), following[:, own])
+                targets = steps.targets(self.mixer(self.targets, team), following[:, columns])
                 counted = steps.counted() & (weights > 0).unsqueeze(-1)
             differences = torch.where(counted, mixed - targets, 0.0)
             totals.append((weights.unsqueeze(-1) * differences.square()).sum() / counted.sum().clamp(min=1))
@@ -187,9 +190,15 @@ class QMIXLearner(OffPolicyLearner):
         discounts, states, next_states = rows[DISCOUNTS], rows[STATE], rows[NEXT + STATE]
         return {
             team: TeamSteps(
-                rewards[:, own], present[:, own], terminated[:, own], discounts, states, next_states, together
+                rewards[:, columns],
+                present[:, columns],
+                terminated[:, columns],
+                discounts,
+                states,
+                next_states,
+                together,
             )
-            for team, own in self.columns.items()
+            for team, columns in self.columns.items()
             if any(policies[agent] in learning for agent in self.teams[team])
         }
 
@@ -212,7 +221,7 @@ class QMIXLearner(OffPolicyLearner):
 
     def _values(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> tuple[Tensor, Tensor]:
         """Return the values (k, N) of the taken actions, with gradients, and of the best next actions, without."""
-        taken, best = [], []
+        action_values, best = [], []
         for policy in self.interface.policy_ids:
             network, target = self.networks[policy], self.targets[policy]
             assert isinstance(network, AgentNetwork)
@@ -229,13 +238,13 @@ class QMIXLearner(OffPolicyLearner):
                     {name: rows[play.present] for name, rows in play.observations.items()}
                 )
             values, online = self._current_and_next(network, play)
-            taken.append(values.gather(-1, play.actions.unsqueeze(-1)).squeeze(-1))
+            action_values.append(values.gather(-1, play.actions.unsqueeze(-1)).squeeze(-1))
             with torch.no_grad():
                 _, valued = self._current_and_next(target, play)
                 mask = play.next_observations[ACTION_MASK].flatten(2) if ACTION_MASK in play.next_observations else None
-                chosen = next_actions(online if self.settings.double else None, valued, mask)
-                best.append(valued.gather(-1, chosen.unsqueeze(-1)).squeeze(-1))
-        return torch.cat(taken, dim=1), torch.cat(best, dim=1)
+                best_actions = next_actions(online if self.settings.double else None, valued, mask)
+                best.append(valued.gather(-1, best_actions.unsqueeze(-1)).squeeze(-1))
+        return torch.cat(action_values, dim=1), torch.cat(best, dim=1)
 
     def _current_and_next(self, network: AgentNetwork, play: _AgentRows) -> tuple[Tensor, Tensor]:
         """Return the values (k, n, actions) of current observations, and of next ones without gradients."""

@@ -246,9 +246,9 @@ def _sequences(lengths: NDArray, sequence: int, state: dict[str, Tensor]) -> Seq
     firsts = np.cumsum(lengths) - lengths
     starts = np.concatenate([first + np.arange(0, n, sequence) for first, n in zip(firsts, lengths, strict=True)])
     stops = np.append(starts[1:], lengths.sum())
-    begun = {key: value[starts] for key, value in state.items()}
-    device = next(iter(begun.values())).device
-    return Sequences(torch.from_numpy(starts).to(device), torch.from_numpy(stops - starts).to(device), begun)
+    start_states = {key: value[starts] for key, value in state.items()}
+    device = next(iter(start_states.values())).device
+    return Sequences(torch.from_numpy(starts).to(device), torch.from_numpy(stops - starts).to(device), start_states)
 
 
 def _standardized(values: NDArray) -> NDArray:

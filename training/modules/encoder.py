@@ -51,12 +51,12 @@ class RunningNormalization(nn.Module):
         Chan, Golub and LeVeque, 1979, "Updating formulae and a pairwise algorithm for computing sample variances":
         with δ the difference of the two means, M = M_a + M_b + δ² n_a n_b / n.
         """
-        values, seen = values.double(), len(values)
-        total = self.count + seen
+        values, batch_size = values.double(), len(values)
+        total = self.count + batch_size
         delta = values.mean(0) - self.mean
-        squares = self.variance * self.count + values.var(0, correction=0) * seen
-        squares += delta.square() * self.count * seen / total
-        self.mean += delta * seen / total
+        squares = self.variance * self.count + values.var(0, correction=0) * batch_size
+        squares += delta.square() * self.count * batch_size / total
+        self.mean += delta * batch_size / total
         self.variance.copy_(squares / total)
         self.count.copy_(total)
 

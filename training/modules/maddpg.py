@@ -63,8 +63,8 @@ class OneHotActions:
         return sum(self._sizes)
 
     def encode(self, raw: Tensor) -> Tensor:
-        chosen = raw.reshape(len(raw), len(self._sizes))
-        return torch.cat([one_hot(chosen[:, i], n) for i, n in enumerate(self._sizes)], dim=-1)
+        indices = raw.reshape(len(raw), len(self._sizes))
+        return torch.cat([one_hot(indices[:, i], n) for i, n in enumerate(self._sizes)], dim=-1)
 
     def sample(self, dist_inputs: Tensor, temperature: float) -> Tensor:
         parts = dist_inputs.split(self._sizes, dim=-1)

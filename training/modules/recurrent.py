@@ -108,12 +108,12 @@ class ActionGRULayer(GRULayer):
         hidden_states = []
         for step in range(len(embeddings)):
             new = self(self._with_action(embeddings[step], acted), hidden)
-            taken = actions[step].to(acted.dtype) + 1
+            action = actions[step].to(acted.dtype) + 1
             if present is None:
-                hidden, acted = new, taken
+                hidden, acted = new, action
             else:
                 hidden = torch.where(present[step].unsqueeze(-1), new, hidden)
-                acted = torch.where(present[step], taken, acted)
+                acted = torch.where(present[step], action, acted)
             hidden_states.append(hidden)
         return torch.stack(hidden_states)
 

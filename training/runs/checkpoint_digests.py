@@ -18,8 +18,8 @@ DIGESTS_FILE = "digests.json"
 
 def write_digests(checkpoint: Path) -> None:
     """Record the digests of all files of a new checkpoint."""
-    found = digests_of(checkpoint, files_in(checkpoint))
-    (checkpoint / DIGESTS_FILE).write_text(json.dumps(found, indent=2))
+    digests = digests_of(checkpoint, files_in(checkpoint))
+    (checkpoint / DIGESTS_FILE).write_text(json.dumps(digests, indent=2))
 
 
 def private_copy(checkpoint: Path, target: Path) -> Path:

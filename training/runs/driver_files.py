@@ -157,5 +157,5 @@ def driver_machine() -> DriverMachine | None:
     if len(alive_nodes()) == 1 and not has_autoscaler():
         return None
     node = ray.get_runtime_context().get_node_id()
-    here = NodeAffinitySchedulingStrategy(node, soft=False)
-    return DriverMachine(node, ray.remote(FileActor).options(num_cpus=0, scheduling_strategy=here).remote())
+    strategy = NodeAffinitySchedulingStrategy(node, soft=False)
+    return DriverMachine(node, ray.remote(FileActor).options(num_cpus=0, scheduling_strategy=strategy).remote())

@@ -57,13 +57,13 @@ class NodeWatch(NotPickled, tune.Callback):
         used = f"{self._share * (1 + self._runners):g} of {cpus:g} CPUs"
         if self._gpus:
             used += f", {self._gpus:g} of {gpus:g} GPUs"
-        shown = f"Training on {len(self._nodes)} of {len(nodes)} nodes, {used}."
+        status = f"Training on {len(self._nodes)} of {len(nodes)} nodes, {used}."
         if self.reason is None and (reason := self._reason_to_move()) is not None:
             self.reason = reason
             self._request_move()
-        elif self.reason is None and shown != self._shown:
-            self._shown = shown
-            self._say(shown)
+        elif self.reason is None and status != self._shown:
+            self._shown = status
+            self._say(status)
 
     def _reason_to_move(self) -> str | None:
         if leaving := self._nodes & draining_nodes():

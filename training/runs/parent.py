@@ -79,8 +79,8 @@ def check_network(version: VersionRow, config: LeagueConfig) -> None:
         settings: AnyTraining = TypeAdapter(TrainingConfig).validate_python(version.manifest.settings)
     except ValidationError as error:
         raise ConfigError(f"{version.ref} was trained with settings of another release") from error
-    before, now = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
+    old_settings, new_settings = (part.model_dump(mode="json", by_alias=True) for part in (settings, config.training))
     for key in NETWORK_SETTINGS:
         # Each algorithm has a subset of them.
-        if (was := before.get(key)) != (wanted := now.get(key)):
-            raise ConfigError(f"training.{key}: {version.ref} was trained with {was}, got {wanted}")
+        if (old_setting := old_settings.get(key)) != (new_setting := new_settings.get(key)):
+            raise ConfigError(f"training.{key}: {version.ref} was trained with {old_setting}, got {new_setting}")

@@ -92,9 +92,9 @@ def policy_summaries(metrics: Mapping[str, Any], policies: Mapping[str, str]) ->
     """Return a summary of the first few policies' metrics. policies: agent → policy id."""
     agents_of = {policy: [agent for agent in policies if policies[agent] == policy] for policy in policies.values()}
     first = list(agents_of.items())[:MAX_POLICIES]
-    shown = "; ".join(_policy_summary(policy, agents, metrics) for policy, agents in first)
+    summaries = "; ".join(_policy_summary(policy, agents, metrics) for policy, agents in first)
     more = len(agents_of) - MAX_POLICIES
-    return f"{shown}; {more} more" if more > 0 else shown
+    return f"{summaries}; {more} more" if more > 0 else summaries
 
 
 def opponent_summary(metrics: Mapping[str, Any]) -> str:
@@ -102,8 +102,8 @@ def opponent_summary(metrics: Mapping[str, Any]) -> str:
     shares = {name.rpartition("/")[0]: value for name, value in metrics.items() if _is_opponent_share(name)}
     scores = {name: metrics[f"{name}/score"] for name in shares if f"{name}/score" in metrics}
     frequent = sorted(scores, key=lambda opponent: shares[opponent], reverse=True)[:MAX_OPPONENTS]
-    shown = [f"{scores[name]:.0%} against {name.removeprefix(OPPONENT_PREFIX)}" for name in frequent]
-    return f"; score {', '.join(shown)}" if shown else ""
+    score_texts = [f"{scores[name]:.0%} against {name.removeprefix(OPPONENT_PREFIX)}" for name in frequent]
+    return f"; score {', '.join(score_texts)}" if score_texts else ""
 
 
 def _is_opponent_share(name: str) -> bool:
@@ -111,8 +111,8 @@ def _is_opponent_share(name: str) -> bool:
 
 
 def _policy_summary(policy: str, agents: Sequence[str], metrics: Mapping[str, Any]) -> str:
-    shown = (("length", ".1f"), ("entropy", ".2f"))
-    values = [f"{name} {metrics[key]:{form}}" for name, form in shown if (key := f"{policy}/{name}") in metrics]
+    formats = (("length", ".1f"), ("entropy", ".2f"))
+    values = [f"{name} {metrics[key]:{form}}" for name, form in formats if (key := f"{policy}/{name}") in metrics]
     if f"{policy}/return" in metrics:
         values.insert(0, _return(metrics[f"{policy}/return"], agents, metrics))
     return f"{policy}: " + (", ".join(values) or "no finished episode yet")
@@ -129,21 +129,23 @@ def _return(mean: float, agents: Sequence[str], metrics: Mapping[str, Any]) -> s
 
 
 def _pace(metrics: Mapping[str, Any], done: float) -> str:
-    left = metrics["seconds"] * (1 - done) / done if done else 0.0
+    remaining_seconds = metrics["seconds"] * (1 - done) / done if done else 0.0
     speed = f"{metrics['steps_per_second']:,.0f} steps/s{_shares(metrics)}  " if "steps_per_second" in metrics else ""
-    return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(left)} left"
+    return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(remaining_seconds)} left"
 
 
 def _shares(metrics: Mapping[str, Any]) -> str:
     """Return the shares of sampling and learning in the wall time since the last report."""
     seconds = {name: metrics[name] for name in (*PHASES, OTHER_TIME) if name in metrics}
     total = sum(seconds.values())
-    shown = [f"{seconds[name] / total:.0%} {name.removeprefix('time/')}" for name in SHOWN_PHASES if name in seconds]
-    return f" ({', '.join(shown)})" if shown else ""
+    phase_shares = [
+        f"{seconds[name] / total:.0%} {name.removeprefix('time/')}" for name in SHOWN_PHASES if name in seconds
+    ]
+    return f" ({', '.join(phase_shares)})" if phase_shares else ""
 
 
 def clock(seconds: float) -> str:
     """Format seconds as minutes and seconds, with hours if needed."""
-    minutes, rest = divmod(int(seconds), 60)
+    minutes, remainder = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{remainder:02d}" if hours else f"{minutes}:{remainder:02d}"

@@ -75,7 +75,9 @@ def pin_opponents(
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for written, is_opponent in dict.fromkeys(found for each in (config, *trials) for found in _references(each)):
+    for written, is_opponent in dict.fromkeys(
+        reference for variant in (config, *trials) for reference in _references(variant)
+    ):
         ref = parse_ref(of_league(written, config.league))
         if isinstance(ref, RemoteRef):
             ref = fixed_version(ref, interface)
@@ -89,11 +91,11 @@ def pin_opponents(
 def _references(config: LeagueConfig) -> list[tuple[str, bool]]:
     """The fixed opponents, the version of the magnet, and the teacher; each with whether it is an opponent."""
     settings = config.training
-    found: list[tuple[str | None, bool]] = [(opponent.ref, True) for opponent in settings.opponents.fixed]
+    references: list[tuple[str | None, bool]] = [(opponent.ref, True) for opponent in settings.opponents.fixed]
     if isinstance(settings, PPOConfig):
-        found.append((settings.magnet.version if settings.magnet else None, False))
-        found.append((settings.teacher.ref if settings.teacher else None, False))
-    return [(ref, is_opponent) for ref, is_opponent in found if ref is not None]
+        references.append((settings.magnet.version if settings.magnet else None, False))
+        references.append((settings.teacher.ref if settings.teacher else None, False))
+    return [(ref, is_opponent) for ref, is_opponent in references if ref is not None]
 
 
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
@@ -105,7 +107,8 @@ def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
 
     settings = config.training
     changes: JSON = {
-        "opponents": settings.opponents.model_dump() | {"fixed": [pinned(each) for each in settings.opponents.fixed]}
+        "opponents": settings.opponents.model_dump()
+        | {"fixed": [pinned(opponent) for opponent in settings.opponents.fixed]}
     }
     if isinstance(settings, PPOConfig):
         parts = {"magnet": settings.magnet, "teacher": settings.teacher}
@@ -186,8 +189,8 @@ class RunDirectory:
         """
         pins = pins or {}
         config = with_pins(config, pins)
-        now = datetime.now(UTC)
-        path = _runs(storage, config.league) / (name or f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}")  # OWN_ID
+        started_at = datetime.now(UTC)
+        path = _runs(storage, config.league) / (name or f"{started_at:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}")  # OWN_ID
         record = RunRecord(
             config=config,
             pins=pins,
@@ -195,7 +198,7 @@ class RunDirectory:
             parent_steps=parent_steps,
             exploits=exploits,
             git_commit=git_commit,
-            started_at=now,
+            started_at=started_at,
         )
         run = cls(path, record)
         with disk_errors(path):
@@ -231,8 +234,8 @@ class RunDirectory:
         Raises NotFound; ConfigError if `config` differs; AlreadyRunning if it is trained on another machine.
         """
         records = _records(registry, config.league)
-        own = (path for path, record in records.items() if record.role == role and OWN_ID.fullmatch(path.name))
-        newest = max(own, default=None)
+        paths = (path for path, record in records.items() if record.role == role and OWN_ID.fullmatch(path.name))
+        newest = max(paths, default=None)
         if newest is None:
             raise NotFound(
                 f"league {config.league} has no training run with the role {role}, neither in"
@@ -279,8 +282,8 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Return complete, unpublished checkpoints by their steps."""
-        found = self.path.glob(f"{ATTEMPT}*/{CHECKPOINTS}/*")
-        return sorted((path for path in found if path.name.isdigit()), key=lambda path: int(path.name))
+        paths = self.path.glob(f"{ATTEMPT}*/{CHECKPOINTS}/*")
+        return sorted((path for path in paths if path.name.isdigit()), key=lambda path: int(path.name))
 
     def remove_checkpoints(self) -> None:
         """Delete the checkpoints of earlier attempts, complete or not, after all complete ones are published."""
@@ -306,12 +309,12 @@ def _records(registry: Registry, league: str, run: str | None = None) -> dict[Pa
     The registry has the newer record of a run that another machine trained last.
     """
     runs = _runs(registry.storage, league)
-    found = {file.parent: _record(file.read_text(), str(file)) for file in runs.glob(f"*/{RUN_FILE}")}
+    records = {file.parent: _record(file.read_text(), str(file)) for file in runs.glob(f"*/{RUN_FILE}")}
     for stored in registry.runs.stored(league, run):
-        if runs / stored.id not in found or not is_local(stored.driver):
+        if runs / stored.id not in records or not is_local(stored.driver):
             record = stored.record | {"complete": stored.state == "ended"}
-            found[runs / stored.id] = _record(record, f"run {stored.id} in the registry")
-    return found
+            records[runs / stored.id] = _record(record, f"run {stored.id} in the registry")
+    return records
 
 
 def _record(found: str | dict[str, Any], source: str) -> RunRecord:
@@ -328,19 +331,19 @@ def _wait_for_other_machine(registry: Registry, league: str, run: str) -> None:
 
     Raises AlreadyRunning if it sends another heartbeat.
     """
-    before: StoredRun | None = None
+    previous_run: StoredRun | None = None
     while stored := registry.runs.stored(league, run):
-        (now,) = stored
-        if now.state != RUNNING or is_local(now.driver):
+        (current_run,) = stored
+        if current_run.state != RUNNING or is_local(current_run.driver):
             return
-        if before is None:
+        if previous_run is None:
             logger.warning(
                 "training run %s was running on %s; waiting for up to %.0f s to see whether it is still",
-                *(run, host_name(now.driver), HEARTBEAT_TIMEOUT.total_seconds()),
+                *(run, host_name(current_run.driver), HEARTBEAT_TIMEOUT.total_seconds()),
             )
-        elif now.heartbeat_at != before.heartbeat_at:
-            raise AlreadyRunning(f"training run {run} is running on {host_name(now.driver)}")
-        before = now
+        elif current_run.heartbeat_at != previous_run.heartbeat_at:
+            raise AlreadyRunning(f"training run {run} is running on {host_name(current_run.driver)}")
+        previous_run = current_run
         time.sleep(POLL)
 
 

@@ -67,8 +67,10 @@ def _check_nodes(learner: Mapping[str, float], runner: Mapping[str, float], runn
     most = -1
     for place, node in enumerate(nodes):
         if all(node.get(name, 0.0) >= amount for name, amount in learner.items()):
-            rest = {name: node.get(name, 0.0) - learner.get(name, 0.0) for name in node}
-            most = max(most, sum(_fitting(runner, each) for each in [*nodes[:place], rest, *nodes[place + 1 :]]))
+            leftover = {name: node.get(name, 0.0) - learner.get(name, 0.0) for name in node}
+            most = max(
+                most, sum(_fitting(runner, resources) for resources in [*nodes[:place], leftover, *nodes[place + 1 :]])
+            )
     if most < runners:
         what = f"the learner needs {_listed(learner)}" if most < 0 else f"{runners} runners need {_listed(runner)} each"
         have = "; ".join(_listed({name: node.get(name, 0.0) for name in ("CPU", "GPU")}) for node in nodes)

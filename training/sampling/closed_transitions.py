@@ -86,7 +86,7 @@ class PolicyTransitions:
                 np.zeros(self._num_envs * n, dtype=bool),
                 np.ones(self._num_envs * n, dtype=bool),
                 recurrent_state={
-                    key: np.stack([each] * self._num_envs * n) for key, each in self._initial.get(policy, {}).items()
+                    key: np.stack([state] * self._num_envs * n) for key, state in self._initial.get(policy, {}).items()
                 },
             )
             for policy, n in self._sizes.items()
@@ -104,14 +104,14 @@ class PolicyTransitions:
         dist_inputs: NDArray,  # noqa: ARG002
         state: Mapping[str, NDArray] | None,
     ) -> None:
-        own = self._open[policy]
-        for key, kept in own.recurrent_state.items():
+        open_transitions = self._open[policy]
+        for key, kept in open_transitions.recurrent_state.items():
             assert state is not None, "a recurrent policy has a state"
-            kept[own.places] = state[key]
-        if own.actions is None:
-            own.actions = np.zeros((len(own.is_open), *raw.shape[1:]), raw.dtype)
-        own.actions[own.places] = raw
-        own.is_open[own.places] = True
+            kept[open_transitions.places] = state[key]
+        if open_transitions.actions is None:
+            open_transitions.actions = np.zeros((len(open_transitions.is_open), *raw.shape[1:]), raw.dtype)
+        open_transitions.actions[open_transitions.places] = raw
+        open_transitions.is_open[open_transitions.places] = True
 
     def cut(self) -> dict[str, TransitionBlock]:
         """Return policy id → transitions completed since the last cut; policies without any are left out."""
@@ -122,13 +122,13 @@ class PolicyTransitions:
     def close(self, turn: Turn) -> dict[str, TransitionBlock]:
         """Return the transitions that a turn completes, and store its rows as the latest observations."""
         for policy, n in self._sizes.items():
-            left = (turn.crashed[:, np.newaxis] * n + np.arange(n)).ravel()
-            self._open[policy].is_open[left] = False
-            self._open[policy].is_first[left] = True
+            crashed_places = (turn.crashed[:, np.newaxis] * n + np.arange(n)).ravel()
+            self._open[policy].is_open[crashed_places] = False
+            self._open[policy].is_first[crashed_places] = True
         closed: dict[str, list[TransitionBlock]] = {policy: [] for policy in self._policies}
         self._close_endings(turn, closed)
-        for own in self._open.values():
-            own.places = own.places[:0]
+        for open_transitions in self._open.values():
+            open_transitions.places = open_transitions.places[:0]
         for group, batch in turn.batches.items():
             if group >= len(self._policies):
                 continue
@@ -143,11 +143,11 @@ class PolicyTransitions:
         for rows in turn.endings:
             policies = self._policy_of[rows.agents]
             for number in np.unique(policies).tolist():
-                policy, own = self._policies[number], np.flatnonzero(policies == number)
-                places = rows.envs[own] * self._sizes[policy] + self._number[rows.agents[own]]
-                observations = {name: array[own] for name, array in rows.observations.items()}
-                rewards, terminated = rows.rewards[own].astype(np.float32), rows.terminations[own]
-                truncated = rows.truncations[own] & ~terminated
+                policy, indices = self._policies[number], np.flatnonzero(policies == number)
+                places = rows.envs[indices] * self._sizes[policy] + self._number[rows.agents[indices]]
+                observations = {name: array[indices] for name, array in rows.observations.items()}
+                rewards, terminated = rows.rewards[indices].astype(np.float32), rows.terminations[indices]
+                truncated = rows.truncations[indices] & ~terminated
                 self._close(policy, places, observations, rewards, terminated, truncated, closed)
                 self._open[policy].is_open[places] = False
                 self._open[policy].is_first[places] = True
@@ -162,34 +162,35 @@ class PolicyTransitions:
         truncated: NDArray,
         closed: dict[str, list[TransitionBlock]],
     ) -> None:
-        own = self._open[policy]
-        chosen = np.flatnonzero(own.is_open[places])
-        if not len(chosen):
+        open_transitions = self._open[policy]
+        indices = np.flatnonzero(open_transitions.is_open[places])
+        if not len(indices):
             return
-        places = places[chosen]
-        assert own.actions is not None, "an open place has acted"
-        rows = {f"{OBSERVATIONS}/{name}": seen[places] for name, seen in own.observations.items()}
-        rows |= {f"{RECURRENT_STATE}/{key}": before[places] for key, before in own.recurrent_state.items()}
-        rows |= {ACTIONS: own.actions[places], REWARDS: rewards[chosen]}
-        rows |= {TERMINATED: terminated[chosen], TRUNCATED: truncated[chosen]}
+        places = places[indices]
+        assert open_transitions.actions is not None, "an open place has acted"
+        rows = {f"{OBSERVATIONS}/{name}": column[places] for name, column in open_transitions.observations.items()}
+        rows |= {f"{RECURRENT_STATE}/{key}": before[places] for key, before in open_transitions.recurrent_state.items()}
+        rows |= {ACTIONS: open_transitions.actions[places], REWARDS: rewards[indices]}
+        rows |= {TERMINATED: terminated[indices], TRUNCATED: truncated[indices]}
         rows |= {
-            f"{NEXT}{OBSERVATIONS}/{name}": observations[name][chosen].astype(seen.dtype, copy=False)
-            for name, seen in own.observations.items()
+            f"{NEXT}{OBSERVATIONS}/{name}": observations[name][indices].astype(column.dtype, copy=False)
+            for name, column in open_transitions.observations.items()
         }
         streams = self._stream_offset * self._sizes[policy] + places
-        closed[policy].append(TransitionBlock(rows, streams, own.is_first[places]))
-        own.is_first[places] = False
-        own.is_open[places] = False
+        closed[policy].append(TransitionBlock(rows, streams, open_transitions.is_first[places]))
+        open_transitions.is_first[places] = False
+        open_transitions.is_open[places] = False
 
     def _observe(self, policy: str, places: NDArray, observations: Rows) -> None:
-        own = self._open[policy]
-        if not own.observations:
-            own.observations = {
-                name: np.zeros((len(own.is_open), *rows.shape[1:]), rows.dtype) for name, rows in observations.items()
+        open_transitions = self._open[policy]
+        if not open_transitions.observations:
+            open_transitions.observations = {
+                name: np.zeros((len(open_transitions.is_open), *rows.shape[1:]), rows.dtype)
+                for name, rows in observations.items()
             }
         for name, rows in observations.items():
-            own.observations[name][places] = rows
-        own.places = places
+            open_transitions.observations[name][places] = rows
+        open_transitions.places = places
 
     def sizes(self) -> dict[str, int]:
         """Return policy id → number of its agents, n_p."""
@@ -198,7 +199,8 @@ class PolicyTransitions:
     def still_open(self, envs: NDArray) -> bool:
         """Return whether an agent of these environments has acted and has no next observation yet."""
         return any(
-            own.is_open.reshape(self._num_envs, self._sizes[policy])[envs].any() for policy, own in self._open.items()
+            open_transitions.is_open.reshape(self._num_envs, self._sizes[policy])[envs].any()
+            for policy, open_transitions in self._open.items()
         )
 
 
@@ -229,15 +231,15 @@ class JointTransitions:
 
     def read(self, turn: Turn) -> None:
         """Raises EnvironmentMismatch if agents take turns."""
-        own = self._own.close(turn)
-        if own:
-            envs = np.unique(np.concatenate([self._envs_of(policy, block) for policy, block in own.items()]))
+        blocks = self._own.close(turn)
+        if blocks:
+            envs = np.unique(np.concatenate([self._envs_of(policy, block) for policy, block in blocks.items()]))
             if self._own.still_open(envs):
                 raise EnvironmentMismatch(
                     "the agents of one step receive their next observations at different times: joint transitions"
                     " require an environment in which all agents act at once"
                 )
-            self._closed.append(self._joint_rows(envs, own, turn))
+            self._closed.append(self._joint_rows(envs, blocks, turn))
         self._keep_states(turn)
 
     def act(
@@ -263,10 +265,10 @@ class JointTransitions:
             rows[f"{PRESENT}/{policy}"] = np.zeros((len(envs), n), dtype=bool)
             rows[f"{PRESENT}/{policy}"][places] = True
             for name, column in block.rows.items():
-                head, _, rest = name.partition("/")
+                head, _, tail = name.partition("/")
                 whole = np.zeros((len(envs), n, *column.shape[1:]), column.dtype)
                 whole[places] = column
-                rows["/".join(filter(None, (head, policy, rest)))] = whole
+                rows["/".join(filter(None, (head, policy, tail)))] = whole
         if self.keeps_states:
             rows |= self._with_states(envs, rows, turn)
         return TransitionBlock(rows, self._stream_offset + envs, firsts)
@@ -321,9 +323,9 @@ def concatenate(blocks: Sequence[TransitionBlock]) -> TransitionBlock:
 
 def _empty_block(spaces: AgentInterface, initial: Mapping[str, NDArray]) -> TransitionBlock:
     """Return the columns of a policy without rows."""
-    seen = {name: np.zeros((0, *leaf.shape), leaf.dtype) for name, leaf in inputs(spaces.observation).items()}
-    rows: Rows = {f"{OBSERVATIONS}/{name}": column for name, column in seen.items()}
-    rows |= {f"{RECURRENT_STATE}/{key}": np.zeros((0, *each.shape), each.dtype) for key, each in initial.items()}
+    columns = {name: np.zeros((0, *leaf.shape), leaf.dtype) for name, leaf in inputs(spaces.observation).items()}
+    rows: Rows = {f"{OBSERVATIONS}/{name}": column for name, column in columns.items()}
+    rows |= {f"{RECURRENT_STATE}/{key}": np.zeros((0, *state.shape), state.dtype) for key, state in initial.items()}
     match spaces.action:
         case Discrete():
             rows[ACTIONS] = np.zeros(0, np.int64)
@@ -332,7 +334,7 @@ def _empty_block(spaces: AgentInterface, initial: Mapping[str, NDArray]) -> Tran
         case Box(shape=shape):
             rows[ACTIONS] = np.zeros((0, math.prod(shape)), np.float32)
     rows |= {REWARDS: np.zeros(0, np.float32), TERMINATED: np.zeros(0, bool), TRUNCATED: np.zeros(0, bool)}
-    rows |= {f"{NEXT}{OBSERVATIONS}/{name}": column for name, column in seen.items()}
+    rows |= {f"{NEXT}{OBSERVATIONS}/{name}": column for name, column in columns.items()}
     return TransitionBlock(rows, np.zeros(0, np.int64), np.zeros(0, bool))
 
 

@@ -113,7 +113,7 @@ class MultiCategorical:
 
     def log_p(self, inputs: NDArray, raw: NDArray) -> NDArray:
         parts = zip(self._split(inputs), raw.T, strict=True)
-        return np.sum([part.log_p(of, chosen) for (part, of), chosen in parts], axis=0)
+        return np.sum([part.log_p(of, column) for (part, of), column in parts], axis=0)
 
     def entropy(self, inputs: NDArray) -> NDArray:
         return np.sum([part.entropy(of) for part, of in self._split(inputs)], axis=0)

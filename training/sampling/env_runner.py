@@ -312,7 +312,7 @@ def one_thread() -> Iterator[None]:
 
 def initial_states(module: MultiRLModule) -> dict[str, dict[str, NDArray]]:
     """Return policy id → initial recurrent state; empty if not recurrent."""
-    return {policy: _arrays(each.get_initial_state()) for policy, each in module.items()}
+    return {policy: _arrays(policy_module.get_initial_state()) for policy, policy_module in module.items()}
 
 
 def _arrays(state: Mapping[str, Any]) -> dict[str, NDArray]:

@@ -57,7 +57,7 @@ def as_episodes(chunks: EpisodeChunks, agents: Sequence[str]) -> Iterator[Single
     for number, (stop, length) in enumerate(zip(stops, chunks.lengths.tolist(), strict=True)):
         steps = slice(stop - length, stop)
         # Each earlier chunk has one observation more than steps.
-        seen = slice(stop - length + number, stop + number + 1)
+        observation_rows = slice(stop - length + number, stop + number + 1)
         outputs = {
             Columns.ACTION_LOGP: ChunkColumn(chunks.log_p[steps]),
             Columns.ACTION_DIST_INPUTS: ChunkColumn(chunks.dist_inputs[steps]),
@@ -73,7 +73,7 @@ def as_episodes(chunks: EpisodeChunks, agents: Sequence[str]) -> Iterator[Single
             multi_agent_episode_id=id_,
             t_started=int(chunks.started[number]),
             len_lookback_buffer=0,
-            observations=ChunkColumn({name: array[seen] for name, array in chunks.observations.items()}),
+            observations=ChunkColumn({name: array[observation_rows] for name, array in chunks.observations.items()}),
             infos=ChunkColumn([NO_INFO] * (length + 1)),
             actions=ChunkColumn(chunks.actions[steps]),
             rewards=ChunkColumn(chunks.rewards[steps]),

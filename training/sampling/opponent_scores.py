@@ -57,13 +57,13 @@ class OpposedGames:
             games += [first[:count], second[:count]]
             partners += [second[:count], first[:count]]
             waiting += [first[count:][-MOST_WAITING:], second[count:][-MOST_WAITING:]]
-        whole, others = self[np.concatenate(games)], self.other[np.concatenate(partners)]
-        return replace(whole, other=others), self[np.concatenate(waiting)]
+        whole, partner_returns = self[np.concatenate(games)], self.other[np.concatenate(partners)]
+        return replace(whole, other=partner_returns), self[np.concatenate(waiting)]
 
     def scores(self) -> NDArray[np.float64]:
         """Return the learner's score in each game, (m,)."""
-        own = self.own[:, np.newaxis]
-        return np.where(own > self.other, 1.0, np.where(own == self.other, 0.5, 0.0)).mean(axis=1)
+        own_returns = self.own[:, np.newaxis]
+        return np.where(own_returns > self.other, 1.0, np.where(own_returns == self.other, 0.5, 0.0)).mean(axis=1)
 
 
 def _no_games(others: int) -> OpposedGames:
@@ -71,7 +71,7 @@ def _no_games(others: int) -> OpposedGames:
 
 
 def _concatenated(games: Sequence[OpposedGames]) -> OpposedGames:
-    return OpposedGames(*(np.concatenate([getattr(each, name) for each in games]) for name in OpposedGames.__slots__))
+    return OpposedGames(*(np.concatenate([getattr(part, name) for part in games]) for name in OpposedGames.__slots__))
 
 
 def is_scored(scoring: Scoring, sides: int) -> bool:
@@ -140,5 +140,5 @@ class OpponentScores:
             [np.sort(self._returns[envs][:, members], axis=1).mean(axis=1) for members in self._members], axis=1
         )
         is_own = np.arange(len(self._members)) == sides[:, np.newaxis]
-        others = of_sides[~is_own].reshape(len(envs), -1)
-        return OpposedGames(self.opponents[envs], sides, of_sides[is_own], others)
+        other_returns = of_sides[~is_own].reshape(len(envs), -1)
+        return OpposedGames(self.opponents[envs], sides, of_sides[is_own], other_returns)

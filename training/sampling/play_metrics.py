@@ -180,7 +180,7 @@ class PlayMetrics:
                 metrics.log_value((NUM_AGENT_STEPS_SAMPLED, name), steps, reduce="sum")
                 metrics.log_value((NUM_AGENT_STEPS_SAMPLED_LIFETIME, name), steps, reduce="lifetime_sum")
         for policy in dict.fromkeys(self._policies):
-            agents = [index for index, own in enumerate(self._policies) if own == policy]
+            agents = [index for index, agent_policy in enumerate(self._policies) if agent_policy == policy]
             _log_means(metrics, EPISODE_MODULE_RETURN_MEAN, EPISODE_MODULE_LEN_MEAN, policy, episodes, agents)
 
     def _clear(self) -> None:

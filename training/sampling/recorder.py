@@ -174,7 +174,7 @@ class ChunkBuilder:
         is_seen = np.repeat(is_whole, steps + 1)
         is_acted, is_rewarded = is_seen.copy(), is_seen.copy()
         is_acted[layout.lasts] = is_rewarded[layout.firsts] = False
-        seen, acted = layout.rows[is_seen], layout.rows[is_acted]
+        observation_rows, action_rows = layout.rows[is_seen], layout.rows[is_acted]
         # The last element is for open chunks.
         terminated = np.append(_joined([end.terminated for end in ends], np.bool_), False)
         truncated = np.append(_joined([end.truncated for end in ends], np.bool_), False)
@@ -184,12 +184,12 @@ class ChunkBuilder:
             agents=layout.slots[is_whole] % self._agents,
             started=layout.started[is_whole],
             lengths=steps[is_whole],
-            observations={name: array[seen] for name, array in observations.items()},
-            actions=played[ACTIONS][acted],
-            log_p=played[LOG_P][acted],
-            dist_inputs=played[DIST_INPUTS][acted],
+            observations={name: array[observation_rows] for name, array in observations.items()},
+            actions=played[ACTIONS][action_rows],
+            log_p=played[LOG_P][action_rows],
+            dist_inputs=played[DIST_INPUTS][action_rows],
             state={
-                name.removeprefix(STATE_PREFIX): column[acted]
+                name.removeprefix(STATE_PREFIX): column[action_rows]
                 for name, column in played.items()
                 if name.startswith(STATE_PREFIX)
             },

@@ -117,12 +117,12 @@ def sweep(
     leagues = [applied(config, settings) for settings in trials]
     pins = {} if interrupted else pin_opponents(config, registry, interface, leagues)
     with connected(address, registry.storage, local) as dashboard:
-        this = interrupted or SweepDirectory.begin(registry.storage, config, pins, trials, git_commit(config_path))
-        with this.locked(), SweepProgress(console or Console(), this, config.sweep.mode) as progress:
+        directory = interrupted or SweepDirectory.begin(registry.storage, config, pins, trials, git_commit(config_path))
+        with directory.locked(), SweepProgress(console or Console(), directory, config.sweep.mode) as progress:
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
-            errors = _run(this, interface, registry, progress)
-        return _conclude(this, errors, interface, registry, publish_best)
+            errors = _run(directory, interface, registry, progress)
+        return _conclude(directory, errors, interface, registry, publish_best)
 
 
 def _conclude(
@@ -149,8 +149,8 @@ def _conclude(
 
 
 def _check(config: LeagueConfig, sweep: SweepConfig, trials: list[Settings], interface: Interface) -> None:
-    if sweep.metric not in (known := metrics.metric_names(interface, config.training.algorithm)):
-        raise ConfigError(f"sweep.metric: unknown metric {sweep.metric!r}; expected one of {', '.join(sorted(known))}")
+    if sweep.metric not in (names := metrics.metric_names(interface, config.training.algorithm)):
+        raise ConfigError(f"sweep.metric: unknown metric {sweep.metric!r}; expected one of {', '.join(sorted(names))}")
     for settings in trials:
         try:
             check(applied(config, settings), interface)

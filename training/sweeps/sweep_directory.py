@@ -81,10 +81,14 @@ class SweepDirectory:
         git_commit: str | None,
     ) -> Self:
         """Create the directory of a new sweep. trials: the settings of each."""
-        now = datetime.now(UTC)
-        path = _sweeps(storage, config.league) / f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+        started_at = datetime.now(UTC)
+        path = _sweeps(storage, config.league) / f"{started_at:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         record = SweepRecord(
-            config=with_pins(config, pins), pins=pins, trials=tuple(trials), git_commit=git_commit, started_at=now
+            config=with_pins(config, pins),
+            pins=pins,
+            trials=tuple(trials),
+            git_commit=git_commit,
+            started_at=started_at,
         )
         with disk_errors(path):
             path.mkdir(parents=True)
@@ -122,8 +126,8 @@ class SweepDirectory:
 
     def checkpoint(self, number: int) -> Path | None:
         """Return the newest complete checkpoint of a trial."""
-        found = (path for path in (self.trial(number) / CHECKPOINTS).glob("*") if path.name.isdigit())
-        return max(found, key=lambda path: int(path.name), default=None)
+        paths = (path for path in (self.trial(number) / CHECKPOINTS).glob("*") if path.name.isdigit())
+        return max(paths, key=lambda path: int(path.name), default=None)
 
     def outcome(self, number: int) -> TrialOutcome | None:
         """Return the result of a trial, if it has ended."""

@@ -50,9 +50,9 @@ class SweepProgress(ProgressDisplay):
     def _show(self) -> None:
         scores = {number: score for number, score in self._scores.items() if score is not None}
         best = max(scores, key=lambda number: self._sign * scores[number], default=None)
-        shown = "" if best is None else f"best: trial {best} with {format_score(scores[best])}"
+        summary = "" if best is None else f"best: trial {best} with {format_score(scores[best])}"
         description = f"{self._over} of {len(self._trials)} trials"
-        self._bars.update(self._bar, completed=sum(self._done.values()), description=description, best=shown)
+        self._bars.update(self._bar, completed=sum(self._done.values()), description=description, best=summary)
 
 
 def format_settings(settings: Settings) -> str:

@@ -75,28 +75,28 @@ class Examiner:
 
         Raises what the environment raises; `place` is then where.
         """
-        found, adapter, budget = self._found, adapter_for(self._env, self._checks), self._budget
+        examination, adapter, budget = self._found, adapter_for(self._env, self._checks), self._budget
         began = time.perf_counter()
         first: list[Episode] = []
         while len(first) < episodes and not (first and budget.is_spent(FIRST)):
             first.append(self._first_episode(adapter, seed + len(first), f"episode {len(first) + 1} of {episodes}"))
-        found.lengths = [episode.steps for episode in first]
-        found.steps_per_second = sum(found.lengths) / (time.perf_counter() - began)
+        examination.lengths = [episode.steps for episode in first]
+        examination.steps_per_second = sum(examination.lengths) / (time.perf_counter() - began)
         is_whole = all(episode.is_whole for episode in first)
-        found.actions_per_episode = max(episode.actions for episode in first) if is_whole else None
+        examination.actions_per_episode = max(episode.actions for episode in first) if is_whole else None
         if budget.is_spent(FIRST) and (len(first) < episodes or not is_whole):
             cut = "" if is_whole else f", the last one only to step {first[-1].steps}"
             budget.skipped.append(f"{len(first)} of {episodes} episodes were played{cut}")
         self._check_seeding(adapter, first, seed)
         traces = [episode.trace for episode in first]
-        check_constant_observations(traces, self._env, found)
+        check_constant_observations(traces, self._env, examination)
         if is_whole:
-            _check_endings(traces, found)
+            _check_endings(traces, examination)
         self._check_returns(adapter, first, seed + episodes)
-        found.openings = measure_openings(adapter, self._spaces, seed, budget, OPENINGS)
-        if found.openings is None:
+        examination.openings = measure_openings(adapter, self._spaces, seed, budget, OPENINGS)
+        if examination.openings is None:
             budget.skipped.append("random openings were not measured")
-        _check_openings(self._config.play.opening_plies, found)
+        _check_openings(self._config.play.opening_plies, examination)
 
     def _first_episode(self, adapter: EnvAdapter, seed: int, doing: str) -> Episode:
         episode = self._episode(adapter, seed, doing, self._most, share=FIRST)

@@ -59,52 +59,54 @@ def examine(
     Returns:
         The findings, with the lengths of the episodes, the speed and the effect of random openings.
     """
-    found, budget = Examination(), TimeBudget(seconds, progress)
+    examination, budget = Examination(), TimeBudget(seconds, progress)
     try:
-        found.implementation = implementation(config.environment).reason
+        examination.implementation = implementation(config.environment).reason
         env = build(config.environment)
         interface = describe(env, config)
     except LeagueError as error:
-        found.add("fault", str(error))
-        return found
+        examination.add("fault", str(error))
+        return examination
     except Exception as error:
-        found.add("fault", f"{config.environment.entry_point} cannot be created{cause(error)}")
-        return found
-    found.api = "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
-    found.agents = len(interface.agents)
-    found.policies = describe_policies(interface)
-    found.actions = describe_selection(config, interface)
+        examination.add("fault", f"{config.environment.entry_point} cannot be created{cause(error)}")
+        return examination
+    examination.api = (
+        "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
+    )
+    examination.agents = len(interface.agents)
+    examination.policies = describe_policies(interface)
+    examination.actions = describe_selection(config, interface)
     for agent, spaces in interface.agents.items():
         if not _is_supported(spaces.action):
-            found.add(
+            examination.add(
                 "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
             )
-    found.interface = interface
-    if not found.passed:
+    examination.interface = interface
+    if not examination.passed:
         env.close()
-        return found
-    examiner = Examiner(env, interface, config, found, steps, budget)
+        return examination
+    examiner = Examiner(env, interface, config, examination, steps, budget)
     try:
         examiner.examine(episodes, seed)
     except InvalidReturn as error:
-        found.add("fault", f"{error} ({examiner.place})")
+        examination.add("fault", f"{error} ({examiner.place})")
     except LeagueError as error:
-        found.add("fault", str(error))
+        examination.add("fault", str(error))
     except Exception as error:
-        found.add("fault", _explained(error, config, seed, str(examiner.place)))
+        examination.add("fault", _explained(error, config, seed, str(examiner.place)))
     finally:
         env.close()
-    if found.passed:
-        _run_pettingzoo_tests(config.environment, found, budget)
-    if found.passed:
-        _compare_vectorised(config.environment, interface, found, seed)
+    if examination.passed:
+        _run_pettingzoo_tests(config.environment, examination, budget)
+    if examination.passed:
+        _compare_vectorised(config.environment, interface, examination, seed)
     if budget.skipped:
-        found.add(
+        examination.add(
             "note",
             f"the checks were cut short after {seconds:.0f} s, because the environment takes"
-            f" {1 / found.steps_per_second:.2g} s per step: {', '.join(budget.skipped)} (--seconds)",
+            f" {1 / examination.steps_per_second:.2g} s per step: {', '.join(budget.skipped)} (--seconds)",
         )
-    return found
+    return examination
 
 
 def _explained(error: Exception, config: LeagueConfig, seed: int, place: str) -> str:

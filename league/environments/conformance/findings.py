@@ -48,8 +48,8 @@ class Finding:
         text = f"{self.text}; first: {self.example}" if self.example else self.text
         if not self.agents:
             return text
-        first, *others = self.agents
-        return f"{first}{f' and {len(others)} more' if others else ''}: {text}"
+        first, *other_agents = self.agents
+        return f"{first}{f' and {len(other_agents)} more' if other_agents else ''}: {text}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +123,11 @@ class Examination:
 
     def add(self, severity: Severity, text: str, agent: str | None = None, example: str = "") -> None:
         """Add a finding, or an agent to an equal finding, which keeps its first example."""
-        known = next((each for each in self.findings if (each.severity, each.text) == (severity, text)), None)
-        if known is None:
-            known = Finding(severity, text, example=example)
-            self.findings.append(known)
-        if agent is not None and agent not in known.agents:
-            known.agents.append(agent)
+        finding = next(
+            (candidate for candidate in self.findings if (candidate.severity, candidate.text) == (severity, text)), None
+        )
+        if finding is None:
+            finding = Finding(severity, text, example=example)
+            self.findings.append(finding)
+        if agent is not None and agent not in finding.agents:
+            finding.agents.append(agent)

@@ -118,9 +118,9 @@ def check_constant_observations(traces: Sequence[Trace], env: Any, found: Examin
     A constant image is a fault; a constant vector is a note, because a game may have a single state.
     """
     for index, agent in enumerate(env.possible_agents):
-        seen = [[observation for reporting, observation, *_ in trace if reporting == index] for trace in traces]
-        turns = max(map(len, seen))
-        if turns < ENOUGH_TURNS or any(len(set(own[len(own) // 2 :])) > 1 for own in seen):
+        histories = [[observation for reporting, observation, *_ in trace if reporting == index] for trace in traces]
+        turns = max(map(len, histories))
+        if turns < ENOUGH_TURNS or any(len(set(history[len(history) // 2 :])) > 1 for history in histories):
             continue
         space = observation_space(env, agent)
         if isinstance(space, gymnasium.spaces.Box) and len(space.shape) > 1:

@@ -94,24 +94,24 @@ def propose(
     environment: JSON = {"entry_point": entry_point} | ({"kwargs": kwargs} if kwargs else {})
     document = {"league": league, "environment": environment, "folder": folder}
     config = LeagueConfig.from_mapping(document, source=entry_point)
-    found = examine(config, seconds=seconds, progress=progress)
-    faults = [str(finding) for finding in found.findings if finding.severity == "fault"]
-    if faults or found.interface is None:
+    examination = examine(config, seconds=seconds, progress=progress)
+    faults = [str(finding) for finding in examination.findings if finding.severity == "fault"]
+    if faults or examination.interface is None:
         raise ConfigError(f"{entry_point} cannot be a league's environment: {'; '.join(faults)}")
-    team = found.is_team if is_team is None else is_team
+    team = examination.is_team if is_team is None else is_team
     if team:
-        one_side = found.interface.model_copy(update={"sides": {"team": tuple(found.interface.agents)}})
-        found.actions = describe_selection(config, one_side)
+        one_side = examination.interface.model_copy(update={"sides": {"team": tuple(examination.interface.agents)}})
+        examination.actions = describe_selection(config, one_side)
     lines = [
         *_header(config, environment, shown),
-        *_policies(found.interface, team),
-        *_play(config, found, found.interface, team),
-        *_training(found, found.interface, team),
+        *_policies(examination.interface, team),
+        *_play(config, examination, examination.interface, team),
+        *_training(examination, examination.interface, team),
         *_gate(),
     ]
     text = "\n".join(map(str, lines)) + "\n"
     proposed = LeagueConfig.from_mapping(yaml.safe_load(text) | {"folder": document["folder"]}, source="the proposal")
-    return Proposal(text, proposed, found)
+    return Proposal(text, proposed, examination)
 
 
 def _header(config: LeagueConfig, environment: JSON, shown: str | None) -> Iterator[_Line]:
@@ -130,9 +130,9 @@ def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
     yield _Line()
     yield _Line("policies:", "policy → its agents; each policy is one network")
     for policy in interface.policy_ids:
-        own = [agent for agent in interface.agents if interface.policies[agent] == policy]
-        space = interface.agents[own[0]].action
-        yield _Line(f"  {policy}: {_inline(_patterns(own, list(interface.agents)))}", _described(space))
+        policy_agents = [agent for agent in interface.agents if interface.policies[agent] == policy]
+        space = interface.agents[policy_agents[0]].action
+        yield _Line(f"  {policy}: {_inline(_patterns(policy_agents, list(interface.agents)))}", _described(space))
     yield _Line()
     if is_team:
         yield _Line("sides:", "side → its agents; the sides are opponents")
@@ -168,11 +168,12 @@ def _play(config: LeagueConfig, found: Examination, interface: Interface, is_tea
 
 def _training(found: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
     turns = found.actions_per_episode
-    others = _other_algorithms(interface, found.api)
+    alternatives = _other_algorithms(interface, found.api)
     yield _Line()
     yield _Line("training:", "league train")
     yield _Line(
-        "  algorithm: ppo", f"also possible: {', '.join(others)}" if others else "the only one for these spaces"
+        "  algorithm: ppo",
+        f"also possible: {', '.join(alternatives)}" if alternatives else "the only one for these spaces",
     )
     yield _Line("  steps: 1_000_000", "budget: actions of all agents")
     yield _Line("  minutes: null", "time limit; the earlier of the two ends training")
@@ -236,14 +237,14 @@ def _described(space: Space) -> str:
 def _other_algorithms(interface: Interface, api: str) -> list[str]:
     """Algorithms other than PPO for the action spaces, see docs/training.md."""
     actions = [spaces.action for spaces in interface.agents.values()]
-    found = []
+    algorithms = []
     if all(isinstance(action, Discrete) for action in actions):
-        found.append("dqn")
+        algorithms.append("dqn")
         if api != "AEC" and len(interface.policy_ids) == 1:
-            found.append("qmix (a team)")
+            algorithms.append("qmix (a team)")
     if api != "AEC" and all(isinstance(action, Discrete | Box) for action in actions):
-        found.append("maddpg")
-    return found
+        algorithms.append("maddpg")
+    return algorithms
 
 
 def _observed(space: Any) -> list[Leaf]:

@@ -28,6 +28,6 @@ class TimeBudget:
 
     def report(self, doing: str) -> None:
         """Report what is done now."""
-        if self._progress is not None and (now := time.monotonic()) - self._reported >= REPORT_EVERY:
-            self._reported = now
+        if self._progress is not None and (current_time := time.monotonic()) - self._reported >= REPORT_EVERY:
+            self._reported = current_time
             self._progress(doing)

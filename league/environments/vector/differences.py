@@ -47,10 +47,12 @@ def check_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> None:
 
 def _other_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> EnvironmentsDiffer:
     """The first row of another copy or agent."""
-    expected, found = (list(zip(rows.envs.tolist(), rows.agents.tolist(), strict=True)) for rows in (stock, vector))
-    row = next((row for row, pair in enumerate(expected) if found[row : row + 1] != [pair]), len(expected))
-    has = f"of copy {found[row][0]}, agent {found[row][1]}" if row < len(found) else "missing"
-    should = f"of {where.text(*expected[row])}" if row < len(expected) else "missing"
+    stock_pairs, vector_pairs = (
+        list(zip(rows.envs.tolist(), rows.agents.tolist(), strict=True)) for rows in (stock, vector)
+    )
+    row = next((row for row, pair in enumerate(stock_pairs) if vector_pairs[row : row + 1] != [pair]), len(stock_pairs))
+    has = f"of copy {vector_pairs[row][0]}, agent {vector_pairs[row][1]}" if row < len(vector_pairs) else "missing"
+    should = f"of {where.text(*stock_pairs[row])}" if row < len(stock_pairs) else "missing"
     return EnvironmentsDiffer(f"row {row} is {has}, in the stock environment {should}")
 
 
@@ -65,8 +67,10 @@ def check_column(column: str, stock: NDArray, vector: NDArray, name: Callable[[i
         return
     differs = (_bits(stock) != _bits(vector)).any(axis=-1)
     row, *index = np.argwhere(differs)[0].tolist()
-    found, expected = (array[(row, *index)].item() for array in (vector, stock))
-    raise EnvironmentsDiffer(f"{name(row)}: {column}{index or ''} is {found!r}, in the stock environment {expected!r}")
+    vector_value, stock_value = (array[(row, *index)].item() for array in (vector, stock))
+    raise EnvironmentsDiffer(
+        f"{name(row)}: {column}{index or ''} is {vector_value!r}, in the stock environment {stock_value!r}"
+    )
 
 
 def _bits(array: NDArray) -> NDArray[np.uint8]:

@@ -140,8 +140,8 @@ class DifferentialTest:
     def step(self, env_ids: NDArray[np.int64], actions: NDArray) -> None:
         """Step some copies of both. actions: as for VectorEnv.step. No call if `env_ids` is empty."""
         acting = self._must_act[env_ids]
-        each = iter(environment_actions(actions, self._agents[0].action))
-        moves = [[(int(agent), next(each)) for agent in np.flatnonzero(row)] for row in acting]
+        action_iterator = iter(environment_actions(actions, self._agents[0].action))
+        moves = [[(int(agent), next(action_iterator)) for agent in np.flatnonzero(row)] for row in acting]
         self._steps[env_ids] += 1
         self._call(env_ids, self._vector.step, actions, lambda row, env: self._stock[env].step(moves[row]))
         self.steps += len(env_ids)
@@ -192,12 +192,12 @@ class DifferentialTest:
         self.stock_seconds += perf_counter() - began
         lent = given.copy()
         began = perf_counter()
-        found = call(env_ids.copy(), lent)
+        blocks = call(env_ids.copy(), lent)
         self.vector_seconds += perf_counter() - began
         # The caller may reuse its arrays: a reference in the environment's state would be a fault.
         lent[...] = 0
         self._must_act[env_ids] = False
-        self._check_reports(self._stock_blocks(reports), found)
+        self._check_reports(self._stock_blocks(reports), blocks)
         self._check_states(env_ids)
         self.is_over[env_ids] = ~self._must_act[env_ids].any(axis=1)
 
@@ -220,15 +220,15 @@ class DifferentialTest:
         names = tuple(agent.name for agent in self._agents)
         if (agents := tuple(self._vector.possible_agents)) != names:
             raise EnvironmentsDiffer(f"possible_agents is {agents}, in the stock environment {names}")
-        self.rows = found = [rows for rows in reported if len(rows.envs)]
-        if len(found) != len(expected):
+        self.rows = blocks = [rows for rows in reported if len(rows.envs)]
+        if len(blocks) != len(expected):
             raise EnvironmentsDiffer(
-                f"{len(found)} AgentRows have rows, expected {len(expected)}: one per observation space"
+                f"{len(blocks)} AgentRows have rows, expected {len(expected)}: one per observation space"
             )
         where = RowNames(names, self._seeds.copy(), self._steps.copy())
-        for stock, vector in zip(expected, found, strict=True):
+        for stock, vector in zip(expected, blocks, strict=True):
             check_rows(stock, vector, where)
-        self._earlier.append(lambda: self._check_unchanged(expected, found, where))
+        self._earlier.append(lambda: self._check_unchanged(expected, blocks, where))
         if len(self._earlier) > KEPT:
             self._earlier.popleft()()
 
@@ -257,10 +257,10 @@ def _agents(env: Any) -> list[_Agent]:
     spaces: list[Space] = []
     agents = []
     for name in env.possible_agents:
-        own = agent_interface(env, name)
-        if own.observation not in spaces:
-            spaces.append(own.observation)
-        agents.append(_Agent(name, own.observation, own.action, spaces.index(own.observation)))
+        interface = agent_interface(env, name)
+        if interface.observation not in spaces:
+            spaces.append(interface.observation)
+        agents.append(_Agent(name, interface.observation, interface.action, spaces.index(interface.observation)))
     return agents
 
 

@@ -23,9 +23,9 @@ def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds
     """
     rng = np.random.default_rng(seed)
     copies = np.arange(vector.num_envs)
-    steps, taken = 0, 0.0
+    steps, duration = 0, 0.0
     rows = list(vector.reset(copies, rng.integers(2**31, size=len(copies))))
-    while taken < seconds:
+    while duration < seconds:
         drawn = _draw(rows, actions, rng)
         began = perf_counter()
         rows = list(vector.step(copies, drawn))
@@ -34,9 +34,9 @@ def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds
             over[block.envs[~block.has_ended]] = False
         if len(ended := np.flatnonzero(over)):
             rows += vector.reset(ended, rng.integers(2**31, size=len(ended)))
-        taken += perf_counter() - began
+        duration += perf_counter() - began
         steps += len(copies)
-    return steps / taken
+    return steps / duration
 
 
 def _draw(rows: list[AgentRows], actions: list[Space], rng: np.random.Generator) -> NDArray:
@@ -46,7 +46,7 @@ def _draw(rows: list[AgentRows], actions: list[Space], rng: np.random.Generator)
         acting = np.flatnonzero(~block.has_ended)
         mask = block.observations.get(ACTION_MASK)
         for agent in np.unique(block.agents[acting]).tolist():
-            own = acting[block.agents[acting] == agent]
-            drawn.append(random_actions(actions[agent], len(own), None if mask is None else mask[own], rng))
-            places.append(block.envs[own] * len(actions) + agent)
+            indices = acting[block.agents[acting] == agent]
+            drawn.append(random_actions(actions[agent], len(indices), None if mask is None else mask[indices], rng))
+            places.append(block.envs[indices] * len(actions) + agent)
     return np.concatenate(drawn)[np.argsort(np.concatenate(places), kind="stable")]

@@ -13,14 +13,14 @@ def random_actions(space: Space, count: int, mask: NDArray | None, rng: np.rando
     """Draw `count` actions from `space`, (count, …). mask: (count, n), or None if all actions are legal."""
     match space:
         case Discrete():
-            chosen = rng.integers(space.n, size=count) if mask is None else random_choices(mask, rng)
-            return (space.start + chosen).astype(space.dtype)
+            indices = rng.integers(space.n, size=count) if mask is None else random_choices(mask, rng)
+            return (space.start + indices).astype(space.dtype)
         case MultiDiscrete():
             choices = np.asarray(space.nvec).ravel()
             allowed = np.ones((count, choices.sum()), dtype=np.int8) if mask is None else mask
             parts = np.split(allowed, np.cumsum(choices)[:-1], axis=1)
-            chosen = np.stack([random_choices(part, rng) for part in parts], axis=1)
-            return (np.asarray(space.start) + chosen.reshape(count, *space.shape)).astype(space.dtype)
+            indices = np.stack([random_choices(part, rng) for part in parts], axis=1)
+            return (np.asarray(space.start) + indices.reshape(count, *space.shape)).astype(space.dtype)
         case MultiBinary():
             return rng.integers(2, size=(count, *space.shape)).astype(space.dtype)
         case Box(dtype=dtype) if np.dtype(dtype).kind != "f":

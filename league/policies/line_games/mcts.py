@@ -67,12 +67,12 @@ class MCTS:
 
 def _position(game: LineGame, board: NDArray) -> str:
     """Return OpenSpiel's JSON for a board (rows, columns, 2) of the player to act."""
-    own, other = (int(board[..., player].sum()) for player in (0, 1))
-    if other - own not in (0, 1) or board.sum(axis=2).max() > 1:
+    own_count, other_count = (int(board[..., player].sum()) for player in (0, 1))
+    if other_count - own_count not in (0, 1) or board.sum(axis=2).max() > 1:
         raise ObservationError(
-            f"observation is not a position of {NAMES[game]}: {own} own pieces and {other} of the opponent"
+            f"observation is not a position of {NAMES[game]}: {own_count} own pieces and {other_count} of the opponent"
         )
-    marks = ("x", "o") if own == other else ("o", "x")
+    marks = ("x", "o") if own_count == other_count else ("o", "x")
     squares = np.where(board[..., 0] != 0, marks[0], np.where(board[..., 1] != 0, marks[1], "."))
     position = {"current_player": marks[0], "is_terminal": False, "winner": ""}
     # OpenSpiel lists the rows of connect four from the bottom.

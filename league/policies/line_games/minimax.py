@@ -27,10 +27,10 @@ class BatchedMinimax:
 
     def positions(self, boards: NDArray) -> tuple[Bitboards, Bitboards]:
         """Return the bitboards of boards (k, rows, columns, 2), two (k,) uint64."""
-        own, other = (
+        own_bitboards, other_bitboards = (
             (boards[..., player].reshape(-1, len(self._bits)) != 0).astype(np.uint64) @ self._bits for player in (0, 1)
         )
-        return own, other
+        return own_bitboards, other_bitboards
 
     def values(self, own: Bitboards, other: Bitboards, plies: int) -> NDArray[np.int8]:
         """Return the value of each move, if the rest of the search is played best.

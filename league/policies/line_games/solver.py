@@ -29,8 +29,10 @@ class LineGameSolver:
 
     def position(self, board: NDArray) -> tuple[int, int]:
         """Return the bitboards of a board (rows, columns, 2)."""
-        own, other = (self._bits @ (board[..., player].ravel() != 0).astype(np.uint64) for player in (0, 1))
-        return int(own), int(other)
+        own_bitboard, other_bitboard = (
+            self._bits @ (board[..., player].ravel() != 0).astype(np.uint64) for player in (0, 1)
+        )
+        return int(own_bitboard), int(other_bitboard)
 
     def outcomes(self, own: int, other: int) -> dict[int, int]:
         """Return each legal action with its outcome under best play: 1 for a win, 0 for a draw, −1 for a loss."""

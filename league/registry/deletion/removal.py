@@ -105,15 +105,15 @@ class RemovalRepository(Repository):
         """Return what the removal of a version removes. Raises UnknownLeague, UnknownVersion or UnknownAlias."""
         with self._database.read() as session:
             version = versions.resolve(session, ref)
-            found = _dependents_of_version(session, version.league, version.number)
-            matches = _count_matches(session, _matches_of(version.ref, found))
+            dependents = _dependents_of_version(session, version.league, version.number)
+            matches = _count_matches(session, _matches_of(version.ref, dependents))
         return RemovalPlan(
             version.ref,
             {version.number: self._artifacts.size(version.league, version.number)},
-            tuple(found.aliases),
-            tuple(found.verdicts),
+            tuple(dependents.aliases),
+            tuple(dependents.verdicts),
             matches,
-            reasons=tuple(found.reasons),
+            reasons=tuple(dependents.reasons),
         )
 
     def plan_league(self, league: str) -> RemovalPlan:
@@ -156,9 +156,9 @@ class RemovalRepository(Repository):
             versions.require(session, target.league, target.version)
             _require_idle(session, target.league)
             _require_no_member(session, target.league, target.version)
-            found = _dependents_of_version(session, target.league, target.version)
-            _require_free(plan.target, found.reasons, force)
-            _delete_dependents(session, target.league, target.version, found, actor)
+            dependents = _dependents_of_version(session, target.league, target.version)
+            _require_free(plan.target, dependents.reasons, force)
+            _delete_dependents(session, target.league, target.version, dependents, actor)
         self._publisher.sweep(target.league)
         return plan
 
@@ -202,19 +202,19 @@ class RemovalRepository(Repository):
 
 def _dependents_of_version(session: Session, league: str, number: int) -> _Dependents:
     """Find what depends on a version: aliases, verdicts, recorded matches, other versions, runs and traffic."""
-    ref, found = f"{league}@{number}", _Dependents()
-    found.aliases += session.scalars(
+    ref, dependents = f"{league}@{number}", _Dependents()
+    dependents.aliases += session.scalars(
         select(AliasTable.name).filter_by(league=league, version=number).order_by(AliasTable.name)
     )
     for row in session.scalars(select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at)):
         verdict = detached(VerdictRow, row)
         if ref in verdict.contestants:
-            found.verdicts.append(verdict.id)
-            found.schedules |= set(verdict.schedules)
+            dependents.verdicts.append(verdict.id)
+            dependents.schedules |= set(verdict.schedules)
     documents = session.execute(select(ScheduleTable.id, ScheduleTable.document).filter_by(league=league))
-    found.played = {id_ for id_, document in documents if ref in json.loads(document)["contestants"]}
-    found.played -= found.schedules
-    matches = _count_matches(session, _matches_of(ref, found))
+    dependents.played = {id_ for id_, document in documents if ref in json.loads(document)["contestants"]}
+    dependents.played -= dependents.schedules
+    matches = _count_matches(session, _matches_of(ref, dependents))
     children = session.scalars(_ready(league).filter_by(parent=number)).all()
     exploiters = session.scalars(_ready(league).filter_by(exploits=ref)).all()
     uses = or_(RunTable.parent == number, RunTable.exploits == ref)
@@ -222,20 +222,20 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     nights = session.scalars(select(NightlyRunTable).filter_by(league=league, ended_at=None)).all()
     setting = traffic.current_setting(session, league)
     portions = {"canary": setting.canary, "shadow": setting.shadow}
-    names = {number, *found.aliases}
-    found.portions = [name for name, portion in portions.items() if portion and portion.version in names]
-    found.reasons = [
-        *(f"the alias {name} points to it" for name in found.aliases),
-        *(f"it is the {name}" for name in found.portions),
-        *(f"it is a member of the mixture @{each}" for each in _mixtures_of(session, league, number)),
-        *_counted(len(found.verdicts), "verdict", map(short_verdict, found.verdicts)),
+    names = {number, *dependents.aliases}
+    dependents.portions = [name for name, portion in portions.items() if portion and portion.version in names]
+    dependents.reasons = [
+        *(f"the alias {name} points to it" for name in dependents.aliases),
+        *(f"it is the {name}" for name in dependents.portions),
+        *(f"it is a member of the mixture @{mixture}" for mixture in _mixtures_of(session, league, number)),
+        *_counted(len(dependents.verdicts), "verdict", map(short_verdict, dependents.verdicts)),
         *_counted(matches, "recorded match", plural="recorded matches"),
         *(f"nightly run {night.id} tests it" for night in nights if number in night.candidates),
         *_counted(len(children), "version trained from it", _refs(children), "versions trained from it"),
         *_counted(len(exploiters), "exploiter of it", _refs(exploiters), "exploiters of it"),
         *_counted(len(started), "training run that uses it", started, "training runs that use it"),
     ]
-    return found
+    return dependents
 
 
 def _delete_dependents(session: Session, league: str, number: int, found: _Dependents, actor: str) -> None:
@@ -300,9 +300,9 @@ def _delete_calls(session: Session, league: str) -> None:
 
 def _require_idle(session: Session, league: str) -> None:
     """Raise Conflict while the league is trained or evaluated."""
-    now = datetime.now(UTC)
+    current_time = datetime.now(UTC)
     for run in runs.active(session, league):
-        if now - run.heartbeat_at < runs.HEARTBEAT_TIMEOUT:
+        if current_time - run.heartbeat_at < runs.HEARTBEAT_TIMEOUT:
             raise Conflict(f"training run {run.id} of league {league} is active: stop it first, or wait for its end")
     for evaluation in evaluations.active(session, league):
         raise Conflict(f"evaluation {evaluation.id} of league {league} is {evaluation.state}: stop it, or wait")
@@ -312,15 +312,15 @@ def _require_no_member(session: Session, league: str, number: int) -> None:
     """Raise Conflict if the version is a member of a mixture, which could not play without it."""
     if containing := _mixtures_of(session, league, number):
         raise Conflict(
-            f"{league}@{number} is a member of {', '.join(f'{league}@{each}' for each in containing)}:"
+            f"{league}@{number} is a member of {', '.join(f'{league}@{mixture}' for mixture in containing)}:"
             " remove the mixture first"
         )
 
 
 def _mixtures_of(session: Session, league: str, number: int) -> list[int]:
     numbers = session.scalars(select(VersionTable.number).filter_by(league=league, state=READY)).all()
-    found = versions.mixtures(session, league, numbers)
-    return sorted(each for each, mixture in found.items() if number in mixture.versions)
+    mixtures = versions.mixtures(session, league, numbers)
+    return sorted(mixture_number for mixture_number, mixture in mixtures.items() if number in mixture.versions)
 
 
 def _require_free(target: str, reasons: Sequence[str], force: bool) -> None:

@@ -273,9 +273,9 @@ def before(deadline: float) -> Iterator[None]:
 
 
 def _milliseconds_until(deadline: float) -> int:
-    if (left := deadline - time.monotonic()) <= 0:
+    if (seconds := deadline - time.monotonic()) <= 0:
         raise DeadlineExceeded("the database was busy until the deadline: nothing was changed")
-    return max(1, int(1000 * left))
+    return max(1, int(1000 * seconds))
 
 
 class Repository:
@@ -432,10 +432,10 @@ def _check_file(_: object, record: ConnectionPoolEntry, __: object) -> None:
 
 def _identity(path: str) -> tuple[int, int] | None:
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _postgresql(url: str, listens: bool) -> Engine:

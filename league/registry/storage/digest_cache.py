@@ -52,13 +52,13 @@ class DigestCache:
         self._evict(path)
 
     def _evict(self, newest: Path) -> None:
-        found = []
+        entries = []
         for path in self._directory.iterdir():
             with suppress(FileNotFoundError):
                 state = path.stat()
-                found.append((state.st_mtime_ns, state.st_size, path))
-        excess = sum(size for _, size, _ in found) - self._limit
-        for _, size, path in sorted(found):
+                entries.append((state.st_mtime_ns, state.st_size, path))
+        excess = sum(size for _, size, _ in entries) - self._limit
+        for _, size, path in sorted(entries):
             if excess <= 0:
                 return
             if path != newest:

@@ -52,15 +52,15 @@ def apply_once(
     """
     if call is None:
         return change()
-    now = datetime.now(UTC)
-    session.execute(delete(IdempotentCallTable).where(IdempotentCallTable.at < now - KEPT))
-    known = session.get(IdempotentCallTable, (call.owner, call.key))
-    if known is not None and known.digest == call.digest:
+    called_at = datetime.now(UTC)
+    session.execute(delete(IdempotentCallTable).where(IdempotentCallTable.at < called_at - KEPT))
+    earlier_call = session.get(IdempotentCallTable, (call.owner, call.key))
+    if earlier_call is not None and earlier_call.digest == call.digest:
         # Equal digests are equal requests, so the stored result is of the kind that `change` returns.
-        return load(getattr(known, column))
-    if known is None:
+        return load(getattr(earlier_call, column))
+    if earlier_call is None:
         result = change()
-        values = {"owner": call.owner, "key": call.key, "digest": call.digest, column: result.id, "at": now}
+        values = {"owner": call.owner, "key": call.key, "digest": call.digest, column: result.id, "at": called_at}
         if insert(session, IdempotentCallTable, [values]):
             return result
     raise KeyReused(f"the Idempotency-Key {call.key!r} was used for another call: use a new key for each change")

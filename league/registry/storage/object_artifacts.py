@@ -141,24 +141,24 @@ class ObjectArtifactStore(ArtifactStore):
 
     def _download(self, manifest: Manifest, name: str, target: Path) -> None:
         """Stream a file to `target`."""
-        shown, digest = label(manifest.league, manifest.version, name), None
+        file_label, digest = label(manifest.league, manifest.version, name), None
         with disk_errors(target), self._errors(), _missing_is_none():
-            found = self._store.get(f"{self._key(manifest.league, manifest.version)}/{name}")
+            response = self._store.get(f"{self._key(manifest.league, manifest.version)}/{name}")
             target.parent.mkdir(parents=True, exist_ok=True)
             hashed = hashlib.sha256()
             with target.open("wb") as file:
-                for chunk in found.stream():
+                for chunk in response.stream():
                     hashed.update(chunk)
                     file.write(chunk)
             digest = hashed.hexdigest()
-        check_digest(shown, manifest.files[name], digest)
+        check_digest(file_label, manifest.files[name], digest)
 
     def _objects(self, prefix: str) -> list[tuple[str, int]]:
         """Return key and size of the objects whose key starts with `prefix`."""
         directory = prefix.rpartition("/")[0]
         with self._errors():
-            found = [(each["path"], each["size"]) for page in self._store.list(directory) for each in page]
-        return [(key, size) for key, size in found if key.startswith(prefix)]
+            objects = [(meta["path"], meta["size"]) for page in self._store.list(directory) for meta in page]
+        return [(key, size) for key, size in objects if key.startswith(prefix)]
 
     def _delete(self, prefix: str) -> None:
         keys = [key for key, _ in self._objects(prefix)]

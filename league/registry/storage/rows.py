@@ -345,7 +345,7 @@ class VerdictRow:
     @property
     def tested_schedules(self) -> list[str]:
         """Ids of the schedules whose results decide the verdict, in order."""
-        return [self.schedule, *(each.schedule for each in self.companions.ready)]
+        return [self.schedule, *(test.schedule for test in self.companions.ready)]
 
     @property
     def contestants(self) -> set[str]:

@@ -53,18 +53,20 @@ class RunRepository(Repository):
         starts from. exploits: the version that an exploiter is trained against. record: what another machine needs to
         continue the run, see `stored`. Raises UnknownLeague.
         """
-        now = datetime.now(UTC)
+        started_at = datetime.now(UTC)
         with self._database.write() as session:
             leagues.require(session, league)
             row = session.get(RunTable, (league, run), with_for_update=True)
             if row is None:
-                row = RunTable(league=league, id=run, attempts=0, seconds=0.0, curves={}, spacing=0, began_at=now)
+                row = RunTable(
+                    league=league, id=run, attempts=0, seconds=0.0, curves={}, spacing=0, began_at=started_at
+                )
                 session.add(row)
             row.algorithm, row.settings, row.seed, row.target, row.parent = algorithm, settings, seed, target, parent
             row.exploits, row.record, row.driver = exploits, record, this_process()
             row.state, row.error, row.ended_at = RUNNING, None, None
             row.attempts += 1
-            row.steps, row.heartbeat_at = steps, now
+            row.steps, row.heartbeat_at = steps, started_at
             session.flush()
             session.execute(delete(RunPointTable).filter_by(league=league, run=run).where(RunPointTable.steps > steps))
             return _row(row)
@@ -106,12 +108,14 @@ class RunRepository(Repository):
         if league:
             query = query.filter_by(league=league)
         with self._database.read() as session:
-            found = list(session.scalars(query.where(table.id.startswith(run, autoescape=True)))) if run else []
-            exact = [row for row in found if row.id == run]
-            if len(found := exact or found) == 1:
-                return _row(found[0])
-            listed = ", ".join(f"{row.league}/{row.id}" for row in found or session.scalars(query.limit(MAX_LISTED)))
-        if found:
+            candidates = list(session.scalars(query.where(table.id.startswith(run, autoescape=True)))) if run else []
+            exact = [row for row in candidates if row.id == run]
+            if len(candidates := exact or candidates) == 1:
+                return _row(candidates[0])
+            listed = ", ".join(
+                f"{row.league}/{row.id}" for row in candidates or session.scalars(query.limit(MAX_LISTED))
+            )
+        if candidates:
             raise InvalidReference(f"training run {text!r} is ambiguous: {listed}")
         raise UnknownRun(f"there is no training run {text!r}; newest: {listed or 'none yet'}")
 
@@ -144,10 +148,10 @@ class RunRepository(Repository):
         with self._database.read() as session:
             leagues.require(session, league)
             with_records = query.options(undefer(table.record)).where(table.driver.is_not(None))
-            found = session.scalars(with_records.limit(MAX_STORED))
+            rows = session.scalars(with_records.limit(MAX_STORED))
             return [
                 StoredRun(row.id, _state(row), row.driver, row.heartbeat_at, row.record)
-                for row in found
+                for row in rows
                 if row.driver is not None and row.record is not None
             ]
 
@@ -155,8 +159,8 @@ class RunRepository(Repository):
         """Return league → number of active training runs, of the leagues that have any."""
         alive = (RunTable.state == RUNNING) & (RunTable.heartbeat_at >= datetime.now(UTC) - HEARTBEAT_TIMEOUT)
         with self._database.read() as session:
-            found = session.execute(select(RunTable.league, func.count()).where(alive).group_by(RunTable.league))
-            return dict(found.tuples().all())
+            rows = session.execute(select(RunTable.league, func.count()).where(alive).group_by(RunTable.league))
+            return dict(rows.tuples().all())
 
     def points(self, league: str, run: str) -> list[RunPoint]:
         """Return the points of a run's curves, sorted by steps, fewer than MAX_POINTS.
@@ -178,8 +182,8 @@ def active(session: Session, league: str) -> tuple[RunRow, ...]:
 
 def is_trained(session: Session, league: str) -> bool:
     """Whether a run of the league sends heartbeats."""
-    now = datetime.now(UTC)
-    return any(now - run.heartbeat_at < HEARTBEAT_TIMEOUT for run in active(session, league))
+    current_time = datetime.now(UTC)
+    return any(current_time - run.heartbeat_at < HEARTBEAT_TIMEOUT for run in active(session, league))
 
 
 def _get(session: Session, league: str, run: str) -> RunRow:

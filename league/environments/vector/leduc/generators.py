@@ -42,8 +42,8 @@ def outputs(seeds: NDArray[np.int64], count: int) -> NDArray[np.uint32]:
     same generator (MT19937) and has the same initialisation, but takes half the time.
     """
     generator = random.Random(0)
-    found = bytearray()
+    buffer = bytearray()
     for seed in seeds.tolist():
         generator.seed(int.from_bytes(sha512(b"%d" % seed).digest()[:8], "little"))
-        found += generator.getrandbits(32 * count).to_bytes(4 * count, "little")
-    return np.frombuffer(found, dtype="<u4").reshape(len(seeds), count)
+        buffer += generator.getrandbits(32 * count).to_bytes(4 * count, "little")
+    return np.frombuffer(buffer, dtype="<u4").reshape(len(seeds), count)

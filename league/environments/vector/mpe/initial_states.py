@@ -19,14 +19,14 @@ def goals_and_positions(
         return np.zeros((goals, len(seeds)), dtype=np.int64), positions_only(seeds, entities)
     outputs = pcg64.outputs(seeds, 1 + 2 * entities)
     halves = np.stack([outputs[0], outputs[0] >> 32])[:goals]
-    chosen, accepted = pcg64.integers(halves, landmarks)
+    goal_landmarks, accepted = pcg64.integers(halves, landmarks)
     positions = pcg64.uniform(outputs[1:], -1.0, 1.0)
     for i in np.flatnonzero(~accepted.all(axis=0)):
         # At most one seed in four billion: NumPy draws again.
         generator = np.random.default_rng(int(seeds[i]))
-        chosen[:, i] = [generator.integers(landmarks) for _ in range(goals)]
+        goal_landmarks[:, i] = [generator.integers(landmarks) for _ in range(goals)]
         positions[:, i] = generator.uniform(-1.0, 1.0, 2 * entities)
-    return chosen, positions.reshape(entities, 2, -1)
+    return goal_landmarks, positions.reshape(entities, 2, -1)
 
 
 def positions_only(seeds: NDArray[np.int64], entities: int) -> NDArray[np.float64]:

@@ -121,5 +121,5 @@ class ParticleEnv(VectorEnv):
 
 def relative(positions: NDArray[np.float64], agent: int, entities: slice | NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the positions of entities relative to an agent, (2 · entities, n)."""
-    others = positions[entities]
-    return (others - positions[agent]).reshape(2 * len(others), positions.shape[-1])
+    entity_positions = positions[entities]
+    return (entity_positions - positions[agent]).reshape(2 * len(entity_positions), positions.shape[-1])

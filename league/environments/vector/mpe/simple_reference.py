@@ -51,6 +51,6 @@ class SimpleReference(ParticleEnv):
 
     def rewards(self, particles: Particles) -> NDArray[np.float64]:
         """Mix both agents' mean with each agent's own reward, which is for the distance of the other from its goal."""
-        own = -lengths(particles.positions[[1, 0]] - self.goal_positions(particles))
-        common = (0.0 + own[0] + own[1]) / 2
-        return common * (1 - self._local_ratio) + own * self._local_ratio
+        own_rewards = -lengths(particles.positions[[1, 0]] - self.goal_positions(particles))
+        common = (0.0 + own_rewards[0] + own_rewards[1]) / 2
+        return common * (1 - self._local_ratio) + own_rewards * self._local_ratio

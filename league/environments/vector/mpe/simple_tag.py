@@ -52,8 +52,8 @@ class SimpleTag(ParticleEnv):
 
     def observation(self, particles: Particles, agent: int) -> Sequence[NDArray[Any]]:
         """See ParticleEnv."""
-        velocities, others = particles.velocities, self.others[agent]
-        good = others[others >= self._adversaries]
+        velocities, other_agents = particles.velocities, self.others[agent]
+        good = other_agents[other_agents >= self._adversaries]
         return (
             velocities[agent],
             particles.positions[agent],
