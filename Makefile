@@ -55,6 +55,7 @@ check: setup
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/generate_sync_client.py --check
 	$(BIN)/python scripts/generate_module_index.py --check
+	$(BIN)/python scripts/check_names.py
 
 fix: setup
 	$(BIN)/ruff format .
