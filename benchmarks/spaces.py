@@ -9,6 +9,8 @@ import argparse
 import functools
 import json
 import multiprocessing
+import re
+import resource
 import sys
 import tempfile
 import traceback
@@ -554,9 +556,13 @@ def main() -> int:
                 if outcome.failure:
                     print(f"FAILED {_case(outcome.seed)}\n  {outcome.failure}", flush=True)
             outcomes += part
+        pool.close()
+        pool.join()
     accepted = [outcome for outcome in outcomes if outcome.refusal is None]
     failed = [outcome for outcome in outcomes if outcome.failure]
-    print(f"{len(outcomes)} cases from seed {options.seed}, {perf_counter() - began:.0f} s")
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    print(f"{len(outcomes)} cases from seed {options.seed}, {perf_counter() - began:.0f} s", end="")
+    print(f" ({used.ru_utime + used.ru_stime:.0f} s of processor time)")
     print(f"accepted {len(accepted)} ({len(accepted) / len(outcomes):.0%}), failed after that {len(failed)}")
     print(f"refused {len(outcomes) - len(accepted)}:")
     for reason, count in Counter(_reason(outcome.refusal) for outcome in outcomes if outcome.refusal).most_common():
@@ -565,8 +571,11 @@ def main() -> int:
 
 
 def _reason(refusal: str) -> str:
-    """Return a refusal without its numbers and names."""
-    return refusal[:140]
+    """Return a refusal without its numbers and names: `has N choices: expected at most N`."""
+    text = re.sub(r"^(agent )?player_\d( and \d more)?:? ", "", refusal)
+    text = re.sub(r"space (\w+)\(.*\) (is|has) ", r"space \1 \2 ", text)
+    text = re.sub(r" in observation.*: training needs", ": training needs", text)
+    return re.sub(r"\d[\d.,]*(e[+]\d+)?", "N", text)[:140]
 
 
 if __name__ == "__main__":
