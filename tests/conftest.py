@@ -23,6 +23,9 @@ from tests.support.servers import postgresql
 # Tests do not measure time: other load on the machine must not make one fail.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+# By default Ray's workers have niceness 15: next to four busy processes they get a fiftieth of a core, and a training
+# run that takes half a minute was not ready after ten.
+os.environ.setdefault("RAY_worker_niceness", "0")
 
 ROOT = Path(__file__).parents[1]
 SHARED = ("ray_session", "ray_server")
