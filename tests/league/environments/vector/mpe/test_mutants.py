@@ -129,7 +129,12 @@ ADVERSARY = [
 TAG = [
     Fault("simple_tag", "obstacles, -0.9, 0.9", "obstacles, -1.0, 1.0", "simple_tag"),
     Fault("simple_tag", "GOOD_SPEED = 1.0, 1.3", "GOOD_SPEED = 1.0, 1.0", "simple_tag"),
-    Fault("simple_tag", "others[others >= self._adversaries]", "others[others < self._adversaries]", "simple_tag"),
+    Fault(
+        "simple_tag",
+        "other_agents[other_agents >= self._adversaries]",
+        "other_agents[other_agents < self._adversaries]",
+        "simple_tag",
+    ),
     Fault("simple_tag", "distances < 0.9", "distances <= 0.95", "simple_tag"),
     Fault("simple_tag", "np.exp(2 * distances[outside] - 2)", "np.exp(distances[outside] - 1) ** 2", "simple_tag"),
     Fault("simple_tag", "- horizontal - vertical", "- horizontal + vertical", "simple_tag"),
@@ -140,7 +145,7 @@ REFERENCE = [
     Fault("simple_reference", "particles.positions[[1, 0]]", "particles.positions[[0, 1]]", "simple_reference"),
     Fault("simple_reference", "particles.goals[agent]", "particles.goals[1 - agent]", "simple_reference"),
     Fault("simple_reference", "particles.messages[1 - agent]", "particles.messages[agent]", "simple_reference"),
-    Fault("simple_reference", "own[1]) / 2", "own[1])", "simple_reference"),
+    Fault("simple_reference", "own_rewards[1]) / 2", "own_rewards[1])", "simple_reference"),
     Fault("simple_reference", "COLORS.take", "COLORS[::-1].take", "simple_reference"),
 ]
 
