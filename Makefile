@@ -54,7 +54,6 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/generate_sync_client.py --check
-	$(BIN)/python scripts/generate_module_index.py --check
 	$(BIN)/python scripts/check_names.py
 
 fix: setup
@@ -66,12 +65,10 @@ bench: setup
 
 # The documentation as a site, in build/site. Fails on a broken link.
 docs: setup
-	$(BIN)/python scripts/generate_module_index.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 generate: setup protocol
 	$(BIN)/python scripts/generate_sync_client.py
-	$(BIN)/python scripts/generate_module_index.py
 
 # The messages of gRPC, in a descriptor pool of their own: a process may hold others of the same names (tritonclient's).
 PROTOCOL := serve_app/inference_protocol

@@ -1,7 +1,8 @@
 """MkDocs hooks: pages link to files of the repository, and the site contains what they link to.
 
-CONTRIBUTING.md and CHANGELOG.md become pages. Every other file outside of `docs/` that a page links to becomes a page
-with its source. A link to a file that does not exist stays as it is, so that the strict build fails.
+CONTRIBUTING.md and CHANGELOG.md become pages, and the page Modules is made from docstrings. Every other file outside of
+`docs/` that a page links to becomes a page with its source. A link to a file that does not exist stays as it is, so
+that the strict build fails.
 """
 
 import posixpath
@@ -11,6 +12,7 @@ from pathlib import Path
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
+from module_index import page as module_index
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -24,6 +26,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     linked = {path for file in files.documentation_pages() for path in _links(file.content_string, DOCS / file.src_uri)}
     for name in PAGES:
         linked |= set(_links((ROOT / name).read_text(), ROOT / name))
+    files.append(File.generated(config, "modules.md", content=module_index()))
     for name, uri in PAGES.items():
         files.append(File.generated(config, uri, content=(ROOT / name).read_text()))
     for path in sorted(path for path in linked if not path.is_relative_to(DOCS) and path.exists()):
@@ -38,10 +41,10 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     uri = page.file.src_uri
     if uri.startswith("source/"):
         return markdown
-    written = {made: ROOT / name for name, made in PAGES.items()}.get(uri, DOCS / uri)
+    origin = {made: ROOT / name for name, made in PAGES.items()}.get(uri, DOCS / uri)
 
     def place(match: re.Match[str]) -> str:
-        target = (written.parent / match[1]).resolve()
+        target = (origin.parent / match[1]).resolve()
         if not target.is_relative_to(ROOT) or not target.exists():
             return match[1]
         return posixpath.relpath(_uri(target), posixpath.dirname(uri) or ".")
@@ -50,8 +53,8 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
 
 
 def _links(text: str, page: Path) -> list[Path]:
-    found = [(page.parent / target).resolve() for target in LINK.findall(text)]
-    return [path for path in found if path.is_relative_to(ROOT)]
+    paths = [(page.parent / target).resolve() for target in LINK.findall(text)]
+    return [path for path in paths if path.is_relative_to(ROOT)]
 
 
 def _uri(path: Path) -> str:
