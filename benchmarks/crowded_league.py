@@ -48,7 +48,7 @@ from league.results.scoring import admit
 from league.settings import Storage
 from league.subprocesses import Subprocess
 
-CONFIG = LeagueConfig.load(Path(__file__).parent.parent / "configs" / "connect_four.yaml")
+CONFIG = LeagueConfig.load(Path(__file__).parent.parent / "policy_league/configs" / "connect_four.yaml")
 CONFIG = CONFIG.model_copy(
     update={
         "gate": CONFIG.gate.model_copy(

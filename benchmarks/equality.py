@@ -19,7 +19,8 @@ STEPS = 10**6
 NUM_ENVS = 64
 SEED = 0
 KUHN_POKER = EnvironmentConfig(
-    entry_point="examples.kuhn_poker:env", vector="examples.kuhn_poker_vector:KuhnPokerVector"
+    entry_point="policy_league.examples.kuhn_poker:env",
+    vector="policy_league.examples.kuhn_poker_vector:KuhnPokerVector",
 )
 
 

@@ -1,7 +1,7 @@
 """How fast are matches played, and do more workers help? Connect four, on one core unless workers are compared.
 
 Parts: throughput (in CPU time, from the schedule to the Match records, with ONNX policies on both sides: MLPs of 2×256
-and the convolutional networks of configs/connect_four.yaml; compared with the unmodified `env()` with random legal
+and the convolutional networks of the bundled connect_four; compared with the unmodified `env()` with random legal
 moves and without networks, and with the unmodified `env()` whose moves are computed by the same networks as RLModules,
 `forward_inference` for each single move), verdict (4,000 games with MLPs of 2×256: schedule, games, sequential test,
 ledger, gate result and report; in wall and in CPU time), workers (a tournament, including the ledger, with two Ray

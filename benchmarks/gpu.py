@@ -22,7 +22,7 @@ from league.environments.building import interface
 from training.algorithms.metrics import PHASES, totals
 from training.runs.trial import MAX_THREADS, build_algorithm
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 SAMPLING, LEARNING, _ = PHASES
 VARIANTS: dict[str, dict[str, float]] = {
     "CPU": {},

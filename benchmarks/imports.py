@@ -42,7 +42,7 @@ from training.importing.checks import collect
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 OBSERVATIONS = 10_000
 ROWS = 256
 """Observations of one request."""

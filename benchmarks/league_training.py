@@ -34,20 +34,20 @@ from rich.console import Console
 from benchmarks.training.league_arms import MINUTES, compare_arms
 from benchmarks.training.league_arms import SEEDS as CONNECT_FOUR_SEEDS
 from benchmarks.training.learned import local_ray, one_thread, report_target, updates
-from examples.blotto import PAYOFF, exploitability
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.results.equilibria import nash_averaging
 from league.settings import Storage
 from league.spaces import OBSERVATION
+from policy_league.examples.blotto import PAYOFF, exploitability
 from training.algorithms.league_algorithm import LeagueAlgorithm
 from training.algorithms.metrics import totals
 from training.export.publish import Checkpoint, publish
 from training.runs.train import train
 from training.runs.trial import build_algorithm
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 OVERHEAD = 1.3
 """Maximum ratio of the times per action."""
 SEEDS = range(5)
@@ -62,7 +62,10 @@ LESS_EXPLOITABLE = {"nash": "nash", "magnet": "last", "uniform magnet": "last"}
 """Arms that must be less exploitable than a third of self-play's last version, and what is compared of them."""
 BLOTTO = {
     "league": "blotto",
-    "environment": {"entry_point": "examples.blotto:env", "vector": "examples.blotto_vector:BlottoVector"},
+    "environment": {
+        "entry_point": "policy_league.examples.blotto:env",
+        "vector": "policy_league.examples.blotto_vector:BlottoVector",
+    },
 }
 VERSIONS = 25
 """Versions of each training of Blotto."""

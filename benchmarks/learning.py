@@ -29,10 +29,10 @@ from benchmarks.training.pistonball import pistonball
 from benchmarks.training.truncation import as_rllib
 from benchmarks.training.two_step import two_step_game
 from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem_dqn, leduc_vs_random
-from examples import traffic
 from league.config.league import LeagueConfig
+from policy_league.examples import traffic
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 SEEDS = range(5)
 SPREAD_STEPS, SPREAD_BETTER_BY = 1_000_000, 4.0
 """Equal numbers of actions for each seed, so that the ablation has the same experience; about two of the ten minutes

@@ -31,7 +31,7 @@ from training.algorithms.setup import algorithm_config
 from training.runs.trial import build_algorithm
 from training.sampling.replay_runner import ActorRunner
 
-CONFIG = Path(__file__).parent.parent / "configs" / "simple_adversary.yaml"
+CONFIG = Path(__file__).parent.parent / "policy_league/configs" / "simple_adversary.yaml"
 CRITICS = {"MADDPG": "centralised", "DDPG": "own"}
 ADVERSARY, GOOD = "adversary", "good_0"
 """Policies of the two sides; the two good agents have equal rewards."""

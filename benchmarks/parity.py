@@ -38,7 +38,7 @@ from training.export.publish import Checkpoint, load_modules, publish
 from training.modules.policy_module import PolicyModule
 from training.runs.trial import build_algorithm
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 OBSERVATIONS = 10_000
 BODY = 3 << 18
 """Bytes of observations in a request: a number takes about four characters in JSON, and the body size is limited."""

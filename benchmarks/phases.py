@@ -26,7 +26,7 @@ from training.algorithms.off_policy import OffPolicy
 from training.runs.trial import build_algorithm
 from training.sampling.replay_runner import ReplayRunner
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 SAMPLING = 0.75
 """Minimum ratio to the rate of the unmodified environment."""
 

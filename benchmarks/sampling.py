@@ -55,7 +55,7 @@ AGENTS = {SPREAD: 3, FOUR: 1, LEDUC: 1}
 STEPS, EPOCHS, MINIBATCH = 4000, 4, 128
 """Of an iteration; the minibatch size is RLlib's default."""
 LARGE_MINIBATCH = 960
-"""As in configs/simple_spread.yaml, whose learning target `benchmarks.learning` measures with these settings too."""
+"""As in the bundled simple_spread, whose learning target `benchmarks.learning` measures with these settings too."""
 
 Rates = dict[Hashable, float]
 

@@ -18,7 +18,7 @@ from pathlib import Path
 HERE = Path(__file__).parents[1]
 TARGETS = {"--help": 0.25, "versions rps": 0.6}
 """Seconds on an idle core."""
-COMMAND = [sys.executable, "-c", "import sys; from cli.main import run; sys.exit(run())"]
+COMMAND = [sys.executable, "-c", "import sys; from policy_league.cli.main import run; sys.exit(run())"]
 REGISTER = """
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -52,7 +52,7 @@ def _environment(checkout: Path, home: Path) -> dict[str, str]:
     # Both use compiled modules, whatever the caller has set.
     shared = {"PYTHONDONTWRITEBYTECODE": ""}
     environment = os.environ | shared | {"PYTHONPATH": str(checkout), "LEAGUE_HOME": str(home)}
-    register = [sys.executable, "-c", REGISTER, str(checkout / "configs/rps.yaml"), str(home)]
+    register = [sys.executable, "-c", REGISTER, str(checkout / "policy_league/configs/rps.yaml"), str(home)]
     subprocess.run(register, env=environment, cwd=checkout, check=True)
     return environment
 

@@ -30,8 +30,6 @@ import yaml
 
 from benchmarks.exploitability import MEASUREMENTS
 from benchmarks.training.learned import report_target
-from cli.output import difference
-from configs.bundled import find
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
 from evaluation.statistics.payoff import paired_difference, score_interval
@@ -39,6 +37,8 @@ from league.config.league import LeagueConfig
 from league.policies.loading import eligible, load
 from league.registry.registry import Registry
 from league.settings import Storage
+from policy_league.cli.output import difference
+from policy_league.configs.bundled import find
 
 NIGHTS, MINUTES = 10, 3.0
 SCORE = 0.75
@@ -124,7 +124,15 @@ def _interval(found: tuple[float, float, float]) -> str:
 
 def run_night(config: Path, home: Path) -> dict[str, Any]:
     """Run `league nightly --train`. Raises CalledProcessError if it reports a fault."""
-    command = [sys.executable, "-c", "from cli.main import run; run()", "nightly", str(config), "--train", "--json"]
+    command = [
+        sys.executable,
+        "-c",
+        "from policy_league.cli.main import run; run()",
+        "nightly",
+        str(config),
+        "--train",
+        "--json",
+    ]
     environment = os.environ | {"LEAGUE_HOME": str(home)}
     document = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
     night: dict[str, Any] = json.loads(document)["nights"][0]

@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 
 _INSTALLED = tuple(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib"))
 _OWN = tuple(
-    f"{Path(__file__).parents[1] / package}/" for package in ("cli", "evaluation", "league", "serve_app", "training")
+    f"{Path(__file__).parents[1] / package}/"
+    for package in ("evaluation", "league", "policy_league", "serve_app", "training")
 )
 
 

@@ -15,8 +15,8 @@ import pytest
 import yaml
 from packaging.utils import canonicalize_name
 
-from configs.bundled import names
 from league.settings import Storage
+from policy_league.configs.bundled import names
 from serve_app.observability.prometheus import METRICS
 from serve_app.runtime import haproxy_script
 from serve_app.settings import ServeSettings
@@ -337,7 +337,7 @@ def test_the_job_without_training_runs_leagues_that_the_image_of_the_server_can_
         import sys
         for name in {sorted(ONLY_IN_TRAINER)}:
             sys.modules[name] = None  # imports of it fail
-        from configs.bundled import find
+        from policy_league.configs.bundled import find
         from league.config.league import LeagueConfig
         from league.environments.building import interface
         from league.policies.loading import configured_contestants
@@ -369,9 +369,9 @@ def test_shared_memory_holds_the_object_store_of_ray(pod: Any) -> None:
 
 
 def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
-    from cli.evaluation.nightly import BUSY, FAULTS
-    from cli.interrupt import INTERRUPTED
-    from cli.main import TERMINATED
+    from policy_league.cli.evaluation.nightly import BUSY, FAULTS
+    from policy_league.cli.interrupt import INTERRUPTED
+    from policy_league.cli.main import TERMINATED
 
     for job, if_busy in zip(JOBS, ("Ignore", "Count"), strict=True):
         rules = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
@@ -414,7 +414,7 @@ def test_the_server_image_has_all_dependencies_except_those_of_training() -> Non
 def test_serving_and_evaluation_import_no_dependency_of_training() -> None:
     program = """if True:
         import importlib, pkgutil, sys
-        for package in ("league", "evaluation", "serve_app", "configs"):
+        for package in ("league", "evaluation", "serve_app", "policy_league.configs"):
             for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
                 if not module.name.endswith(("__main__", ".env")):
                     importlib.import_module(module.name)

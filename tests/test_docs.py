@@ -17,17 +17,17 @@ import yaml
 from markdown.extensions.toc import slugify
 from typer.core import TyperGroup
 
-from cli.main import app
 from league.config.algorithms import ALGORITHMS
 from league.config.league import LeagueConfig
+from policy_league.cli.main import app
 from serve_app.runtime import haproxy_script
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
-PACKAGES = ("cli", "evaluation", "examples", "league", "serve_app", "training")
-FOLDERS = (*PACKAGES, "benchmarks", "configs", "deploy", "docs", "scripts", "tests")
+PACKAGES = ("evaluation", "league", "policy_league", "serve_app", "training")
+FOLDERS = (*PACKAGES, "benchmarks", "deploy", "docs", "scripts", "tests")
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
@@ -65,7 +65,7 @@ def test_each_shown_command_exists_with_its_options(page: str, line: str) -> Non
     for argument in arguments:
         if argument.startswith("--"):
             assert argument.partition("=")[0] in known, f"{page}: {line}"
-        if re.fullmatch(r"configs/.*", argument):
+        if re.fullmatch(r"policy_league/configs/.*", argument):
             assert (ROOT / argument).exists(), f"{page}: {line}"
 
 
@@ -286,7 +286,7 @@ def error_codes(node: Any) -> Iterator[str]:
 
 def test_the_code_of_the_tutorial_runs(capsys: pytest.CaptureFixture[str]) -> None:
     page = DOCS / "vectorised-environments.md"
-    example = "".join((ROOT / "examples/kuhn_poker_vector.py").read_text().split())
+    example = "".join((ROOT / "policy_league/examples/kuhn_poker_vector.py").read_text().split())
     names: dict[str, object] = {}
     for block in fenced(page, "python"):
         # Methods of the example have another indentation and other line breaks on the page.

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PRODUCT = ("league", "training", "serve_app", "evaluation", "cli", "examples")
+PRODUCT = ("league", "training", "serve_app", "evaluation", "policy_league")
 GENERATED = ("migrations/", "_pb2.py", "_sync/")
 MAX_MODULES = 14
 ONE_PER_RESOURCE = {"serve_app/routes": 20}

@@ -19,7 +19,7 @@ from tests.support.waiting import until
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("cli", "configs", "evaluation", "examples", "league", "serve_app", "training")
+PACKAGES = ("evaluation", "league", "policy_league", "serve_app", "training")
 
 Installed = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -1,4 +1,4 @@
-"""A league for evaluation: configs/connect_four.yaml, and untrained versions with its network and different seeds."""
+"""A league for evaluation: the bundled connect_four, and untrained versions with its network and different seeds."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -16,7 +16,7 @@ from training.algorithms.ppo import module_spec
 from training.export.onnx_export import export_policy, graph_tensors
 from training.modules.actor_critic import ActorCritic
 
-CONFIG = LeagueConfig.load(Path(__file__).parents[2] / "configs" / "connect_four.yaml")
+CONFIG = LeagueConfig.load(Path(__file__).parents[2] / "policy_league/configs" / "connect_four.yaml")
 
 
 def with_mlp(config: LeagueConfig) -> LeagueConfig:

@@ -55,7 +55,7 @@ def publish(home: Path, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Regi
 
 def fill(registry: Registry, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Registry:
     """The registry, with the league of `publish`."""
-    config = LeagueConfig.load(ROOT / "configs" / "connect_four.yaml")
+    config = LeagueConfig.load(ROOT / "policy_league/configs" / "connect_four.yaml")
     registry.leagues.register(config, interface(config))
     for seed in range(versions):
         registry.publisher.publish(LEAGUE, builder(registry, seed, hidden), source=f"random/{seed}")

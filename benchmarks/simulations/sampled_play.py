@@ -14,7 +14,6 @@ from evaluation.gating.gate import decide_matches
 from evaluation.gating.sequential_tests import SequentialTest
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import verdict
-from examples.kuhn_poker import AGENTS, KuhnPoker
 from league.config.gate import GateConfig
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -22,14 +21,15 @@ from league.environments.implementation import stepping
 from league.policies.draws import probabilities
 from league.policies.onnx import OnnxPolicy
 from league.spaces import ACTION_MASK, OBSERVATION, Discrete
+from policy_league.examples.kuhn_poker import AGENTS, KuhnPoker
 from tests.support.policies.graphs import masked_mlp
 
 CONFIG = LeagueConfig.from_mapping(
     {
         "league": "kuhn",
         "environment": {
-            "entry_point": "examples.kuhn_poker:env",
-            "vector": "examples.kuhn_poker_vector:KuhnPokerVector",
+            "entry_point": "policy_league.examples.kuhn_poker:env",
+            "vector": "policy_league.examples.kuhn_poker_vector:KuhnPokerVector",
         },
     }
 )

@@ -31,7 +31,7 @@ from league.registry.storage.manifest import Manifest
 from league.settings import Storage
 from training.runs.train import train
 
-CONFIG = Path(__file__).parent.parent.parent / "configs" / "connect_four.yaml"
+CONFIG = Path(__file__).parent.parent.parent / "policy_league/configs" / "connect_four.yaml"
 SEEDS = range(3)
 MINUTES = 28.0
 """Of training, by default."""

@@ -13,8 +13,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from examples.leduc_holdem import MOST_ACTIONS, ROUNDS
 from league.policies.policy import Policy
+from policy_league.examples.leduc_holdem import MOST_ACTIONS, ROUNDS
 
 CALL, RAISE, FOLD, CHECK = range(4)
 RANKS, COPIES, BIG_BLIND, MAX_RAISES = 3, 2, 2, 2

@@ -12,7 +12,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 
-CONFIG = Path(__file__).parents[2] / "configs" / "pistonball.yaml"
+CONFIG = Path(__file__).parents[2] / "policy_league/configs" / "pistonball.yaml"
 SEEDS = range(3)
 SECONDS, EPISODES, TARGET = 1800.0, 32, 80.0
 

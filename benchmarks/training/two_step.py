@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
 from benchmarks.training.learned import greedy_returns, local_ray, one_thread, report_target, two_at_once
-from examples.two_step import ACTIONS, AGENTS, STATES, values
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from policy_league.examples.two_step import ACTIONS, AGENTS, STATES, values
 from training.runs.trial import build_algorithm
 
-CONFIG = Path(__file__).parents[2] / "configs" / "two_step_game.yaml"
+CONFIG = Path(__file__).parents[2] / "policy_league/configs" / "two_step_game.yaml"
 SEEDS, MAX_SECONDS, NEAR = 20, 60.0, 0.1
 RETURNS = {"qmix": 8.0, "vdn": 7.0, "none": 7.0}
 """Of greedy play: QMIX finds the optimum, the others cannot."""

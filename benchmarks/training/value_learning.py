@@ -19,7 +19,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(__file__).parents[2] / "policy_league/configs"
 SEEDS = range(3)
 RLCARD, BEST = 1.21, 1.4716
 """Return per hand of Leduc against a random opponent: RLCard's DQN, and the exact best response."""

@@ -16,7 +16,7 @@ export function Leagues() {
 
 function List({ leagues }) {
   if (!leagues.length) {
-    return html`<${EmptyState}>No leagues yet. Create one with <code>league train configs/connect_four.yaml</code>.<//>`;
+    return html`<${EmptyState}>No leagues yet. Create one with <code>league train connect_four</code>.<//>`;
   }
   return html`<table class="full stacked">
     <caption class="visually-hidden">Leagues</caption>

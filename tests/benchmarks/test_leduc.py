@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.training.leduc import CALL, CHECK, FOLD, RAISE, RANKS, Hand, best_response, uniform
-from examples.leduc_holdem import STOCK_SIZE
-from examples.leduc_holdem import env as with_history
+from policy_league.examples.leduc_holdem import STOCK_SIZE
+from policy_league.examples.leduc_holdem import env as with_history
 
 
 def test_hands_equal_those_of_the_environment() -> None:

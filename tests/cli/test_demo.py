@@ -1,6 +1,6 @@
 import numpy as np
 
-from cli.demo import drawing
+from policy_league.cli.demo import drawing
 
 
 def test_a_board_is_drawn_with_its_columns() -> None:

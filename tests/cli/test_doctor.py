@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from cli import doctor
+from policy_league.cli import doctor
 from serve_app.runtime import launch
 from tests.support.command import League
 

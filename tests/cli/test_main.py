@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import typer
 
-from cli.main import SUBCOMMANDS, app
 from league.client import Client
 from league.registry.registry import Registry
+from policy_league.cli.main import SUBCOMMANDS, app
 from tests.support.command import League
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -137,7 +137,7 @@ def test_help_imports_no_large_package() -> None:
     program = f"""if True:
         import sys
         from typer.testing import CliRunner
-        from cli.main import SUBCOMMANDS, app
+        from policy_league.cli.main import SUBCOMMANDS, app
         for arguments in ([], *([name] for name in SUBCOMMANDS)):
             done = CliRunner().invoke(app, [*arguments, "--help"])
             assert done.exit_code == 0, done.output
@@ -150,7 +150,7 @@ def test_the_versions_of_a_league_without_games_are_listed_without_numpy(home: P
     program = f"""if True:
         import sys
         from typer.testing import CliRunner
-        from cli.main import app
+        from policy_league.cli.main import app
         done = CliRunner().invoke(app, ["versions", "tictactoe"])
         assert done.exit_code == 0, done.output
         print(sorted(sys.modules.keys() & ({set(LARGE_PACKAGES)} - {{"sqlalchemy"}})))

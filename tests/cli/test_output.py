@@ -4,8 +4,8 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from cli import output
 from evaluation.results import Progress
+from policy_league.cli import output
 
 
 @pytest.fixture

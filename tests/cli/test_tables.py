@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
-import cli
-from cli import output
-from cli.doctor import Check
 from league.histograms import Histogram
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import ShadowCounts
 from league.registry.traffic import write_shadow_counts
+from policy_league import cli
+from policy_league.cli import output
+from policy_league.cli.doctor import Check
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 
@@ -97,7 +97,9 @@ def test_tables_fit_80_columns(
 ) -> None:
     request.getfixturevalue("registry" if module == "evaluation/nightly" else "used")
     advice = f"tested with 6.0: pip install 'policy-league[postgres]'. {NOTE}"
-    monkeypatch.setattr("cli.doctor.CHECKS", (lambda: iter([Check("protobuf", "note", "5.29.3", advice)]),))
+    monkeypatch.setattr(
+        "policy_league.cli.doctor.CHECKS", (lambda: iter([Check("protobuf", "note", "5.29.3", advice)]),)
+    )
     result = league(*COMMANDS[module])
     assert result.code == 0, result.err
     lines = tables.getvalue().splitlines()

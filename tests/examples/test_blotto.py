@@ -4,13 +4,13 @@ import pytest
 from hypothesis import given, settings
 from pettingzoo.test import parallel_api_test
 
-from examples.blotto import COINS, DIVISIONS, FIELDS, PAYOFF, Blotto, exploitability
-from examples.blotto_vector import BlottoVector
 from league.config.environment import EnvironmentConfig
 from league.results.equilibria import nash_averaging
+from policy_league.examples.blotto import COINS, DIVISIONS, FIELDS, PAYOFF, Blotto, exploitability
+from policy_league.examples.blotto_vector import BlottoVector
 from tests.support.environments.plans import Plan, assert_equal, plans
 
-CONFIG = EnvironmentConfig(entry_point="examples.blotto:env")
+CONFIG = EnvironmentConfig(entry_point="policy_league.examples.blotto:env")
 
 
 @settings(max_examples=20)

@@ -7,13 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.test import api_test, seed_test
 
-from examples.kuhn_poker import BET, DEALS, PASS, KuhnPoker, env
-from examples.kuhn_poker_vector import KuhnPokerVector
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
+from policy_league.examples.kuhn_poker import BET, DEALS, PASS, KuhnPoker, env
+from policy_league.examples.kuhn_poker_vector import KuhnPokerVector
 from tests.support.environments.plans import Plan, assert_equal, last_rows, plans
 
-CONFIG = EnvironmentConfig(entry_point="examples.kuhn_poker")
+CONFIG = EnvironmentConfig(entry_point="policy_league.examples.kuhn_poker")
 
 LINES = {
     (PASS, PASS): ("showdown", 1),

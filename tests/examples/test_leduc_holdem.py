@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from pettingzoo.classic import leduc_holdem_v4
 from pettingzoo.test import api_test, seed_test
 
-from examples.leduc_holdem import MOST_ACTIONS, NUM_ACTIONS, ROUNDS, STOCK_SIZE, env
-from examples.leduc_holdem_vector import LeducWithHistoryVector
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
+from policy_league.examples.leduc_holdem import MOST_ACTIONS, NUM_ACTIONS, ROUNDS, STOCK_SIZE, env
+from policy_league.examples.leduc_holdem_vector import LeducWithHistoryVector
 from tests.support.environments.plans import Plan, assert_equal, plans
 
-CONFIG = EnvironmentConfig(entry_point="examples.leduc_holdem:env")
+CONFIG = EnvironmentConfig(entry_point="policy_league.examples.leduc_holdem:env")
 CALL, RAISE, FOLD, CHECK = range(NUM_ACTIONS)
 
 

@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from examples.traffic import GREEN, RED, Crossing, lights_reward, move, optimum, starts
+from policy_league.examples.traffic import GREEN, RED, Crossing, lights_reward, move, optimum, starts
 
 
 def test_waiting_at_red_costs_and_two_cars_in_the_crossing_crash() -> None:

@@ -4,7 +4,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from examples.two_step import AGENTS, FIRST, GAME_A, GAME_B, PAYOFFS, multi_agent_env, parallel_env, values
+from policy_league.examples.two_step import (
+    AGENTS,
+    FIRST,
+    GAME_A,
+    GAME_B,
+    PAYOFFS,
+    multi_agent_env,
+    parallel_env,
+    values,
+)
 
 GAMMA = 0.99
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from examples.kuhn_poker import KuhnPoker
 from league.conditions import action_selection, describe_selection, hides_information
 from league.config.league import LeagueConfig
 from league.environments.building import build, interface
+from policy_league.examples.kuhn_poker import KuhnPoker
 
 
 def config(entry_point: str, **parts: Any) -> LeagueConfig:
@@ -35,7 +35,7 @@ LEDUC, CHESS = "pettingzoo.classic.leduc_holdem_v4", "pettingzoo.classic.tictact
     [
         (config(LEDUC), "sampled", "hides information from opponents"),
         (config("pettingzoo.classic.rps_v2"), "sampled", "hides information from opponents"),
-        (config("examples.kuhn_poker:env"), "sampled", "hides information from opponents"),
+        (config("policy_league.examples.kuhn_poker:env"), "sampled", "hides information from opponents"),
         (config(ADVERSARY), "sampled", "opponents act at once"),
         (config(ADVERSARY, play={"actions": "greedy"}), "greedy", "as play.actions says"),
         (config(ADVERSARY, sides={"team": ["*"]}), "greedy", "there is only one side"),

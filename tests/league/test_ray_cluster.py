@@ -103,7 +103,7 @@ def test_a_ray_that_does_not_start_is_reported_on_one_line(monkeypatch: pytest.M
 
 def test_only_one_module_initializes_ray() -> None:
     root = Path(__file__).parents[2]
-    packages = ("cli", "evaluation", "examples", "league", "serve_app", "training")
+    packages = ("evaluation", "league", "policy_league", "serve_app", "training")
     callers = [path for name in packages for path in (root / name).rglob("*.py") if "ray.init(" in path.read_text()]
     assert callers == [root / "league/ray_cluster.py"]
 

@@ -13,15 +13,15 @@ from unittest import mock
 
 from click.testing import CliRunner
 
-from cli import output
-from cli.main import run
+from policy_league.cli import output
+from policy_league.cli.main import run
 
 WIDTH = 200
 """Terminal columns: wide enough that no table row is wrapped."""
 # A console reads the width from the environment once, when it is created.
 output.console.width = output.errors.width = WIDTH
 
-COMMAND = (sys.executable, "-c", "from cli.main import run; run()")
+COMMAND = (sys.executable, "-c", "from policy_league.cli.main import run; run()")
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,9 @@ def modules(algorithm: Algorithm) -> dict[str, dict[str, torch.Tensor]]:
 @pytest.mark.parametrize("case", CASES)
 def test_the_learner_and_the_runner_use_the_gpu_and_the_cpu_continues(case: str, tmp_path: Path) -> None:
     name, changes = CASES[case]
-    league = LeagueConfig.load(ROOT / "configs" / f"{name}.yaml").with_training(runners=0, num_envs=8, **changes)
+    league = LeagueConfig.load(ROOT / f"policy_league/configs/{name}.yaml").with_training(
+        runners=0, num_envs=8, **changes
+    )
     with built(league.with_training(gpus=0.5, runner_gpus=0.5)) as algorithm:
         for _ in range(3):
             learned = algorithm.train()["learners"]

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks.training.learned import LearningCurve, learn
-from examples import traffic
 from league.config.league import LeagueConfig
+from policy_league.examples import traffic
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(__file__).parents[2] / "policy_league/configs"
 # Training takes minutes on a busy machine, more than the timeout of other tests.
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.usefixtures("ray_session")]
 

@@ -12,7 +12,7 @@ from training.rllib_compat import remote_traceback
 
 FRAME_LINE = re.compile(r'^\s*File "(?P<file>.+)", line (?P<line>\d+), in ', re.MULTILINE)
 ROOT = Path(training.__file__).parent.parent
-OWN_PATHS = ("<", *(f"{ROOT}/{package}/" for package in ("league", "training", "cli")))
+OWN_PATHS = ("<", *(f"{ROOT}/{package}/" for package in ("league", "training", "policy_league")))
 LIBRARY_PATHS = ("-packages/", "/lib/python")
 
 

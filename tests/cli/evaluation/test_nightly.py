@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
-from cli.evaluation.nightly import night_document, summary_of_night
 from league.config.gate import AnchorConfig, GateConfig
 from league.registry.registry import Registry
 from league.registry.storage.rows import TrainingNightRow
+from policy_league.cli.evaluation.nightly import night_document, summary_of_night
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 

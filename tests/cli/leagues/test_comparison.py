@@ -2,9 +2,9 @@
 
 import pytest
 
-from cli import output
 from league.registry.registry import Registry
 from league.registry.storage.rows import RunPoint
+from policy_league.cli import output
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 

@@ -10,7 +10,7 @@ from tests.support.command import League
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
 BROKEN = """
-from examples.two_step import TwoStep
+from policy_league.examples.two_step import TwoStep
 
 
 def make_env(fault=True):
@@ -60,7 +60,9 @@ def test_code_in_the_working_directory_is_found_from_another_folder(league: Leag
 
 def test_a_team_is_one_side_unless_the_user_says_otherwise(league: League) -> None:
     for options, sides in ((), {"team": ["*"]}), (("--no-team",), {f"agent_{i}": [f"agent_{i}"] for i in range(2)}):
-        written = league("init", "examples.two_step:parallel_env", "--output", f"game{len(options)}.yaml", *options)
+        written = league(
+            "init", "policy_league.examples.two_step:parallel_env", "--output", f"game{len(options)}.yaml", *options
+        )
         assert written.code == 0, written.err
         assert "are they one team?" in written.out
         assert ("If they are opponents, use --no-team." in written.out) == (not options)

@@ -2,9 +2,9 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from cli.serving.serve import hints
 from league.registry.registry import Registry
 from league.settings import Storage
+from policy_league.cli.serving.serve import hints
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 

@@ -12,16 +12,16 @@ import httpx
 import pytest
 import yaml
 
-from cli.training.train import next_step
 from league.registry.registry import Registry
 from league.settings import Storage
+from policy_league.cli.training.train import next_step
 from serve_app.runtime.haproxy import free_ports
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 from tests.support.waiting import until
 
 DEADLINE = 300
-COMMAND = (sys.executable, "-c", "from cli.main import run; run()")
+COMMAND = (sys.executable, "-c", "from policy_league.cli.main import run; run()")
 TRAINING = {
     "runners": 1, "num_envs": 4, "hidden": [16], "train_batch_size": 256, "minibatch_size": 128, "epochs": 1,
     "checkpoint_every": 1024, "steps": 10**9,

@@ -26,7 +26,7 @@ from league.results.ledger import Ledger
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
 
-BOT = "script:examples.tictactoe_bot:act"
+BOT = "script:policy_league.examples.tictactoe_bot:act"
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
-from cli.output import verdict as verdict_line
 from evaluation.gating import verdicts
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
@@ -28,6 +27,7 @@ from league.registry.storage.rows import ShadowCounts
 from league.registry.verdicts import VerdictRepository
 from league.results.ledger import Ledger
 from league.settings import Storage
+from policy_league.cli.output import verdict as verdict_line
 from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of

@@ -21,7 +21,7 @@ from tests.support.policies.bots import MODULE
 
 CONFIG = tictactoe.config(play={"opening_plies": 2})
 INTERFACE = interface(CONFIG)
-EXAMPLE = "script:examples.tictactoe_bot:act"
+EXAMPLE = "script:policy_league.examples.tictactoe_bot:act"
 
 
 def play(contestants: Sequence[str], num_envs: int, blocks: int = 10) -> list[Match]:

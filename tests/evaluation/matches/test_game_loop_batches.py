@@ -18,7 +18,7 @@ from league.policies.scripted import script
 from league.results.records import Match
 from tests.support.policies.graphs import masked_mlp
 
-CONFIG = LeagueConfig.load(Path(__file__).parents[3] / "configs" / "connect_four.yaml")
+CONFIG = LeagueConfig.load(Path(__file__).parents[3] / "policy_league/configs" / "connect_four.yaml")
 INTERFACE = interface(CONFIG)
 SPACES = INTERFACE.of_policy("shared")
 MLP = CONFIG.training.model_copy(update={"convolutions": (), "hidden": (256, 256)})

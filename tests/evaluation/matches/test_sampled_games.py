@@ -28,8 +28,8 @@ CONFIG = LeagueConfig.from_mapping(
     {
         "league": "kuhn",
         "environment": {
-            "entry_point": "examples.kuhn_poker:env",
-            "vector": "examples.kuhn_poker_vector:KuhnPokerVector",
+            "entry_point": "policy_league.examples.kuhn_poker:env",
+            "vector": "policy_league.examples.kuhn_poker_vector:KuhnPokerVector",
         },
         "policies": {"shared": ["*"]},
     }

@@ -32,6 +32,6 @@ def test_names_belong_to_the_policies_of_agents() -> None:
 
 
 def test_names_follow_the_first_action() -> None:
-    config = LeagueConfig.load("configs/simple_spread.yaml")
+    config = LeagueConfig.load("policy_league/configs/simple_spread.yaml")
     named = action_names(config.play, interface(config))
     assert direction_keys(named["agent_0"]).items() >= {"ArrowLeft": 1, "ArrowRight": 2, "ArrowDown": 3, "w": 4}.items()

@@ -36,7 +36,7 @@ def test_declarations_are_found_behind_wrappers() -> None:
 
 
 def test_an_environment_without_pictures_has_no_views() -> None:
-    assert environment_hooks(EnvironmentConfig(entry_point="examples.kuhn_poker:env")).draws is False
+    assert environment_hooks(EnvironmentConfig(entry_point="policy_league.examples.kuhn_poker:env")).draws is False
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.errors import ConfigError
 
-CONFIGS = sorted(Path("configs").glob("*.yaml"))
+CONFIGS = sorted(Path("policy_league/configs").glob("*.yaml"))
 MINIMAL = {"league": "mini", "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}}
 
 
@@ -100,7 +100,7 @@ def test_a_missing_file_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_config_survives_json() -> None:
-    config = LeagueConfig.load("configs/connect_four.yaml")
+    config = LeagueConfig.load("policy_league/configs/connect_four.yaml")
     assert LeagueConfig.from_mapping(config.model_dump(mode="json", by_alias=True)) == config
 
 

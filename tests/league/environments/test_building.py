@@ -40,7 +40,7 @@ def test_an_environment_that_cannot_be_built_is_reported_with_its_key(config: Le
 
 
 def test_by_default_each_agent_is_a_side_and_all_share_a_policy() -> None:
-    found = interface(LeagueConfig.load("configs/connect_four.yaml"))
+    found = interface(LeagueConfig.load("policy_league/configs/connect_four.yaml"))
     assert list(found.agents) == ["player_0", "player_1"]
     assert found.policies == {"player_0": "shared", "player_1": "shared"}
     assert found.sides == {"player_0": ("player_0",), "player_1": ("player_1",)}
@@ -84,8 +84,8 @@ def nameless() -> Any:
 
 
 def test_the_interface_digest_depends_on_spaces_and_policy_ids_only() -> None:
-    one = interface(LeagueConfig.load("configs/connect_four.yaml"))
-    text = LeagueConfig.load("configs/connect_four.yaml").model_dump(mode="json", by_alias=True)
+    one = interface(LeagueConfig.load("policy_league/configs/connect_four.yaml"))
+    text = LeagueConfig.load("policy_league/configs/connect_four.yaml").model_dump(mode="json", by_alias=True)
     renamed = interface(LeagueConfig.from_mapping(text | {"policies": {"other": ["*"]}}))
     sided = interface(LeagueConfig.from_mapping(text | {"sides": {"x": ["player_0"], "y": ["player_1"]}}))
     assert one.digest() == sided.digest()
@@ -157,7 +157,7 @@ def test_wrappers_in_an_impossible_order_are_rejected() -> None:
 
 
 def test_supersuit_does_not_wrap_rllib_environments() -> None:
-    config = EnvironmentConfig(entry_point="examples.traffic:crossing", wrappers=["flatten_v0"])
+    config = EnvironmentConfig(entry_point="policy_league.examples.traffic:crossing", wrappers=["flatten_v0"])
     with pytest.raises(ConfigError, match=r"flatten_v0 \(number 1\).*RLlib"):
         build(config)
 

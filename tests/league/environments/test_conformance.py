@@ -10,13 +10,13 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from examples.kuhn_poker_vector import KuhnPokerVector
 from league.config.league import LeagueConfig
 from league.environments.conformance import examination
 from league.environments.conformance.examination import examine
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.openings import OpeningLength, OpeningMeasurement, recommended
 from league.environments.vector.vector_env import AgentRows
+from policy_league.examples.kuhn_poker_vector import KuhnPokerVector
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
 
@@ -49,9 +49,9 @@ def findings(found: Examination, severity: str) -> str:
         "pettingzoo.classic.leduc_holdem_v4",
         "pettingzoo.classic.rps_v2",
         "mpe2.simple_spread_v3",
-        "examples.traffic:crossing",
-        "examples.two_step:parallel_env",
-        "examples.two_step:multi_agent_env",
+        "policy_league.examples.traffic:crossing",
+        "policy_league.examples.two_step:parallel_env",
+        "policy_league.examples.two_step:multi_agent_env",
         f"{SUPPORT}.counting:counting",
         f"{SUPPORT}.simultaneous:meeting",
         f"{SUPPORT}.simultaneous:rllib_meeting",
@@ -60,7 +60,7 @@ def findings(found: Examination, severity: str) -> str:
 def test_valid_environments_pass(entry_point: str) -> None:
     config = league(entry_point)
     if "traffic" in entry_point:
-        config = LeagueConfig.load("configs/cars_and_lights.yaml")
+        config = LeagueConfig.load("policy_league/configs/cars_and_lights.yaml")
     found = examine(config)
     assert found.passed, found.findings
     assert found.lengths
@@ -165,7 +165,7 @@ def test_checks_of_a_slow_environment_are_cut_short_and_reported() -> None:
     ("entry_point", "least", "most"),
     [
         ("mpe2.simple_spread_v3", 0.95, 0.999),
-        ("examples.two_step:parallel_env", 1.0, 1.0),
+        ("policy_league.examples.two_step:parallel_env", 1.0, 1.0),
         ("mpe2.simple_adversary_v3", -1.0, 0.0),
         ("pettingzoo.classic.connect_four_v3", -1.0, -1.0),
     ],
@@ -184,13 +184,13 @@ def test_returns_that_agree_are_those_of_a_team(entry_point: str, least: float, 
         ("mpe2.simple_adversary_v3", '`metadata["hidden_information"] = True` and `render_for(agent)`'),
         ("pettingzoo.classic.leduc_holdem_v4", "the environment declares `render_for(agent)`"),
         ("pettingzoo.classic.tictactoe_v3", ""),
-        ("examples.traffic:crossing", ""),
+        ("policy_league.examples.traffic:crossing", ""),
     ],
 )
 def test_how_to_declare_hidden_information_is_said_where_observations_differ(entry_point: str, expected: str) -> None:
     config = LeagueConfig.from_mapping({"league": "x", "environment": {"entry_point": entry_point}})
     if "traffic" in entry_point:
-        config = LeagueConfig.load("configs/cars_and_lights.yaml")
+        config = LeagueConfig.load("policy_league/configs/cars_and_lights.yaml")
     found = examine(config, episodes=1)
     assert expected in found.views
     assert bool(found.views) == bool(expected)
@@ -495,12 +495,12 @@ class BrokenKuhnPoker(KuhnPokerVector):
 
 
 def kuhn_poker(vector: str) -> Examination:
-    environment = {"entry_point": "examples.kuhn_poker:env", "vector": vector}
+    environment = {"entry_point": "policy_league.examples.kuhn_poker:env", "vector": vector}
     return examine(LeagueConfig.from_mapping({"league": "kuhn", "environment": environment}))
 
 
 def test_a_vectorised_environment_is_compared() -> None:
-    found = kuhn_poker("examples.kuhn_poker_vector:KuhnPokerVector")
+    found = kuhn_poker("policy_league.examples.kuhn_poker_vector:KuhnPokerVector")
     assert found.passed, found.findings
     assert found.vectorised is not None
     assert found.vectorised.steps >= 500

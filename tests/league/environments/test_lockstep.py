@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from examples import two_step
-from examples.traffic import crossing
 from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import each_agent_alone
+from policy_league.examples import two_step
+from policy_league.examples.traffic import crossing
 from tests.conformance.stepping import assert_abandoning_conforms, assert_states_conform, assert_stepping_conforms
 from tests.support.environments.simultaneous import meeting, rllib_meeting
 
@@ -32,9 +32,9 @@ OWN: dict[str, tuple[Any, dict[str, Any]]] = {
         {"arrives": [0, 2, 1, 0], "leaves": [4, 5, 2, 3], "truncated": [1, 2]},
     ),
     "tests.support.environments.simultaneous:rllib_meeting": (rllib_meeting, {"ends": 4}),
-    "examples.traffic:crossing": (crossing, {}),
-    "examples.two_step:parallel_env": (two_step.parallel_env, {}),
-    "examples.two_step:multi_agent_env": (two_step.multi_agent_env, {}),
+    "policy_league.examples.traffic:crossing": (crossing, {}),
+    "policy_league.examples.two_step:parallel_env": (two_step.parallel_env, {}),
+    "policy_league.examples.two_step:multi_agent_env": (two_step.multi_agent_env, {}),
 }
 
 
@@ -67,7 +67,12 @@ def test_an_abandoned_episode_has_no_effect_on_the_next(case: Case) -> None:
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize(
-    "entry_point", ["mpe2.simple_spread_v3", "examples.two_step:parallel_env", "examples.two_step:multi_agent_env"]
+    "entry_point",
+    [
+        "mpe2.simple_spread_v3",
+        "policy_league.examples.two_step:parallel_env",
+        "policy_league.examples.two_step:multi_agent_env",
+    ],
 )
 def test_states_equal_those_of_the_plain_loop(entry_point: str, num_envs: int) -> None:
     module, _, name = entry_point.partition(":")

@@ -20,7 +20,7 @@ from tests.support.leagues.reported_league import HOSTILE, league_after_nightly
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.waiting import until
 
-CONFIGS = Path(__file__).parents[3] / "configs"
+CONFIGS = Path(__file__).parents[3] / "policy_league/configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
 TEAM, LONG = "team", "n" * 60 + "_" + "m" * 39
 """The two-step game, whose agents are a team, and tic-tac-toe with the longest name and the longest reason."""

@@ -190,7 +190,7 @@ def test_an_off_policy_run_publishes_and_continues(registry: Registry) -> None:
 @pytest.mark.usefixtures("ray_session")
 def test_a_recurrent_team_is_trained_and_continued(registry: Registry) -> None:
     """Trained by a remote runner, published, and continued; its versions do not contain the mixer."""
-    config = LeagueConfig.load("configs/two_step_game.yaml").with_training(
+    config = LeagueConfig.load("policy_league/configs/two_step_game.yaml").with_training(
         runners=1, steps=2048, checkpoint_every=1024, recurrence={"width": 8, "sequence": 2}, batch_size=16
     )
     versions = train(config, registry=registry, console=Console(file=io.StringIO()))
@@ -226,10 +226,10 @@ def test_invalid_options_are_rejected_before_training(registry: Registry) -> Non
             train(LEAGUE, registry=registry, **options)
     with pytest.raises(EnvironmentMismatch, match="chess@1 is not a version of league tictactoe"):
         train(LEAGUE, registry=registry, role=EXPLOITER, target=CheckpointRef("chess", 1))
-    team = LeagueConfig.load("configs/two_step_game.yaml")
+    team = LeagueConfig.load("policy_league/configs/two_step_game.yaml")
     with pytest.raises(ConfigError, match="--against: league two_step_game has one side only"):
         train(team, registry=registry, role=EXPLOITER, target=CheckpointRef("two_step_game", 1))
-    adversary = LeagueConfig.load("configs/simple_adversary.yaml")
+    adversary = LeagueConfig.load("policy_league/configs/simple_adversary.yaml")
     with pytest.raises(ConfigError, match="--against: maddpg does not support opponents"):
         train(adversary, registry=registry, role=EXPLOITER, target=CheckpointRef("simple_adversary", 1))
     assert not (registry.storage.home / "runs").exists()

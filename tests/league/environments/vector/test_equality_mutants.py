@@ -9,13 +9,13 @@ from tests.support.environments.mutants import Mutation, mutated
 VECTOR = "league.environments.vector."
 ALTERNATION, BOARD_GAME = VECTOR + "alternation", VECTOR + "board_game"
 CONNECT_FOUR, TICTACTOE, RPS = VECTOR + "connect_four", VECTOR + "tictactoe", VECTOR + "rps"
-KUHN = "examples.kuhn_poker_vector"
+KUHN = "policy_league.examples.kuhn_poker_vector"
 
 ENVIRONMENTS = {
     CONNECT_FOUR: ("pettingzoo.classic.connect_four_v3", "ConnectFour", (ALTERNATION, BOARD_GAME, CONNECT_FOUR)),
     TICTACTOE: ("pettingzoo.classic.tictactoe_v3", "TicTacToe", (ALTERNATION, BOARD_GAME, TICTACTOE)),
     RPS: ("pettingzoo.classic.rps_v2", "RockPaperScissors", (RPS,)),
-    KUHN: ("examples.kuhn_poker", "KuhnPokerVector", (ALTERNATION, KUHN)),
+    KUHN: ("policy_league.examples.kuhn_poker", "KuhnPokerVector", (ALTERNATION, KUHN)),
 }
 
 MOST_STEPS = 50_000

@@ -1,0 +1,1 @@
+"""What the `league` command consists of beside its libraries: subcommands, bundled configurations and example games."""

@@ -1,0 +1,130 @@
+"""`league act`."""
+
+import sys
+from pathlib import Path
+from secrets import token_hex
+from typing import Annotated, Any
+
+import orjson
+import typer
+
+from league.errors import ConfigError, InvalidReference, RemoteError
+from league.refs import CHAMPION, CheckpointRef, PolicyRef, RemoteRef, ScriptRef, parse_ref
+from policy_league.cli.options import DEFAULT_URL, MAX_SEED, open_registry
+from policy_league.cli.output import emit, say
+
+
+def act(
+    ref: Annotated[str, typer.Argument(metavar="REF", help="connect_four, connect_four@3, connect_four@candidate …")],
+    observation: Annotated[
+        str | None,
+        typer.Option(
+            "--observation",
+            "-o",
+            help="Observation as JSON text, a file, or - for stdin: a nested list, or {observation, action_mask}. "
+            "Default: the first observation of a new episode.",
+        ),
+    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy ID, if the version has several policies.")] = None,
+    url: Annotated[str, typer.Option(envvar="LEAGUE_URL", help="URL of the policy server.")] = DEFAULT_URL,
+    local: Annotated[
+        bool, typer.Option("--local", help="Load the version in this process instead of calling a server.")
+    ] = False,
+    explore: Annotated[
+        bool | None,
+        typer.Option("--explore/--greedy", help="Sample an action, or take the greedy one. Default: as in matches."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED, help="Random seed for a sampled action.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the complete response as JSON.")] = False,
+) -> None:
+    """Request one action from a policy server, or compute it locally."""
+    parsed: CheckpointRef | ScriptRef | RemoteRef
+    if "@" in ref or ":" in ref:
+        parsed = parse_ref(ref)
+    else:  # as over HTTP, LEAGUE or LEAGUE.POLICY stands for the champion
+        model = PolicyRef.parse(ref)
+        parsed, policy = CheckpointRef(model.league, CHAMPION), policy or model.policy
+    if not isinstance(parsed, CheckpointRef):
+        raise InvalidReference(f"{ref} is not a version. Only versions can be served, such as connect_four@champion")
+    value = _first_observation(parsed, policy) if observation is None else _read(observation)
+    response = (_act_here if local else _ask)(parsed, policy, value, explore, seed, url)
+    if as_json:
+        emit(response)
+    else:
+        say(str(response["action"]))
+
+
+def _ask(
+    ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, url: str
+) -> dict[str, Any]:
+    import httpx
+    import numpy as np
+
+    from league.client import Client
+
+    model = str(PolicyRef(ref.league, policy))
+    try:
+        with Client(url) as client:
+            response = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
+    except RemoteError as error:
+        if not isinstance(error.__cause__, httpx.ConnectError):
+            raise
+        raise RemoteError(
+            f"{error}; `league serve` starts a server, --url names another, --local needs none"
+        ) from error
+    return {
+        "action": np.asarray(response.action).tolist(),
+        "model": model,
+        "version": response.version,
+        "sha256": response.sha256,
+    }
+
+
+def _act_here(
+    ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, _: str
+) -> dict[str, Any]:
+    import numpy as np
+
+    from league.policies.loading import acting_version, load
+    from league.random.seeds import generator
+    from serve_app.codecs.observation_codec import ObservationReader, reject_strings
+
+    registry = open_registry()
+    version = acting_version(registry.versions.resolve(ref), registry, token_hex())
+    loaded = load(version.ref, policy=policy, registry=registry)
+    space = version.manifest.policies[policy or next(iter(version.manifest.policies))].observation
+    reject_strings(value)
+    observations = ObservationReader(space).read([value])
+    # The same generator as on the server, so that both sample the same action.
+    rng = np.random.default_rng() if seed is None else generator(seed, 0)
+    is_sampled = registry.leagues.get(ref.league).conditions.actions == "sampled" if explore is None else explore
+    actions = loaded.act(observations, explore=is_sampled, rng=[rng])
+    return {
+        "action": actions.actions[0].tolist(),
+        "model": str(PolicyRef(ref.league, policy)),
+        "version": version.number,
+        "sha256": version.sha256,
+    }
+
+
+def _first_observation(ref: CheckpointRef, policy: str | None) -> Any:
+    from evaluation.playback.single_game import first_observation
+
+    league = open_registry().leagues.get(ref.league)
+    return first_observation(league.config, league.interface, policy)
+
+
+def _read(observation: str) -> Any:
+    if observation == "-":
+        text = sys.stdin.read()
+    elif observation.lstrip()[:1] in ("[", "{"):
+        text = observation
+    else:
+        try:
+            text = Path(observation).read_text(encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--observation: {observation}: {error.strerror}") from error
+    try:
+        return orjson.loads(text)
+    except orjson.JSONDecodeError as error:
+        raise ConfigError(f"--observation is not valid JSON: {error}") from error
