@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-PROCESSES ?= 2
+PROCESSES ?= 3
 
 .PHONY: setup demo test test-slow check fix bench docs generate protocol clean
 .DEFAULT_GOAL := setup

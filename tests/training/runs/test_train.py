@@ -34,6 +34,8 @@ from training.runs.tune import Interrupted
 
 SETTINGS = {"runners": 1, "train_batch_size": 256, "minibatch_size": 128, "epochs": 1, "checkpoint_every": 512}
 LEAGUE = tictactoe(steps=1024, **SETTINGS)
+LOCAL = {"runners": 0}
+"""Sampling in the learner's process: a runner of its own takes seconds to start."""
 DEADLINE = 120
 
 
@@ -132,7 +134,9 @@ def test_an_interrupted_run_says_how_to_continue_it(
 
 @pytest.mark.slow
 def test_continued_training_has_a_parent(trained: Trained) -> None:
-    first, second = train(LEAGUE, registry=trained.registry, parent=CheckpointRef("tictactoe", 1))
+    first, second = train(
+        LEAGUE.with_training(**LOCAL), registry=trained.registry, parent=CheckpointRef("tictactoe", 1)
+    )
     assert lineage([first, second]) == [(first.number, 1024, 1), (second.number, 1536, first.number)]
 
 
@@ -140,11 +144,11 @@ def test_continued_training_has_a_parent(trained: Trained) -> None:
 @pytest.mark.timeout(600)
 def test_a_run_is_resumed_after_its_parent_was_removed(trained: Trained) -> None:
     """It continues from its own version."""
-    registry = trained.registry
-    parent = CheckpointRef("tictactoe", train(LEAGUE.with_training(steps=512), registry=registry)[-1].number)
-    begun = train(LEAGUE.with_training(steps=512), registry=registry, parent=parent)
+    registry, league = trained.registry, LEAGUE.with_training(**LOCAL)
+    parent = CheckpointRef("tictactoe", train(league.with_training(steps=512), registry=registry)[-1].number)
+    begun = train(league.with_training(steps=512), registry=registry, parent=parent)
     registry.removal.remove_version(parent, force=True)
-    resumed = train(LEAGUE, registry=registry, resume=True)
+    resumed = train(league, registry=registry, resume=True)
     assert [(version.run, version.steps) for version in resumed] == [(begun[0].run, 1024), (begun[0].run, 1536)]
 
 
@@ -161,7 +165,7 @@ def test_an_exploiter_is_trained_against_one_version(trained: Trained) -> None:
     assert version.manifest.settings["gamma"] == 0.5
     assert "Role: exploiter. Opponent in all episodes: tictactoe@1." in shown.getvalue()
     registry.aliases.set("tictactoe", "champion", 2, expected=1, actor="test", reason="test")
-    further = train(settings.with_training(steps=1024), registry=registry, role=EXPLOITER, resume=True)
+    further = train(settings.with_training(steps=1024, **LOCAL), registry=registry, role=EXPLOITER, resume=True)
     assert [each.exploits for each in further] == ["tictactoe@1"] * 2
 
 
@@ -176,7 +180,7 @@ def test_an_off_policy_run_publishes_and_continues(registry: Registry) -> None:
     assert versions[0].manifest.algorithm == "dqn"
     for kept in (True, False):
         shown, parent = io.StringIO(), CheckpointRef("tictactoe", 1)
-        further = league.with_training(steps=1024, opponents=["@1"], replay_in_checkpoint=kept)
+        further = league.with_training(steps=1024, opponents=["@1"], replay_in_checkpoint=kept, **LOCAL)
         (version,) = train(further, registry=registry, parent=parent, console=Console(file=shown))
         assert (version.steps, version.parent) == (2048, 1)
         assert ("The replay buffer starts empty" in shown.getvalue()) is not kept
@@ -202,7 +206,7 @@ def test_a_recurrent_team_is_trained_and_continued(registry: Registry) -> None:
     (run,) = (registry.storage.home / "runs" / "two_step_game").iterdir()
     assert {"joint/loss", "joint/value", "joint/error"} <= set(curves(run).Tags()["scalars"])
     parent = CheckpointRef("two_step_game", 1)
-    (further,) = train(config.with_training(steps=1024), registry=registry, parent=parent)
+    (further,) = train(config.with_training(steps=1024, **LOCAL), registry=registry, parent=parent)
     assert (further.steps, further.parent) == (2048, 1)
     with pytest.raises(ConfigError, match=r"training\.mixer: two_step_game@1 was trained with qmix, got vdn"):
         train(config.with_training(mixer="vdn"), registry=registry, parent=parent)
@@ -249,13 +253,13 @@ def test_a_failed_parity_check_ends_the_run_and_keeps_earlier_versions(
 
     monkeypatch.setattr(publishing.parity, "check_parity", check_once)
     with pytest.raises(ParityError, match="the graph differs"):
-        train(tictactoe(steps=4096, **SETTINGS), registry=registry)
+        train(tictactoe(steps=4096, **SETTINGS | LOCAL), registry=registry)
     assert lineage(registry.versions.all("tictactoe")) == [(1, 512, None)]
     (record,) = registry.runs.newest("tictactoe")
     assert (record.state, record.error) == ("failed", "the graph differs")
 
     monkeypatch.undo()
-    versions = train(tictactoe(steps=1024, **SETTINGS), registry=registry, resume=True)
+    versions = train(tictactoe(steps=1024, **SETTINGS | LOCAL), registry=registry, resume=True)
     steps = [version.steps for version in versions]
     assert steps[:2] == [512, 1024]
     assert steps == sorted(set(steps))
