@@ -44,7 +44,7 @@ HOLDERS = """
 SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted
 AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
 """
-TABLES = ("matches", "verdicts", "alias_events", "nights")
+TABLES = ("matches", "verdicts", "alias_events", "nightly_runs")
 
 
 def lost_locks(runs: int) -> bool:

@@ -59,7 +59,7 @@ LOCK_SECONDS = 60
 def upgrade(engine: Engine) -> None:
     """Apply the missing migrations, all or none. If none is missing, Alembic is not imported.
 
-    Raises StorageError if the database was created by a newer release.
+    Raises StorageError if another release has created the database, with tables that this one does not know.
     """
     with engine.connect() as connection:
         if revision(connection) == HEAD:
@@ -67,7 +67,7 @@ def upgrade(engine: Engine) -> None:
     with _exclusive(engine) as connection:
         current = revision(connection)
         if current not in (None, *KNOWN):
-            raise StorageError(f"the database has the schema {current} of a newer release: upgrade this program")
+            raise StorageError(f"the database has the schema {current} of another release: install that one")
         if current != HEAD:
             _apply(connection)
 

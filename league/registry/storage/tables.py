@@ -70,7 +70,7 @@ class LeagueTable(Base):
     interface_digest: Mapped[str] = mapped_column(String(64))
     environment_digest: Mapped[str] = mapped_column(String(64))
     game: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """What decides results, see LeagueConfig.game; empty if the league was registered before it was recorded."""
+    """What decides results, see LeagueConfig.game."""
     game_digest: Mapped[str] = mapped_column(String(64))
     last_version: Mapped[int]
     """The highest number ever reserved. Numbers are never reused."""
@@ -112,7 +112,7 @@ class VersionTable(Base):
     state: Mapped[str] = mapped_column(String(16))
     source: Mapped[str] = mapped_column(Text)
     parent: Mapped[int | None]
-    role: Mapped[str] = mapped_column(String(16), default=MAIN, server_default=MAIN)
+    role: Mapped[str] = mapped_column(String(16), default=MAIN)
     """As in the manifest."""
     exploits: Mapped[str | None] = mapped_column(Text)
     """As in the manifest."""
@@ -193,10 +193,7 @@ class ChangeCounterTable(Base):
 
 
 class AcknowledgementTable(Base):
-    """What a replica serves of a league, while it differs from what the replica has read.
-
-    Replicas of releases without the change counter have a row for each league.
-    """
+    """What a replica serves of a league, while it differs from what the replica has read."""
 
     __tablename__ = "acknowledgements"
 
@@ -380,8 +377,8 @@ class VerdictTable(Base):
 class NightlyRunTable(Base):
     """A nightly run with its candidates and its report. Open until `ended_at`."""
 
-    __tablename__ = "nights"
-    __table_args__ = (Index("ix_nights_league_id", "league", "id"),)
+    __tablename__ = "nightly_runs"
+    __table_args__ = (Index("ix_nightly_runs_league_id", "league", "id"),)
 
     id: Mapped[int] = mapped_column(primary_key=True)
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
@@ -418,7 +415,7 @@ class EvaluationTable(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
-    request: Mapped[dict[str, Any]] = mapped_column("asked", JSON)
+    request: Mapped[dict[str, Any]] = mapped_column(JSON)
     """A document of league/service_requests.py."""
     state: Mapped[str] = mapped_column(String(16), index=True)
     progress: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
@@ -475,12 +472,12 @@ class RunTable(Base):
     """The version that an exploiter is trained against."""
     state: Mapped[str] = mapped_column(String(16))
     error: Mapped[str | None] = mapped_column(Text)
-    attempts: Mapped[int] = mapped_column("lives")
+    attempts: Mapped[int]
     """How often it was started or resumed."""
-    driver: Mapped[str | None] = mapped_column(Text)
+    driver: Mapped[str] = mapped_column(Text)
     """The process that trains it, or trained it last, see `league.registry.processes.this_process`."""
     record: Mapped[dict[str, Any] | None] = mapped_column(JSON, deferred=True)
-    """What another machine needs to continue it; null in runs of earlier releases."""
+    """What another machine needs to continue it; null if it cannot."""
     steps: Mapped[int] = mapped_column(BigInteger)
     seconds: Mapped[float] = mapped_column(Double)
     curves: Mapped[dict[str, float]] = mapped_column(JSON)

@@ -147,12 +147,11 @@ class RunRepository(Repository):
             query = query.filter_by(id=run)
         with self._database.read() as session:
             leagues.require(session, league)
-            with_records = query.options(undefer(table.record)).where(table.driver.is_not(None))
-            rows = session.scalars(with_records.limit(MAX_STORED))
+            rows = session.scalars(query.options(undefer(table.record)).limit(MAX_STORED))
             return [
                 StoredRun(row.id, _state(row), row.driver, row.heartbeat_at, row.record)
                 for row in rows
-                if row.driver is not None and row.record is not None
+                if row.record is not None
             ]
 
     def counts(self) -> dict[str, int]:

@@ -1,30 +1,32 @@
-"""Migrations build the current tables and are applied once."""
+"""Migrations build the current tables, are applied once, and keep the data of version 0.1.0."""
 
+import sqlite3
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from datetime import UTC, datetime
-from functools import partial
+from contextlib import closing
 from inspect import unwrap
 from pathlib import Path
 
+import psycopg
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from alembic.operations import Operations
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, text
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import inspect, make_url, select, text
 
 from league.errors import ConfigError, StorageError
 from league.registry.registry import Registry
 from league.registry.storage import database, migrations
 from league.registry.storage.database import Database
-from league.registry.storage.rows import RunPoint
+from league.registry.storage.idempotency import IdempotentCall
+from league.registry.storage.rows import Portion
 from league.registry.storage.tables import Base
 from league.results.ledger import Ledger
 from league.settings import Storage
+from league.verdict_tests import AnchorTest
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
-from tests.support.leagues.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, interface, publish
+
+DATA = Path(__file__).parents[4] / "tests" / "data"
 
 
 @pytest.fixture(autouse=True)
@@ -65,11 +67,11 @@ def test_reopening_keeps_the_data(registry: Registry, storage: Storage) -> None:
     again.close()
 
 
-def test_a_newer_schema_is_rejected(empty: Registry, storage: Storage) -> None:
+def test_the_schema_of_another_release_is_rejected(empty: Registry, storage: Storage) -> None:
     with empty.database.engine.connect() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
         connection.commit()
-    with pytest.raises(StorageError, match="9999 of a newer release"):
+    with pytest.raises(StorageError, match="9999 of another release"):
         Registry.open(storage)
 
 
@@ -92,82 +94,87 @@ def test_a_failed_migration_is_rolled_back(storage: Storage, monkeypatch: pytest
     registry.close()
 
 
-def test_the_budgets_and_points_of_old_runs_are_kept(storage: Storage) -> None:
-    registry = registered(Registry.open(storage), versions=1)
-    begin = partial(registry.runs.begin, LEAGUE, algorithm="ppo", settings={}, seed=1)
-    begin("old", target=1000)
-    registry.runs.record(LEAGUE, "old", RunPoint(10, {"return": 0.5}, datetime.now(UTC)))
-    with registry.database.engine.execution_options(writes=True).begin() as connection:
-        # As revision 0013 left it.
-        connection.execute(text("ALTER TABLE runs ADD COLUMN old BIGINT NOT NULL DEFAULT 1000"))
-        connection.execute(text("ALTER TABLE runs DROP COLUMN target"))
-        connection.execute(text("ALTER TABLE runs RENAME COLUMN old TO target"))
-        connection.execute(text("ALTER TABLE leagues DROP COLUMN archived_at"))
-        for column in ("exploits", "driver", "record"):
-            connection.execute(text(f"ALTER TABLE runs DROP COLUMN {column}"))
-        for table in ("earlier_games", "strengths", "change_counter"):
-            connection.execute(text(f"DROP TABLE {table}"))
-        connection.execute(text("DROP INDEX ix_replicas_seen_at"))
-        for column in ("event", "traffic", "changes"):
-            connection.execute(text(f"ALTER TABLE replicas DROP COLUMN {column}"))
-        connection.execute(text("UPDATE alembic_version SET version_num = '0013'"))
-    with pytest.raises(IntegrityError), registry.database.engine.begin() as connection:
-        connection.execute(text("UPDATE runs SET target = NULL"))
-    registry.close()
-    upgraded = Registry.open(storage)
-    assert upgraded.runs.get(LEAGUE, "old").target == 1000
-    assert [point.steps for point in upgraded.runs.points(LEAGUE, "old")] == [10]
-    new = upgraded.runs.begin(LEAGUE, "new", algorithm="ppo", settings={}, seed=1, target=None)
-    assert upgraded.runs.get(LEAGUE, "new") == new
-    assert new.target is None
-    upgraded.close()
+def restored(storage: Storage) -> Registry:
+    """A registry of version 0.1.0, migrated."""
+    url = make_url(storage.database_url)
+    dump = (DATA / f"registry-0.1.0-{url.get_backend_name()}.sql").read_text()
+    if url.get_backend_name() == "sqlite":
+        storage.home.mkdir()
+        with closing(sqlite3.connect(str(url.database))) as connection:
+            connection.executescript(dump)
+    else:
+        with psycopg.connect(storage.database_url, autocommit=True) as connection:
+            connection.execute(dump.encode())
+    return Registry.open(storage)
 
 
-def test_old_matches_are_found_by_contestant(storage: Storage) -> None:
-    """A ledger of an earlier release identifies the contestants of matches only by the schedule."""
-    registry = registered(Registry.open(storage), versions=1)
-    ledger = Ledger(registry)
-    schedules = [SCHEDULE, replace(SCHEDULE, id="later", kind="gauntlet", contestants=SCHEDULE.contestants[::-1])]
-    for schedule in schedules:
-        ledger.open(schedule)
-        ledger.extend([play_match(schedule, position) for position in (0, 2, 4)])
-    ledger.open(replace(SCHEDULE, id="never-played"))
-    expected = ledger.page(LEAGUE)
-    with registry.database.engine.execution_options(writes=True).begin() as connection:
-        operations = Operations(MigrationContext.configure(connection))
-        for index in ("ix_matches_league_played_at", "ix_matches_league_first_second_played_at"):
-            operations.drop_index(index, "matches")
-        added = {
-            "schedules": ("kind",),
-            "matches": ("league", "first", "second"),
-            "acknowledgements": ("event",),
-            "versions": ("retired_at", "role", "exploits"),
-            "leagues": ("game", "game_digest", "archived_at"),
-        }
-        for table, columns in added.items():
-            for column in columns:
-                operations.drop_column(table, column)
-        for table in (
-            "snapshots",
-            "run_points",
-            "runs",
-            "version_notes",
-            "replicas",
-            "training_nights",
-            "strengths",
-            "earlier_games",
-            "change_counter",
-        ):
-            operations.drop_table(table)
-        connection.execute(text("UPDATE alembic_version SET version_num = '0005'"))
-    registry.close()
-    upgraded = Registry.open(storage)
-    assert Ledger(upgraded).page(LEAGUE) == expected
-    row = upgraded.leagues.get(LEAGUE)
-    assert row.game_digest == row.environment_digest
-    assert Ledger(upgraded).page(LEAGUE, contestants=("script:random", "tictactoe@1"), limit=1) == expected[:1]
-    upgraded.aliases.set(LEAGUE, "champion", 1, expected=None, actor="test", reason="its role is main")
-    upgraded.close()
+def test_a_database_of_version_0_1_0_is_migrated_to_the_tables(storage: Storage) -> None:
+    with closing(restored(storage)) as registry, registry.database.engine.connect() as connection:
+        assert database.revision(connection) == migrations.HEAD
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, Base.metadata) == []
+        empty = [
+            table.name for table in Base.metadata.sorted_tables if connection.execute(select(table)).first() is None
+        ]
+    assert empty == [], "the database has rows in all tables"
+
+
+def test_what_version_0_1_0_wrote_is_read(storage: Storage) -> None:
+    with closing(restored(storage)) as registry:
+        league = registry.leagues.get(LEAGUE)
+        assert (league.config.league, league.interface, league.archived_at) == (LEAGUE, interface(), None)
+        assert [game.game["play.opening_plies"] for game in registry.leagues.earlier_games(LEAGUE)] == [4]
+        first, second, exploiter, mixture = registry.versions.all(LEAGUE)
+        assert (first.aliases, first.note and first.note.text, first.source) == (("champion",), "the first", "run/1000")
+        assert (second.parent, second.steps, second.manifest.interface) == (1, 2000, interface())
+        assert (exploiter.role, exploiter.exploits) == ("exploiter", "tictactoe@1")
+        assert mixture.mixture is not None
+        assert [member.probability for member in mixture.mixture.members] == [0.25, 0.75]
+        rollback, promotion, start = registry.aliases.history(LEAGUE)
+        assert (rollback.kind, rollback.version, start.actor, start.reason) == ("rollback", 1, "ada", "the first")
+        verdict = registry.verdicts.get(str(promotion.verdict))
+        assert (verdict.outcome, verdict.candidate, verdict.evidence) == ("promote", 2, {"promoted": True, "elo": 42.0})
+        assert verdict.companions.anchors == (AnchorTest("script:random", 0.1, SCHEDULE.id, "no_worse"),)
+        (run,) = registry.nightly_runs.all(LEAGUE)
+        assert (run.candidates, run.alpha, run.report) == ((2,), 0.01, {"champion": "tictactoe@2"})
+        (night,) = registry.training_nights.all(LEAGUE)
+        assert (night.number, night.parent, night.start, night.ended_at is None) == (1, 1, 1, False)
+        ledger = Ledger(registry)
+        schedule = ledger.schedule(SCHEDULE.id)
+        matches = ledger.matches(league=LEAGUE, schedule=schedule.id)
+        assert matches == [play_match(schedule, position) for position in range(3)]
+        assert len(ledger.results(LEAGUE)) == 6
+        (key,) = registry.keys.all()
+        assert (key.name, key.scopes, key.leagues, key.rate) == ("ci", {"read", "promote"}, {LEAGUE}, 20)
+        (setting,) = registry.traffic.history(LEAGUE)
+        assert (setting.canary, setting.shadow) == (Portion(2, 0.25), Portion("candidate", 0.5))
+        (counts,) = registry.traffic.shadow_counts(LEAGUE)
+        assert (counts.agreement, counts.latency[:3]) == (0.75, (1, 2, 3))
+        evaluation = registry.evaluations.get(LEAGUE, 1)
+        assert (evaluation.state, evaluation.request["blocks"], evaluation.result) == ("done", 2, {"matches": 4})
+        training = registry.runs.get(LEAGUE, "run")
+        assert (training.state, training.target, training.curves) == ("ended", 2000, {"return": 0.5})
+        assert [point.curves for point in registry.runs.points(LEAGUE, "run")] == [{"return": 0.25}, {"return": 0.5}]
+        assert [stored.record for stored in registry.runs.stored(LEAGUE)] == [{"git_commit": None}]
+        (strength,) = registry.strength.of_run(LEAGUE, "run")
+        assert (strength.version, strength.opponent, strength.score) == (2, "tictactoe@1", 0.75)
+        assert [(row.replica, row.version) for row in registry.replicas.acknowledgements(LEAGUE)] == [
+            ("replica-1", 1),
+            ("replica-2", 1),
+        ]
+
+
+def test_a_registry_of_version_0_1_0_continues(storage: Storage) -> None:
+    """Numbers and ids follow those of its rows, and a repeated call gets its result."""
+    with closing(restored(storage)) as registry:
+        assert publish(registry, "run/3000", parent=2).number == 5
+        owner = registry.keys.all()[0].id
+        repeated = IdempotentCall(owner=owner, key="a", digest="a" * 64)
+        event = registry.aliases.set(LEAGUE, "champion", 1, expected=None, actor="ada", reason="again", call=repeated)
+        assert (event.id, event.reason) == (1, "the first")
+        assert registry.aliases.set(LEAGUE, "champion", 5, expected=1, actor="ada", reason="better").id == 5
+        assert registry.aliases.rollback(LEAGUE, actor="ada", reason="worse").version == 1
+        assert registry.training_nights.open(LEAGUE).number == 2
 
 
 @pytest.mark.parametrize(
