@@ -18,7 +18,7 @@ class AnchorTest:
         ref: The anchor.
         margin: By how much the candidate may be weaker, or do worse than the champion.
         schedule: Id of the schedule of its matches.
-        mode: `at_least` in verdicts of releases without modes.
+        mode: What the candidate is compared with.
     """
 
     ref: str
@@ -73,7 +73,7 @@ class ExploitabilityTest:
             margin=record["margin"],
             blocks=record["blocks"],
             schedule=record["schedule"],
-            improvement=record.get("improvement", 0.0),
+            improvement=record["improvement"],
         )
 
     def to_record(self) -> dict[str, Any]:
@@ -109,8 +109,7 @@ class CompanionTests:
         trained = settings.get("exploitability")
         return cls(
             anchors=tuple(
-                AnchorTest(anchor["ref"], anchor["margin"], anchor["schedule"], anchor.get("mode", "at_least"))
-                for anchor in anchors
+                AnchorTest(anchor["ref"], anchor["margin"], anchor["schedule"], anchor["mode"]) for anchor in anchors
             ),
             exploiters=tuple(
                 ExploiterTest(exploiter["ref"], exploiter["exploits"], exploiter["margin"], exploiter["schedule"])

@@ -76,7 +76,6 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     computed = report.to_json()
     # Sentences, in the words of the release that wrote them.
     del computed["reason"], computed["remedy"]
-    _omit_later_fields(computed, row.evidence)
     if row.outcome == VOID:
         # A voided verdict keeps its evidence, which is empty if it was open.
         computed = {name: value for name, value in computed.items() if name in row.evidence and name != "outcome"}
@@ -93,15 +92,6 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     return Verification(
         row.id, row.outcome, len(matches), len(computed), replayed, is_current, report.reason, report.remedy
     )
-
-
-def _omit_later_fields(computed: dict[str, Any], recorded: dict[str, Any]) -> None:
-    """Remove the fields that the release that recorded the evidence did not have."""
-    for name in {"model", "forfeits"} - recorded.keys():
-        del computed[name]
-    for anchor, recorded_anchor in zip(computed["anchors"], recorded.get("anchors", ()), strict=False):
-        if "mode" not in recorded_anchor:
-            del anchor["mode"]
 
 
 def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Match]:

@@ -27,14 +27,14 @@ class EarlierResults:
     Attributes:
         conditions: Those of the matches.
         matches: Their number.
-        changes: What of the game differs from the current one; None if it was not recorded.
+        changes: What of the game differs from the current one.
         actions_changed: Whether versions select actions in another way now.
-        replaced_at: When the league had this game last; None if it still has it, or this was not recorded.
+        replaced_at: When the league had this game last; None if it still has it.
     """
 
     conditions: Conditions
     matches: int
-    changes: tuple[GameChange, ...] | None
+    changes: tuple[GameChange, ...]
     actions_changed: bool
     replaced_at: datetime | None
 
@@ -44,7 +44,7 @@ class EarlierResults:
             "name": self.conditions.name,
             "actions": self.conditions.actions,
             "matches": self.matches,
-            "changes": None if self.changes is None else [change._asdict() for change in self.changes],
+            "changes": [change._asdict() for change in self.changes],
             "actions_changed": self.actions_changed,
             "replaced_at": self.replaced_at and iso_timestamp(self.replaced_at),
         }
@@ -61,14 +61,12 @@ def earlier_results(registry: Registry, league: LeagueRow) -> list[EarlierResult
             matches[schedule.conditions] += played[schedule.id]
     results = []
     for conditions, number in reversed(matches.items()):
-        game = games.get(conditions.game_digest)
-        same_game = conditions.game_digest == league.game_digest
-        changes = () if same_game else game_changes(game.game, league.game) if game and game.game else None
+        game = games.get(conditions.game_digest)  # None if only the selection of actions is another one
         results.append(
             EarlierResults(
                 conditions=conditions,
                 matches=number,
-                changes=changes,
+                changes=game_changes(game.game, league.game) if game else (),
                 actions_changed=conditions.actions != league.conditions.actions,
                 replaced_at=game.replaced_at if game else None,
             )

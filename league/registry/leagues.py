@@ -75,8 +75,9 @@ class LeagueRepository(Repository):
             )
             if changes:
                 change_counter.count(session, "leagues")
-            if row.game_digest != values["game_digest"] and _has_results(session, row.slug):
+            if row.game_digest != values["game_digest"]:
                 changes.insert(0, _describe_changes(row.game, game))
+                # Also without results: a match of a schedule that is open may still be recorded.
                 earlier = {"game": row.game, "replaced_at": datetime.now(UTC)}
                 upsert(session, EarlierGameTable, {"league": row.slug, "digest": row.game_digest}, earlier)
             if changes and _has_results(session, row.slug):
@@ -97,7 +98,7 @@ class LeagueRepository(Repository):
             return _row(session.get(LeagueTable, league) or _unknown(session, league))
 
     def earlier_games(self, league: str) -> list[EarlierGameRow]:
-        """Return the other games that the league had when results existed, newest first. Raises UnknownLeague."""
+        """Return the other games that the league had, newest first. Raises UnknownLeague."""
         table = EarlierGameTable
         query = select(table).filter_by(league=league).order_by(table.replaced_at.desc(), table.digest)
         with self._database.read() as session:
@@ -215,13 +216,11 @@ def _has_results(session: Session, league: str, conditions: Conditions | None = 
     if conditions is None:
         return session.scalar(query.limit(1)) is not None
     schedules = map(json.loads, session.scalars(query.where(ScheduleTable.document.contains(conditions.game_digest))))
-    return any((schedule.get("game_digest"), schedule.get("actions", "greedy")) == conditions for schedule in schedules)
+    return any((schedule["game_digest"], schedule["actions"]) == conditions for schedule in schedules)
 
 
 def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:
     """Describe the differences of two games."""
-    if not before:
-        return "what decides results (the environment's code, its libraries, the rules of play) was not recorded before"
     return "the game has changed: " + ", ".join(
         f"{change.name} {change.before} → {change.now}" for change in game_changes(before, now)
     )

@@ -2,8 +2,7 @@
 
 A replica has one row that says how far it has read the changes of the registry. It serves what the registry required
 then, except of leagues for which it has an acknowledgement as well: while a version is loaded, or after a
-failure. So following a change, or 1,000 of them, is one update. Replicas of earlier releases have an acknowledgement
-for each league.
+failure. So following a change, or 1,000 of them, is one update.
 
 All times are those of the database's clock, because the clocks of replicas may differ.
 """

@@ -30,7 +30,7 @@ from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 7
+FORMAT = 1
 """Version of the document format. A new format invalidates all snapshots."""
 
 

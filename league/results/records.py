@@ -50,8 +50,7 @@ class Schedule:
     seed: int
     environment_digest: str
     game_digest: str
-    """Digest of what decides results, see `LeagueConfig.game`; in schedules from before it was recorded, the digest of
-    the environment."""
+    """Digest of what decides results, see `LeagueConfig.game`."""
     sides: tuple[str, ...]
     contestants: tuple[str, ...]
     """Pinned references: `connect_four@3`, `script:random`; never an alias."""
@@ -129,7 +128,7 @@ class Forfeit:
     """A contestant (index) had to act as `agent` and returned no valid action.
 
     detail: the exception with its place, or the action and what was expected; at most MAX_DETAIL characters. It may
-    differ between machines, and is no part of the result. Empty in records from before it was stored.
+    differ between machines, and is no part of the result.
     """
 
     contestant: int
@@ -266,7 +265,6 @@ def dump_schedule(schedule: Schedule) -> str:
 def load_schedule(text: str) -> Schedule:
     """Return the schedule that `dump_schedule` wrote."""
     fields = json.loads(text)
-    fields.setdefault("game_digest", fields["environment_digest"])
     fields["pairings"] = tuple(tuple(pairing) for pairing in fields["pairings"])
     return Schedule(**fields | {name: tuple(fields[name]) for name in ("sides", "contestants")})
 

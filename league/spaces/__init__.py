@@ -77,7 +77,7 @@ class DictSpace(_Space):
 
     type: Literal["dict"] = "dict"
     spaces: dict[str, "Space"]
-    # Excluded by default, because digests and manifests of earlier versions do not contain it.
+    # Written only where a key of this name is not the mask, so that all other digests are those of plain spaces.
     maskable: bool = Field(default=True, exclude_if=bool)
 
     @property

@@ -37,8 +37,6 @@ OVERDUE_HEARTBEATS = 1.5
 """Heartbeats without a report after which it is examined whether the process of another replica has ended."""
 MAX_EXAMINED = 20
 """Replicas that one examines at a heartbeat. After an interruption of the database, all others are overdue."""
-REREAD = 60.0
-"""Seconds after which everything is read again: processes of earlier releases do not count changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +102,6 @@ class RegistryWatcher:
         self._newest_events: Mapping[str, int] = {}
         """league → its newest alias event"""
         self._last_read: _Read | None = None
-        self._reread_at = 0.0
         self._heartbeat_at = 0.0
         """When the next one is due, a time of `time.monotonic`."""
         self._acknowledged = _Acknowledged()
@@ -188,8 +185,7 @@ class RegistryWatcher:
         self._connection.discard_notifications()
         counts, connection = registry.changes.counts(), self._connection.opened
         last = self._last_read
-        is_current = last is not None and connection == last.connection and time.monotonic() < self._reread_at
-        last_counts = last.counts if last is not None and is_current else None
+        last_counts = last.counts if last is not None and connection == last.connection else None
         return _Read(
             counts,
             connection,
@@ -215,8 +211,6 @@ class RegistryWatcher:
             self._wanted_traffic = read.traffic
         if read.selections is not None:
             self._selections.update(read.selections)
-        if None not in (read.aliases, read.traffic, read.keys, read.selections):
-            self._reread_at = time.monotonic() + REREAD
         settings = (one.id or 0 for one in self._wanted_traffic.values())
         newest = max(self._newest_events.values(), default=0), max(settings, default=0)
         self._position = ReadPosition(read.counts.to_acknowledge, *newest)

@@ -20,11 +20,10 @@ export function EarlierResults({ league, summary, game, page = "" }) {
   </details>`;
 }
 
-const period = ({ replaced_at: at, actions }) => `with ${actions} actions, ${at ? `until ${dateTime(at)}` : "at an unknown time"}`;
+const period = ({ replaced_at: at, actions }) => `with ${actions} actions${at ? `, until ${dateTime(at)}` : ""}`;
 
 /** What differs between an earlier game and the current one. */
 function Changes({ of: { changes, actions_changed: actionsChanged, actions } }) {
-  if (!changes) return html`<span>What has changed since then was not recorded.</span>`;
   const parts = changes.map(({ name, before, now }) => html`<li key=${name}><code>${name}</code>: ${before ?? "none"} → ${now ?? "none"}</li>`);
   if (actionsChanged) parts.push(html`<li key="actions"><code>play.actions</code>: ${actions} → ${actions === "greedy" ? "sampled" : "greedy"}</li>`);
   return html`<ul>${parts}</ul>`;

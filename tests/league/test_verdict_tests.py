@@ -34,19 +34,14 @@ def test_recorded_tests_are_read_as_they_were_written(tests: CompanionTests) -> 
 
 
 @pytest.mark.parametrize("settings", [{}, {"gate": {}, "night": 1, "anchors": []}])
-def test_verdicts_of_earlier_releases_have_fewer_tests(settings: dict[str, object]) -> None:
+def test_a_verdict_may_have_no_companion_tests(settings: dict[str, object]) -> None:
     assert CompanionTests.of_settings(settings) == CompanionTests()
 
 
 def test_settings_of_a_later_release_are_ignored() -> None:
     """Versions are still removed, and snapshots made, by programs that were not updated yet."""
-    anchor = {"ref": "l@1", "margin": 50.0, "schedule": "a", "new": 1}
+    anchor = {"ref": "l@1", "margin": 50.0, "schedule": "a", "mode": "at_least", "new": 1}
     assert CompanionTests.of_settings({"anchors": [anchor]}).anchors == (AnchorTest("l@1", 50.0, "a"),)
-
-
-def test_a_test_of_exploitability_of_an_earlier_release_has_no_improvement() -> None:
-    record = {"of_candidate": ["l@3"], "of_champion": ["l@4"], "margin": 0.2, "blocks": 10, "schedule": "s"}
-    assert ExploitabilityTest.of_record(record).improvement == 0
 
 
 def test_a_test_whose_exploiters_are_not_trained_counts_but_is_not_ready() -> None:

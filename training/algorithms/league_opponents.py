@@ -168,13 +168,8 @@ class LeagueOpponents:
         """Restore what `get_state` returned."""
         self.candidates, self._payoff = state["candidates"], state["payoff"]
         self._scores, self._priors = dict(state["scores"]), dict(state["priors"])
-        self._inherited = dict(state.get("inherited", {}))
-        if "all_episodes" in state:
-            self._episodes, self._all_episodes = dict(state["episodes"]), state["all_episodes"]
-        else:
-            # Checkpoints of earlier releases have the scored games only, a share of all.
-            self._episodes = {ref: games for ref, (games, _) in self._scores.items()}
-            self._all_episodes = sum(self._episodes.values()) / (self._league.training.opponents.share or 1.0)
+        self._inherited = dict(state["inherited"])
+        self._episodes, self._all_episodes = dict(state["episodes"]), state["all_episodes"]
         self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
 
     def _versions(self, registry: Registry) -> dict[str, str]:

@@ -144,8 +144,8 @@ class RunRecord(BaseModel):
     pins: dict[str, str] = {}
     """Opponents as the user wrote them → what they resolved to when the run began."""
     parent: int | None
-    parent_steps: int | None = None
-    """Steps of the parent when the run began. Runs of earlier releases have no record of it."""
+    parent_steps: int = 0
+    """Steps of the parent when the run began; 0 without one."""
     exploits: str | None = None
     """The version that an exploiter is trained against."""
     git_commit: str | None
@@ -180,7 +180,7 @@ class RunDirectory:
         pins: dict[str, str] | None = None,
         exploits: str | None = None,
         name: str | None = None,
-        parent_steps: int | None = None,
+        parent_steps: int = 0,
     ) -> Self:
         """Create the directory of a new run.
 

@@ -124,7 +124,7 @@ def train(
             pins,
             exploits,
             name,
-            None if start is None else start.steps,
+            0 if start is None else start.steps,
         )
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policies)
         strength = StrengthQueue(run, registry, progress, measure)
@@ -234,8 +234,6 @@ def _start(run: RunDirectory, registry: Registry, private: Path) -> StartState:
     """
     parent, league = run.record.parent, run.record.config.league
     before = run.record.parent_steps
-    if before is None:
-        before = registry.versions.get(league, parent).steps if parent is not None else 0
     published = published_versions(registry, run)
     if published:
         state = registry.versions.copy(league, published[-1].number, TRAINING, private)

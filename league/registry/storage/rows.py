@@ -44,7 +44,7 @@ class LeagueRow:
     interface_digest: str
     environment_digest: str
     game: dict[str, Any]
-    """What decides results, see `LeagueConfig.game`; empty if it was not recorded."""
+    """What decides results, see `LeagueConfig.game`."""
     game_digest: str
     """SHA-256 of `game`. Only results with the same digest are combined."""
     registered_at: datetime
@@ -67,7 +67,7 @@ class EarlierGameRow:
 
     digest: str
     game: dict[str, Any]
-    """See `LeagueConfig.game`; empty if it was not recorded."""
+    """See `LeagueConfig.game`."""
     replaced_at: datetime
 
 
@@ -408,9 +408,9 @@ class TrainingNightRow:
     def start(self) -> int | None:
         """The version that its training started from, which may be another one than `parent`; None: from scratch.
 
-        `parent` if none is recorded: before the end of training, or in a night of an earlier release.
+        `parent` before the end of training.
         """
-        start: int | None = self.steps.get("train", {}).get("start", self.parent)
+        start: int | None = self.steps["train"]["start"] if "train" in self.steps else self.parent
         return start
 
     @property

@@ -145,7 +145,6 @@ def test_a_version_that_cannot_be_tested_gives_exit_code_1(league: League, regis
     [
         ({"start": 2}, "from tictactoe@2"),
         ({"start": None}, "from scratch"),
-        ({}, "from tictactoe@3"),  # recorded by an earlier release
     ],
 )
 def test_the_summary_of_a_night_names_the_version_that_training_started_from(train: dict[str, Any], start: str) -> None:
@@ -154,7 +153,7 @@ def test_the_summary_of_a_night_names_the_version_that_training_started_from(tra
     now = datetime.now(UTC)
     night = TrainingNightRow(id=9, number=5, league="tictactoe", parent=3, steps=steps, began_at=now, ended_at=now)
     assert summary_of_night(night) == [f"tictactoe: night 5 trained tictactoe@4 {start}."]
-    assert [night_document(night)[name] for name in ("night", "number", "parent")] == [9, 5, train.get("start", 3)]
+    assert [night_document(night)[name] for name in ("night", "number", "parent")] == [9, 5, train["start"]]
 
 
 def test_a_verdict_is_voided_with_a_reason(league: League, registry: Registry) -> None:

@@ -103,14 +103,6 @@ def test_each_change_of_the_evidence_is_reported(registry: Registry, name: str) 
         verify(row.id, registry=registry)
 
 
-def test_a_record_of_an_earlier_release_is_verified(registry: Registry) -> None:
-    row, later = verdicts(registry)[0], ("model", "forfeits")
-    with registry.database.write() as session:
-        stored = session.get_one(tables.VerdictTable, row.id)
-        stored.evidence = {name: value for name, value in (stored.evidence or {}).items() if name not in later}
-    assert verify(row.id, registry=registry).outcome == "promote"
-
-
 def change_moves(registry: Registry, verdict: str, change: Callable[[list[Any]], None], position: int = 0) -> None:
     with registry.database.write() as session:
         match = session.scalars(select(tables.MatchTable).filter_by(schedule=verdict, position=position)).one()

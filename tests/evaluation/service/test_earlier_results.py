@@ -73,13 +73,15 @@ def test_another_selection_of_actions_is_named(registry: Registry) -> None:
     assert (found.conditions.actions, found.actions_changed, found.changes) == ("greedy", True, ())
 
 
-def test_a_game_that_was_not_recorded_has_unknown_changes(registry: Registry) -> None:
-    from sqlalchemy import delete
-
-    from league.registry.storage.tables import EarlierGameTable
-
+def test_a_game_without_results_is_recorded(registry: Registry) -> None:
+    """A worker that has the configuration from before a change records its matches afterwards."""
+    earlier = registry.leagues.get(LEAGUE)
+    change(registry, opening_plies=3)
     change(registry, opening_plies=4)
-    with registry.database.write() as session:
-        session.execute(delete(EarlierGameTable))
-    (found,) = earlier_results(registry, registry.leagues.get(LEAGUE))
-    assert (found.changes, found.replaced_at) == (None, None)
+    evaluate(earlier.slug, registry=registry, schedule="gauntlet", against=["script:random"], blocks=2)
+    change(registry, opening_plies=5)
+    changes = {results.matches: results.changes for results in earlier_results(registry, registry.leagues.get(LEAGUE))}
+    assert changes == {
+        4: (GameChange("play.opening_plies", "2", "5"),),
+        2: (GameChange("play.opening_plies", "4", "5"),),
+    }

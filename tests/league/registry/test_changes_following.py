@@ -235,15 +235,3 @@ def test_counts_in_sql_agree_with_the_listed_acknowledgements(local: Registry, s
     with pytest.raises(NotReady) as caught:
         local.changes.wait_for_alias(event, 0)
     assert all((f"{one.replica} " in str(caught.value)) == (one.replica in late) for one in listed)
-
-
-def test_a_replica_of_an_earlier_release_is_judged_by_its_acknowledgement_of_the_league(served: Registry) -> None:
-    for replica in ("replica-1", "replica-2"):
-        acknowledge(served, replica, 2)
-    registered(served, "another", versions=1)
-    other = served.aliases.set("another", "champion", 1, expected=None, actor="test", reason="test")
-    with served.database.write() as session:
-        session.execute(update(ReplicaTable).values(changes=None, event=None, traffic=None))
-    assert served.changes.wait_for_alias(newest(served), 0) == ["replica-1", "replica-2"]
-    with pytest.raises(NotReady, match="2 of 2"):
-        served.changes.wait_for_alias(other, 0)

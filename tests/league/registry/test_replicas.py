@@ -57,7 +57,6 @@ def test_replicas_whose_processes_have_ended_are_removed_on_their_machine(regist
         "alive": {PROCESS: this_process()},
         "ended": {PROCESS: f"{machine}:{pid}:1"},
         "elsewhere": {PROCESS: f"another:{pid}:1"},
-        "of an earlier release": {"pid": pid},
     }
     for replica, description in descriptions.items():
         registry.replicas.register(replica, description)

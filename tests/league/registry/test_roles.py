@@ -44,6 +44,16 @@ def test_an_exploiter_cannot_become_champion(registry: Registry) -> None:
     assert registry.aliases.current(LEAGUE) == {"spar": 2}
 
 
+def test_a_shadow_that_has_become_an_exploiter_does_not_prevent_a_canary(registry: Registry) -> None:
+    registry.aliases.set(LEAGUE, "spar", 1, expected=None, actor="test", reason="test")
+    registry.traffic.set(LEAGUE, shadow=Portion("spar", 1.0), actor="test", reason="test")
+    registry.aliases.set(LEAGUE, "spar", 2, expected=1, actor="test", reason="test")
+    setting = registry.traffic.set(LEAGUE, canary=Portion(1, 0.5), actor="test", reason="test")
+    assert (setting.canary, setting.shadow) == (Portion(1, 0.5), Portion("spar", 1.0))
+    with pytest.raises(NotPromotable, match=REFUSED):
+        registry.traffic.set(LEAGUE, shadow=Portion("spar", 0.5), actor="test", reason="test")
+
+
 def test_exploiters_play_only_where_they_are_named(registry: Registry) -> None:
     assert [version.number for version in eligible(registry, LEAGUE)] == [1]
     named = evaluate(LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=registry, blocks=1)

@@ -12,7 +12,7 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
-from league.registry.storage.tables import ReplicaReportTable, TrafficEventTable
+from league.registry.storage.tables import ReplicaReportTable
 from tests.support.leagues.acknowledgements import acknowledge
 from tests.support.leagues.registries import LEAGUE, registered
 
@@ -57,15 +57,6 @@ def test_an_unchanged_setting_creates_no_event(versioned: Registry) -> None:
 def test_an_alias_is_stored_as_an_alias(versioned: Registry) -> None:
     versioned.aliases.set(LEAGUE, "candidate", 2, expected=ANY, actor="test", reason="test")
     assert set_traffic(versioned, shadow=Portion("candidate", 1.0)).shadow == Portion("candidate", 1.0)
-
-
-def test_a_setting_that_remains_is_not_checked(versioned: Registry) -> None:
-    """Releases before this one kept a shadow whose version was removed."""
-    set_traffic(versioned, shadow=Portion(3, 1.0))
-    with versioned.database.write() as session:
-        session.execute(update(TrafficEventTable).values(shadow="9"))
-    assert set_traffic(versioned, canary=Portion(2, 0.5)).shadow == Portion(9, 1.0)
-    assert set_traffic(versioned, shadow=None).canary == Portion(2, 0.5)
 
 
 def test_only_existing_versions_get_traffic(versioned: Registry) -> None:

@@ -302,19 +302,6 @@ def test_a_failure_is_forgotten_after_a_rollback(registry: Registry) -> None:
         assert (row.version, row.fault) == (1, None)
 
 
-def test_changes_by_processes_of_earlier_releases_are_followed(
-    registry: Registry, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They do not count changes."""
-    monkeypatch.setattr("serve_app.models.registry_watcher.REREAD", 0.1)
-    with replica(registry.storage):
-        until(lambda: serves(registry, 1))
-        with monkeypatch.context() as earlier:
-            earlier.setattr("league.registry.aliases.change_counter.count", lambda *_: None)
-            promote(registry, "board", 2)
-        until(lambda: serves(registry, 2))
-
-
 def named(storage: Storage, name: str) -> Storage:
     """The storage, whose connections have a name in PostgreSQL."""
     return replace(storage, database_url=f"{storage.database_url}&application_name={name}")

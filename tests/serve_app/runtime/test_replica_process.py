@@ -13,9 +13,3 @@ def test_a_process_that_runs_has_not_ended() -> None:
 def test_a_process_of_this_machine_has_ended() -> None:
     described = subprocess.run([sys.executable, "-c", DESCRIBE], stdout=subprocess.PIPE, text=True, check=True).stdout
     assert has_ended({"process": described.strip()})
-
-
-def test_nothing_is_known_of_a_replica_of_another_kind() -> None:
-    """Earlier releases describe their processes by other keys."""
-    assert not has_ended({"machine": "another/1", "pid": "1", "start": "1"})
-    assert not has_ended({})

@@ -132,14 +132,6 @@ def test_the_shares_of_opponents_that_are_no_longer_drawn_vanish(registry: Regis
         assert each.score("tictactoe@1") == 0.5
 
 
-def test_shares_after_a_checkpoint_of_an_earlier_release(registry: Registry) -> None:
-    opponents, restored = opponents_of(registry, share=0.4), opponents_of(registry, share=0.4)
-    opponents.add(metrics(100.0, v1=(40.0, 20.0)), 0)
-    state = opponents.get_state()
-    restored.set_state({name: value for name, value in state.items() if name not in ("episodes", "all_episodes")})
-    assert restored.shares() == pytest.approx(opponents.shares())
-
-
 def test_opponents_whose_games_are_not_scored_have_shares(registry: Registry) -> None:
     opponents = opponents_of(registry)
     opponents.add(unscored(10.0, {"v1": (4.0, 0.0, 0.0), "v2": (1.0, 2.0, 2.0)}), 0)

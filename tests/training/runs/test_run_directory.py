@@ -210,15 +210,6 @@ def test_a_run_that_ended_on_another_machine_is_complete(registry: Registry) -> 
     assert not RunDirectory.resume(registry, tictactoe(steps=11)).record.complete
 
 
-def test_runs_of_earlier_releases_are_resumed_where_they_began(registry: Registry, elsewhere: Registry) -> None:
-    run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
-    start(registry, run)
-    change(registry, run, record=None, driver=None)
-    assert RunDirectory.resume(registry, tictactoe()).id == run.id
-    with pytest.raises(NotFound):
-        RunDirectory.resume(elsewhere, tictactoe())
-
-
 def test_a_changed_record_is_named(registry: Registry, storage: Storage) -> None:
     run = RunDirectory.begin(storage, tictactoe(), None, None)
     (run.path / "run.json").write_text("{")
