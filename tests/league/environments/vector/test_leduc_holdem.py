@@ -174,11 +174,10 @@ def test_random_play() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_a_million_steps() -> None:
-    comparison = random_play(num_envs=64, steps=10**6)
+def test_many_steps() -> None:
+    comparison = random_play(num_envs=64, steps=200_000)
     assert comparison.difference is None
-    assert comparison.steps >= 10**6
+    assert comparison.steps >= 200_000
 
 
 def in_tables(**change: Callable[[NDArray], NDArray]) -> tuple[Any, str, Any]:

@@ -26,13 +26,11 @@ def test_all_reports_equal_those_of_the_stock_environment(plan: Plan, num_action
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("arguments", [{}, {"num_actions": 5, "max_cycles": 4}], ids=str)
-def test_a_million_steps_equal_those_of_the_stock_environment(arguments: dict[str, int]) -> None:
-    """Half of them with each arguments."""
-    found = compare(config(**arguments), RockPaperScissors(256, **arguments), 500_000, seed=1)
+def test_many_steps_equal_those_of_the_stock_environment(arguments: dict[str, int]) -> None:
+    found = compare(config(**arguments), RockPaperScissors(256, **arguments), 100_000, seed=1)
     assert found.difference is None
-    assert found.episodes > 25_000
+    assert found.episodes > 5_000
 
 
 @pytest.mark.parametrize(

@@ -19,10 +19,10 @@ def test_all_reports_equal_those_of_the_stock_environment(plan: Plan) -> None:
 
 
 @pytest.mark.slow
-def test_a_million_steps_equal_those_of_the_stock_environment() -> None:
-    found = compare(CONFIG, TicTacToe(256), 1_000_000, seed=1)
+def test_many_steps_equal_those_of_the_stock_environment() -> None:
+    found = compare(CONFIG, TicTacToe(256), 200_000, seed=1)
     assert found.difference is None
-    assert found.episodes > 100_000
+    assert found.episodes > 20_000
 
 
 def played(cells: list[int]) -> AgentRows:

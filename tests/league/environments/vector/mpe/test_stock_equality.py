@@ -19,7 +19,7 @@ from tests.support.environments.plans import Plan, assert_equal, plans
 
 COMMON = {"max_cycles": st.integers(1, 12), "continuous_actions": st.booleans()}
 RATIO = {"local_ratio": st.sampled_from([0, 0.25, 0.5, 0.9, 1])}
-MILLION = 10**6
+AGENT_STEPS = 100_000
 
 
 @dataclass(frozen=True)
@@ -97,16 +97,14 @@ def test_all_reports_equal_those_of_the_stock_environment(name: str, plan: Plan,
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "continuous"])
 @pytest.mark.parametrize("name", CASES)
-def test_a_million_agent_steps_equal_those_of_the_stock_environment(name: str, continuous: bool) -> None:
-    """Half of them with each kind of actions."""
+def test_many_agent_steps_equal_those_of_the_stock_environment(name: str, continuous: bool) -> None:
     vector = CASES[name].vector(64, continuous_actions=continuous)
-    steps = MILLION // 2 // len(vector.possible_agents) + 1
+    steps = AGENT_STEPS // len(vector.possible_agents) + 1
     found = compare(config(name, continuous_actions=continuous), vector, steps, seed=1)
     assert found.difference is None
-    assert found.steps * len(vector.possible_agents) >= MILLION / 2
+    assert found.steps * len(vector.possible_agents) >= AGENT_STEPS
     assert found.episodes > steps / 30
 
 
