@@ -90,12 +90,13 @@ def _support(table: Floats) -> NDArray[np.intp]:
 
     There is an equilibrium p in which every contestant either is played or loses against p (A. Goldman and A. Tucker,
     "Theory of linear programming", 1956); contestants that lose against it are in no equilibrium. It maximises t
-    subject to `p - table @ p >= t`. A contestant that beats all others is such a p.
+    subject to `p - table @ p >= t`. A contestant that beats all others, and any p without decisive games, need no
+    linear program.
     """
     size = len(table)
     best = np.flatnonzero((table < 0).sum(axis=0) == size - 1)
-    if best.size:
-        return best
+    if best.size or not table.any():
+        return best if best.size else np.arange(size)
     ones, no_gain = np.ones((size, 1)), np.concatenate([table, np.zeros((size, 1))], axis=1)
     solved = linprog(
         -np.eye(size + 1)[size],
